@@ -1,4 +1,4 @@
-"""The gallery: what commands make, made while the site is built."""
+"""The gallery: results of commands, made while the site is built."""
 
 import shlex
 import shutil
@@ -15,7 +15,7 @@ RUN = "from crane.cli import main; main()"
 
 
 class Entry(NamedTuple):
-    """One picture or page, and how it is made."""
+    """One figure or page, and its commands."""
 
     title: str
     text: str
@@ -33,39 +33,39 @@ PAGES = (
     Entry(
         "A log crane of laboratory size",
         "The published trajectory that picks up a log and places it into the bunk. Press play, "
-        "turn it with the mouse or a finger, and switch forces on.",
+        "turn the view with the mouse or a finger, and switch forces on.",
         "simulate mini_forwarder --task loading --out loading\nview loading --no-open",
         "loading/view.html",
     ),
     Entry(
         "A log crane on its valves",
-        "It lifts, stretches and runs its extension out, through its valves: signals in volt, "
-        "pressures in bar, flows.",
+        "The crane lifts, stretches and extends by valve commands: signals in volt, pressures in "
+        "bar, flows.",
         "simulate patu655 --task reach --out reach\nview reach --no-open",
         "reach/view.html",
     ),
     Entry(
         "An excavator grades",
-        "It draws its teeth towards itself, level and 50 mm above the ground, through its valves.",
+        "The teeth move horizontally towards the machine, 50 mm above the ground, by valves.",
         "simulate excavator --task grade --out grade\nview grade --no-open",
         "grade/view.html",
     ),
     Entry(
         "A grapple that does not sway",
-        "A quarter turn with a log in the grapple, whose reference was changed so that nothing "
-        "sways after it.",
+        "A quarter turn with a log in the grapple; the reference suppresses the sway.",
         "simulate patu655_grapple --task swing --sway flat --out swing\nview swing --no-open",
         "swing/view.html",
     ),
     Entry(
         "A robot with a parallel linkage",
-        "A machine alone, without a run: its loops are closed while the page's sliders move.",
+        "A machine without a run: the page closes the loops while you move the sliders.",
         "view kr300 --out kr300.html --no-open",
         "kr300.html",
     ),
     Entry(
         "What an excavator lifts",
-        "Loads all over the reach, and what ends them: drives, tipping, pins. Point at a place.",
+        "Rated loads over the reach with their limiting factors: drives, tipping, pins. Point at "
+        "a position.",
         "capacity excavator --out capacity",
         "capacity/capacity.html",
     ),
@@ -73,13 +73,13 @@ PAGES = (
 PICTURES = (
     Entry(
         "How far it works",
-        "Reach, depth and heights, each an exact optimum.",
+        "Reach, depth and heights, each an exact optimum over all strokes.",
         "working-range excavator --out range",
         "range/working_range.png",
     ),
     Entry(
         "Its mechanism",
-        "Drawn from the description, for a paper.",
+        "A drawing for publications, from the description.",
         "sketch patu655 --com --out mechanism.svg",
         "mechanism.svg",
     ),
@@ -93,13 +93,13 @@ PICTURES = (
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Make everything before pages are read."""
+    """Make all results before pages are read."""
     app.connect("config-inited", lambda *_: write())
     return {"parallel_read_safe": True}
 
 
 def write() -> None:
-    """Run all commands; the page shows what they made."""
+    """Run all commands and write the page that shows their results."""
     pages = GENERATED / "pages"
     shutil.rmtree(pages, ignore_errors=True)
     (pages / "gallery").mkdir(parents=True)
@@ -108,7 +108,10 @@ def write() -> None:
             for command in entry.commands.splitlines():
                 _run(command, folder)
             shutil.copy(Path(folder, entry.result), pages / entry.file)
-    text = "# Gallery\n\nEach is one file that needs no network, made by the commands below it.\n"
+    text = (
+        "# Gallery\n\nResults of commands. Each is a single file that needs no network; the "
+        "commands are below it.\n"
+    )
     shown = [_page(entry) for entry in PAGES] + [_picture(entry) for entry in PICTURES]
     (GENERATED / "gallery.md").write_text("\n".join([text, *shown]))
 
@@ -124,7 +127,7 @@ def _page(entry: Entry) -> str:
     frame = (
         f'<iframe class="page" src="../{entry.file}" title="{entry.title}" loading="lazy">'
         "</iframe>\n"
-        f'<p><a href="../{entry.file}">Alone in the window</a></p>'
+        f'<p><a href="../{entry.file}">Open in the whole window</a></p>'
     )
     return _shown(entry, frame)
 

@@ -65,7 +65,8 @@ def _key_rows(section: SectionSchema) -> list[tuple[str, ...]]:
 
 def _type_text(key: Key) -> str:
     if key.choices:
-        return ", ".join(f"`{x}`" for x in key.choices)
+        names = ", ".join(f"`{x}`" for x in key.choices)
+        return f"list of {names}" if isinstance(key, NameListKey) else names
     if isinstance(key, VariantKey):
         return ", or ".join(dict.fromkeys(map(_type_text, key.types)))
     if isinstance(key, MapKey):

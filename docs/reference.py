@@ -169,14 +169,17 @@ def _room(room: str, names: list[str], inner: list[type]) -> str:
         else:
             parts.append(f".. py:data:: {path}\n\n   By name: {', '.join(value)}.\n")
     if inner:
-        heading = "What these lead to"
-        parts += [f"{heading}\n{'-' * len(heading)}", "Classes of their attributes and results."]
+        heading = "Related classes"
+        parts += [
+            f"{heading}\n{'-' * len(heading)}",
+            "Classes of the attributes and results of the above.",
+        ]
         parts += [f".. autoclass:: {x.__module__}.{x.__name__}\n{_MEMBERS}" for x in inner]
     return "\n\n".join(parts)
 
 
 def _errors() -> str:
-    text = "What goes wrong on purpose: one line that says what, where, and what to do."
+    text = "Errors of the package. The message is one line: what is wrong, where, and the remedy."
     body = ".. automodule:: crane.common.errors\n   :members:\n   :show-inheritance:\n"
     return "\n\n".join([_title("Errors"), text, body])
 
@@ -191,8 +194,8 @@ def _index() -> str:
     )
     tree = "\n".join(f"   {room}" for room in [*ROOMS, "errors"])
     text = (
-        f"``crane`` itself has what short programs need: {root}. All else is in submodules, which "
-        "``import crane`` makes available."
+        f"The root of ``crane`` has the names that short programs need: {root}. All others are in "
+        "submodules, which ``import crane`` makes available."
     )
     table = f".. list-table::\n\n{rows}\n"
     toctree = f".. toctree::\n   :maxdepth: 2\n   :hidden:\n\n{tree}\n"

@@ -1,4 +1,4 @@
-"""How do I simulate one motion with a hundred different loads at once?"""
+"""How do I simulate one motion with a hundred different loads in one call?"""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ trajectory = crane.task_trajectory(empty, "lift")
 masses = np.linspace(0.0, 0.2, 100)  # [kg]
 machines = [empty.with_payload(crane.Payload("link7_tip", mass=m)) for m in masses]
 
-# all share their machine code; threads use all cores
+# all runs share the machine code; threads use all cores
 batch = crane.simulation.simulate_batch(
     machines, lambda machine: crane.PI(machine, trajectory), step=0.01
 )

@@ -1,4 +1,4 @@
-"""What force must the cylinder have that lifts my boom?"""
+"""Which force does the cylinder need that lifts my boom?"""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ Path("boom.urdf").write_text(f"""<robot name="boom">
 
 
 def eye(link, place):
-    """A pin as `add_cylinder` reads it."""
+    """A pin in the syntax of `add_cylinder`."""
     return f"{link}:{','.join(map(str, place))}"
 
 
@@ -34,7 +34,7 @@ added = crane.formats.add_cylinder(
     bore=0.08,
     rod=0.045,
     stroke=0.5,
-    dead_length=0.75,  # pin to pin with the rod in [m]
+    dead_length=0.75,  # pin to pin with the rod retracted [m]
 )
 machine = crane.load(added.path, changes={"payload.mass": LOAD})
 print(machine)
@@ -48,8 +48,8 @@ area = np.pi / 4 * 0.08**2  # [m2]
 print(f"at most {force.max() / 1e3:.1f} kN, {force.max() / area / 1e5:.0f} bar on its piston")
 
 
-# by hand: moment of boom and load over the lever arm of the force, which leaves the steel of the
-# cylinder out (1 or 2 %)
+# by hand: moment of boom and load over the lever arm of the force, without the weight of the
+# cylinder (1 or 2 %)
 for turn, f in zip(angle, force, strict=True):
     x, z = EYE[[0, 2]]
     pin = np.array([x * np.cos(turn) - z * np.sin(turn), x * np.sin(turn) + z * np.cos(turn)])

@@ -7,7 +7,7 @@ import crane
 held = {"slew": 0.0, "X_tilt": 0.246, "X_ext": 0.1}
 truth = {"payload.mass": 240.0, "valve.X_lift.neutral": 5.7}
 described = crane.load("patu655", changes={"payload.mass": 200.0}, lock=held)
-true = crane.load("patu655", changes=truth, lock=held)  # which nobody knows
+true = crane.load("patu655", changes=truth, lock=held)  # unknown in practice
 
 # the log, every 20 ms: signals of the valve, stroke, pressures; with noise of 0.2 mm, 0.2 bar
 time = np.array([0.0, 0.3, 0.5, 1.2, 1.4, 1.8, 2.0, 2.6, 2.8])  # [s]
@@ -22,7 +22,7 @@ units = ["s", "V", "m", "Pa", "Pa"]
 heads = ",".join(f"{name} [{unit}]" for name, unit in zip(columns, units, strict=True))
 np.savetxt("log.csv", table, delimiter=",", header=heads, comments="")
 
-found = crane.calibrate(described, "log.csv", list(truth), train=(0.0, 3.0))  # the rest judges
+found = crane.calibrate(described, "log.csv", list(truth), train=(0.0, 3.0))  # rest held out
 print(found.to_text())
 for one in found.parameters:
     print(

@@ -7,12 +7,12 @@ import numpy as np
 import crane
 from crane.description.machine_lookup import example_root
 
-warnings.simplefilter("ignore", crane.CraneWarning)  # of what its file for Gazebo leaves open
+warnings.simplefilter("ignore", crane.CraneWarning)  # about its file, which is for Gazebo
 
 # Agility Robotics' Cassie by DAIRLab, ISC licence, from example-robot-data
 sdf = example_root() / "cassie_description" / "robots" / "cassie_v2.sdf"
 motors = ("roll-op", "yaw-op", "pitch-op", "knee-op", "tarsus-crank-joint")
-springs = {f"{side}-knee-shin-joint": 0.0 for side in ("left", "right")}  # stiff, held
+springs = {f"{side}-knee-shin-joint": 0.0 for side in ("left", "right")}  # stiff springs, locked
 machine = crane.load(
     sdf, active=[f"{side}-{motor}" for side in ("left", "right") for motor in motors], lock=springs
 )

@@ -1,4 +1,4 @@
-"""How do I close the loop that a URDF cannot say?"""
+"""How do I close a loop, which URDF cannot describe?"""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ def pin(name, parent, child, x, angle):
     <parent link="{parent}"/><child link="{child}"/><axis xyz="0 1 0"/></joint>"""
 
 
-# an open tree, as every exporter writes it, and one <loop> that closes it
+# an open tree, as exporters write it, and one <loop> that closes it
 Path("four_bar.urdf").write_text(f"""<robot name="four_bar">
   <link name="ground"/>{rod("crank", CRANK)}{rod("coupler", COUPLER)}{rod("rocker", ROCKER)}
   {pin("A", "ground", "crank", 0, 0)}
@@ -44,7 +44,7 @@ gap = np.abs(machine.closure.residual(q)).max()
 print(f"joints: {', '.join(machine.joints)}; driven: {', '.join(machine.active)}")
 print(f"the rocker swings by {np.rad2deg(np.ptp(swing)):.1f} deg, loops closed to {gap:.0e} m")
 
-# Grashof's linkage: the ends of its swing are where crank and coupler are in line
+# Grashof linkage: at the ends of its swing crank and coupler are collinear
 
 
 def inner(reach):
@@ -53,5 +53,5 @@ def inner(reach):
 
 
 expected = inner(COUPLER + CRANK) - inner(COUPLER - CRANK)
-assert abs(np.ptp(swing) - expected) < 2e-3  # the grid of 5 deg misses the very ends
+assert abs(np.ptp(swing) - expected) < 2e-3  # the grid of 5 deg does not contain the ends
 assert gap < 1e-12

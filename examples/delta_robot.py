@@ -1,4 +1,4 @@
-"""How do I write a delta robot, whose loops stand in a robot.yaml, and where is its platform?"""
+"""How do I describe a delta robot with its loops in a robot.yaml, and where is its platform?"""
 
 from pathlib import Path
 
@@ -7,12 +7,12 @@ import numpy as np
 import crane
 
 BASE, ARM, ROD, PLATFORM, WIDE = 0.2, 0.2, 0.45, 0.05, 0.04  # radii, lengths [m]
-TURNS = np.deg2rad([0.0, 120.0, 240.0])  # where the three arms are
+TURNS = np.deg2rad([0.0, 120.0, 240.0])  # directions of the three arms
 TILT = np.arctan2(-(BASE + ARM - PLATFORM), -np.sqrt(ROD**2 - (BASE + ARM - PLATFORM) ** 2))
 
 
 def link(name, mass, size):
-    """A body with its mass at its origin, and a size for its inertia [kg], [m]."""
+    """A body with its mass at its origin; `size` sets its inertia [kg], [m]."""
     inertia = " ".join(f'{axis}="{mass * size**2 / 12}"' for axis in ("ixx", "iyy", "izz"))
     return f"""
   <link name="{name}"><inertial><mass value="{mass}"/>
@@ -62,11 +62,11 @@ joint_type: {["UJOINT_YX"] * 6 + ["SPHERICAL"]}
 
 machine = crane.load("robot.yaml")
 print(machine)
-angles = np.array([0.2, -0.1, 0.4])  # of the motors, downwards [rad]
+angles = np.array([0.2, -0.1, 0.4])  # motor angles, positive downwards [rad]
 centre = crane.Kinematics(machine, "tip").position(angles)  # [m]
 print(f"the platform is at {(1e3 * centre).round(2)} mm")
 
-# by hand: it is as far from each elbow, moved inwards by the platform's radius, as a rod is long
+# by hand: its distance from each elbow, moved inwards by the platform's radius, is a rod's length
 for turn, angle in zip(TURNS, angles, strict=True):
     out = BASE + ARM * np.cos(angle) - PLATFORM
     elbow = [out * np.cos(turn), out * np.sin(turn), -ARM * np.sin(angle)]

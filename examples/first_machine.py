@@ -1,4 +1,4 @@
-"""How do I describe my first machine, a slider-crank of two dimensions?"""
+"""How do I describe my first machine, a planar slider-crank?"""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Where is the tool of a five-bar robot, and how well do its two motors move it?"""
+"""Where is the tool of a five-bar robot, and how well can its two motors move it?"""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ import numpy as np
 
 import crane
 
-BASE, CRANK, ROD = 0.3, 0.25, 0.4  # between the motors, lengths of cranks and rods [m]
+BASE, CRANK, ROD = 0.3, 0.25, 0.4  # distance of the motors, lengths of cranks and rods [m]
 
 
 def link(name, length):
@@ -18,7 +18,7 @@ def link(name, length):
 
 
 def joint(name, parent, child, x, angle, motor):
-    """A joint about z, whose zero is at an angle [rad]."""
+    """A joint about z with its zero at an angle [rad]."""
     return f"""
   <joint name="{name}" type="continuous" independent="{motor}">
     <origin xyz="{x} 0 0" rpy="0 0 {angle}"/>
@@ -46,7 +46,7 @@ q_a = np.array([0.1, -0.05])  # motors from their zeros [rad]
 place = tool.position(q_a)  # [m]
 print(f"the tool is at x = {1e3 * place[0]:.2f} mm, y = {1e3 * place[1]:.2f} mm")
 
-# by hand: the tool is where circles about the ends of both cranks meet
+# by hand: the tool is at the intersection of circles about the ends of both cranks
 a, b = (
     np.array([x + CRANK * np.cos(t), CRANK * np.sin(t)])
     for x, t in ((0.0, 2.2 + q_a[0]), (BASE, 0.9 + q_a[1]))

@@ -6,13 +6,13 @@ from scipy.interpolate import CubicSpline
 import crane
 
 held = {"q1": 0.0, "X2": 0.0108}
-machine = crane.load("mini_forwarder", lock=held)  # as its file says
+machine = crane.load("mini_forwarder", lock=held)  # the described machine
 truth = {"friction.X1.viscous": 800.0, "friction.X1.coulomb": 20.0, "link3.mass": 0.4}
-true = crane.load("mini_forwarder", lock=held, changes=truth)  # as it is, which nobody knows
+true = crane.load("mini_forwarder", lock=held, changes=truth)  # unknown in practice
 
 
 def recorded(frequencies, seed):
-    """40 s of the true machine at 100 Hz, with the noise of sensors: 1 um, 0.05 N.
+    """40 s of the true machine at 100 Hz, with sensor noise: 1 um, 0.05 N.
 
     Velocities are not measured, and the simulated ones are dropped: they would be exact.
     """
@@ -26,7 +26,7 @@ def recorded(frequencies, seed):
 
 
 learn, judge = recorded([0.05, 0.09], 1), recorded([0.04, 0.075], 2)
-before = {"bodies": "10 %", "q*.viscous": "10 %"}  # what is known of the rest, as of every drawing
+before = {"bodies": "10 %", "q*.viscous": "10 %"}  # prior of the others, as of a drawing
 found = crane.identify(machine, learn, judge, prior=before)
 print(found.to_text())
 
@@ -34,4 +34,4 @@ known = dict(zip(found.model.names, found.parameters, strict=True))
 print(f"friction of the cylinder: {known['X1.coulomb']:.1f} N, {known['X1.viscous']:.0f} N s/m")
 print(f"forces of the other recording are off by {found.validation.rmse[0]:.3f} N")
 assert abs(known["X1.coulomb"] - 20.0) < 0.2 and abs(known["X1.viscous"] - 800.0) < 40.0
-assert found.validation.rmse[0] < 0.05  # less than the noise, which the filter takes away
+assert found.validation.rmse[0] < 0.05  # less than the noise, which the filter removes

@@ -1,4 +1,4 @@
-"""How much does my crane lift where, and what ends it?"""
+"""How much can my crane lift at each position, and what is the limit?"""
 
 import matplotlib
 import numpy as np
@@ -30,7 +30,7 @@ for radius in (3.0, 4.0, 5.0):
     )
     print(f"{load:.0f} kg at {radius} m, 1 m above the ground: {why}")
 
-    # there and with that load the lift cylinder needs all the pressure that the pump has
+    # at this position and load the lift cylinder needs the full pressure of the pump
     loaded = machine.with_payload(crane.Payload(chart.frame, mass=load))
     force = crane.Dynamics(loaded).gravity(chart.q_a[0, row, column])
     i, circuit = machine.active.index("X_lift"), machine.hydraulics

@@ -1,4 +1,4 @@
-"""How do I move a machine by sliders in a browser, and end that from a program?"""
+"""How do I move a machine by sliders in a browser, and stop that from a program?"""
 
 import os
 import signal
@@ -12,7 +12,7 @@ from crane.view.live.live_server import serve_live_view
 
 machine = crane.load("patu655")
 session = Session(machine)
-posture = session.move("X_lift", 0.3)  # what a slider does [m]
+posture = session.move("X_lift", 0.3)  # the same as a slider [m]
 session.set_payload(200.0)  # [kg] at the tip
 print(f"the tip is {session.posture.tip[2]:.2f} m high, loops closed to {posture.residual:.0e} m")
 lift = machine.active.index("X_lift")
@@ -22,7 +22,7 @@ loaded = machine.with_payload(crane.Payload(machine.tip, mass=200.0))
 expected = crane.Dynamics(loaded).gravity(session.posture.q_a)
 assert np.allclose(session.posture.gravity, expected, rtol=1e-9)
 
-# Ctrl+C ends a live view; here a timer presses it after three seconds
+# Ctrl+C ends a live view; here a timer does so after three seconds
 threading.Timer(3.0, os.kill, (os.getpid(), signal.SIGINT)).start()
 serve_live_view(session)  # prints the address to open
 print("the live view has ended")

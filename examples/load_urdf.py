@@ -1,21 +1,21 @@
-"""What torques hold the arm of a URDF stretched out?"""
+"""Which torques hold the stretched arm of a URDF?"""
 
 import numpy as np
 import pinocchio as pin
 
 import crane
 
-machine = crane.load("ur5_robot")  # of example-robot-data; the path of your own file does as well
+machine = crane.load("ur5_robot")  # of example-robot-data; or the path of your own file
 print(machine)
 
-q = np.zeros(6)  # [rad], the arm points straight ahead
+q = np.zeros(6)  # [rad], the arm is stretched horizontally
 torque = crane.Dynamics(machine).gravity(q)  # [N m]
 for joint, value in zip(machine.active, torque, strict=True):
     print(f"{joint:20} {value:z8.3f} N m")
 lift = machine.active.index("shoulder_lift_joint")
 print(f"the shoulder holds {abs(torque[lift]):.1f} N m")
 
-# the same by hand: weight of the arm times how far its centre of mass is ahead of the shoulder
+# the same by hand: weight of the arm times the distance of its centre of mass from the shoulder
 model, data = machine.model, machine.model.createData()
 pin.centerOfMass(model, data, q)
 joint = model.getJointId("shoulder_lift_joint")

@@ -1,4 +1,4 @@
-"""What is the fastest way to lift, within speed and force of the cylinder?"""
+"""What is the fastest lift within speed and force of the cylinder?"""
 
 import casadi as ca
 import numpy as np
@@ -11,12 +11,12 @@ machine = crane.load(
 inverse = crane.simulation.casadi_function(machine, "inverse")  # (q, v_A, a_A) -> forces
 loops = crane.simulation.casadi_function(machine, "loops")  # q -> 0 where the loops are closed
 
-PARTS, WAY, SPEED, FORCE = 40, 0.3, 0.15, 70e3  # way of the stroke [m], limits [m/s], [N]
+PARTS, WAY, SPEED, FORCE = 40, 0.3, 0.15, 70e3  # distance of the stroke [m], limits [m/s], [N]
 lift = int(machine.closure.active[0])
 
 opti = ca.Opti()
-q = opti.variable(len(machine.home), PARTS + 1)  # all joints: loops are equations
-v, a = opti.variable(1, PARTS + 1), opti.variable(1, PARTS)  # accelerations are steps
+q = opti.variable(len(machine.home), PARTS + 1)  # all joints: loops are constraints
+v, a = opti.variable(1, PARTS + 1), opti.variable(1, PARTS)  # accelerations are piecewise constant
 duration = opti.variable()
 h = duration / PARTS
 for k in range(PARTS + 1):
@@ -38,7 +38,7 @@ found = opti.solve()
 q, v, a = found.value(q).T, found.value(v)[:, None], found.value(a)[:, None]
 print(f"{found.value(duration):.2f} s for {WAY} m")
 
-# the forces anew, and Pontryagin's principle: who is in a hurry is at a limit all the time
+# recomputed forces, and Pontryagin's principle: the fastest motion is always at a limit
 assert np.abs(machine.closure.residual(q)).max() < 1e-8
 dynamics, stroke = crane.Dynamics(machine), q[:, [lift]]
 force = np.hstack([dynamics.inverse(stroke[i], v[i], a) for i in (slice(-1), slice(1, None))])

@@ -1,4 +1,4 @@
-"""Where should the lift cylinder's pin sit, so that my crane lifts most and still reaches high?"""
+"""Which position of the lift cylinder's pin gives the largest load at a required height?"""
 
 import crane
 
@@ -17,7 +17,7 @@ for solution in found.solutions:
     print(f"pin at ({1e3 * x:.0f}, {1e3 * y:.0f}) mm: {solution.objectives[0]:.0f} kg")
 print(f"before: {found.initial.objectives[0]:.0f} kg")
 
-# the machine of the best pin, asked anew
+# check with the machine that has the best pin
 better = found.variant()
 chart = crane.capacity(better, radii=[5.0], heights=[1.0])
 assert abs(chart.loads.item() - found.solutions[0].objectives[0]) < 1e-3

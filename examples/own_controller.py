@@ -15,31 +15,31 @@ KD = np.array([1.0, 100.0, 100.0])  # [N m s/rad], [N s/m], [N s/m]
 
 
 def feedback(t, q_a, v_a):
-    """A function of time, coordinates and velocities gives forces."""
+    """Return the forces at a time, coordinates and velocities."""
     return weight + KP * (trajectory.position(t) - q_a) - KD * v_a
 
 
 class Feedback(crane.control.ControlLaw):
-    """The same in formulas, from which machine code is made."""
+    """The same as formulas, which are compiled to machine code."""
 
     def references(self, times):
-        """What depends on time alone."""
+        """Return the references, which depend on time only."""
         return trajectory.position(times)
 
     def law(self, inputs):
-        """Forces and the rates of states, of which there are none."""
+        """Return the forces, and the rates of states (none)."""
         error = np.array(inputs.reference) - np.array(inputs.q_a)
         return weight + KP * error - KD * np.array(inputs.v_a), ()
 
 
 def timed(controller):
-    """A simulation of a second, and how long it took [s]."""
+    """Simulate one second; return the recording and the computing time [s]."""
     before = time.perf_counter()
     run = crane.simulate(machine, controller, start, duration=1.0, method="rk4")
     return run, time.perf_counter() - before
 
 
-timed(Feedback(machine))  # the first time makes the machine code
+timed(Feedback(machine))  # the first call compiles
 slow, slow_time = timed(feedback)
 fast, fast_time = timed(Feedback(machine))
 print(f"function: {slow_time:.2f} s, law: {fast_time:.3f} s for one second of motion")

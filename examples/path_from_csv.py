@@ -1,4 +1,4 @@
-"""How does a crane follow a path that I have as a table?"""
+"""How does a crane follow a path from a table?"""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ import numpy as np
 
 import crane
 
-# where the tip shall be at which time; from rest to rest, as smoothly as can be
+# positions of the tip over time; from rest to rest with minimum jerk
 Path("path.csv").write_text("""time [s],x [m],y [m],z [m]
 0,4.5,0,0.0
 3,4.8,0,0.6

@@ -1,4 +1,4 @@
-"""What do the pins of an excavator bear while its bucket is loaded?"""
+"""Which forces act on the pins of an excavator while its bucket is loaded?"""
 
 import numpy as np
 
@@ -16,8 +16,8 @@ found = dict(
 for pin in ("boom", "arm", "bucket"):
     print(f"pin of the {pin}: {np.linalg.norm(found[pin][:3]) / 1e3:.0f} kN")
 
-# the first joint carries all there is: the weight of what it moves, and the load
+# the first joint carries the weight of all moving bodies, and the load
 first = reactions.names[0]
-mass = sum(inertia.mass for inertia in machine.model.inertias[1:])  # [0] stands
+mass = sum(inertia.mass for inertia in machine.model.inertias[1:])  # [0] is fixed
 print(f"the slewing ring carries {found[first][2] / 1e3:.1f} kN")
 assert np.isclose(found[first][2], 9.81 * mass + 20e3, rtol=1e-9)

@@ -1,4 +1,4 @@
-"""How do I design a regulator (LQR) for a machine, and does it hold?"""
+"""How do I design a regulator (LQR) for a machine, and does it reject a disturbance?"""
 
 import numpy as np
 from scipy.linalg import solve_continuous_are
@@ -10,7 +10,7 @@ model = crane.linearize(machine, drive="forces")  # x' = A x + B u about home, i
 n = len(machine.active)
 print(f"states: {', '.join(model.states)}")
 
-# cost: 1 mm and 1 cm/s are as bad as 200 N
+# cost: 1 mm and 1 cm/s cost as much as 200 N
 Q = np.diag([1 / 1e-3**2] * n + [1 / 1e-2**2] * n)
 R = np.eye(n) / 200.0**2
 P = solve_continuous_are(model.A, model.B, Q, R)
@@ -20,7 +20,7 @@ print(f"the slowest pole is at {poles.real.max():.1f} /s")
 
 
 def regulator(t, q_a, v_a):
-    """Forces that hold, and feedback of what is off."""
+    """Holding forces plus feedback of the deviations."""
     return model.u - K @ (np.concatenate([q_a, v_a]) - model.x)
 
 
@@ -31,7 +31,7 @@ print(
     f"strokes are {1e3 * off[0].max():.0f} mm off at first, {1e3 * off[-1].max():.1f} mm after 3 s"
 )
 
-# what is left is what friction at rest holds against the feedback; 300 N by the machine file
+# the remaining force is that of stiction, which balances the feedback; 300 N in the machine file
 left = np.abs(K[:, :n] @ (run.q[-1] - home))  # [N]
 print(f"which friction holds: {', '.join(f'{x:.0f} N' for x in left)} of 300 N")
 assert poles.real.max() < 0 and left.max() < 300.0

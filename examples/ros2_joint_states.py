@@ -1,4 +1,4 @@
-"""How do I show a closed machine in ROS 2, where only its actuators are measured?"""
+"""How do I display a closed machine in ROS 2 if only its actuators are measured?"""
 
 import io
 from types import SimpleNamespace
@@ -16,22 +16,22 @@ try:
     from std_msgs.msg import String
 
     LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-except ImportError:  # without ROS: plain messages, and a node that keeps what it would publish
+except ImportError:  # without ROS: plain messages, and a node that stores what it would publish
     rclpy, LATCHED, JointState, String = None, None, SimpleNamespace, SimpleNamespace
     published = {}
 
     class Node:
-        """As much of one as is used here."""
+        """The part of a node that is used here."""
 
         __init__ = create_subscription = lambda *_: None
 
         def create_publisher(self, kind, topic, qos):
-            """What keeps the last message by its topic."""
+            """Return a publisher that stores the last message by its topic."""
             return SimpleNamespace(publish=lambda message: published.update({topic: message}))
 
 
 class ClosedMachine(Node):
-    """From actuator_states to what robot_state_publisher and RViz take."""
+    """Convert actuator_states to the input of robot_state_publisher and RViz."""
 
     def __init__(self, machine):
         super().__init__("closed_machine")
@@ -46,7 +46,7 @@ class ClosedMachine(Node):
         given = message.name, message.position, message.velocity, message.effort
         try:
             state = self.transmission.update(*given)
-        except crane.CraneError as error:  # nothing is published, tf stays as it is
+        except crane.CraneError as error:  # nothing is published, tf does not change
             self.get_logger().warning(str(error), throttle_duration_sec=1.0)
             return
         if state is not None:
@@ -62,7 +62,7 @@ if rclpy is not None:
 else:
     node = ClosedMachine(machine)
     still = ["X_tilt", "slew", "X_ext"], [0.2, 0.5, 0.1], [0.0] * 3, []
-    for stroke in np.linspace(0.1, 0.4, 31).tolist():  # [m], its sensor sends on its own
+    for stroke in np.linspace(0.1, 0.4, 31).tolist():  # [m], its sensor sends separate messages
         for given in (still, (["X_lift"], [stroke], [0.1], [])):
             parts = zip(("name", "position", "velocity", "effort"), given, strict=True)
             node.heard(SimpleNamespace(header=None, **dict(parts)))
@@ -75,6 +75,6 @@ else:
 
     tree = yourdfpy.URDF.load(io.StringIO(description))
     tree.update_cfg(dict(zip(joints.name, joints.position, strict=True)))
-    for loop in machine.closure.equations.loops:  # cut, but its frames lie on each other in tf
+    for loop in machine.closure.equations.loops:  # cut, but its frames coincide in tf
         ends = [tree.get_transform(end)[:3, 3] for end in (loop.predecessor, loop.successor)]
         assert np.abs(ends[0] - ends[1]).max() < 1e-12

@@ -1,23 +1,23 @@
-"""How do I simulate a machine with controlled forces, and keep what came out?"""
+"""How do I simulate a machine with controlled forces, and save the results?"""
 
 import numpy as np
 
 import crane
 
 machine = crane.load("mini_forwarder")
-trajectory = crane.task_trajectory(machine, "lift")  # of its machine file
+trajectory = crane.task_trajectory(machine, "lift")  # a task of its machine file
 recording = crane.simulate(machine, crane.PI(machine, trajectory), label="lift")
 
 recording.to_csv("lift.csv")
 crane.report(machine, recording, "lift.html")  # a page that plays the motion, for any browser
 
 for joint in machine.active:
-    off = np.abs(recording.error(joint)).max()  # from its reference
+    off = np.abs(recording.error(joint)).max()  # deviation from its reference
     print(f"{joint}: off by {off:.1e} {machine.unit(joint)} at most")
 lifted = np.ptp(recording["tip_z"])
 print(f"the tip rises by {lifted:.3f} m in {recording.time[-1]:g} s")
 
-# the balance of energy: what the drives do is lifted, is in motion, or is lost to friction
+# the energy balance: the work of the drives is potential or kinetic energy, or lost to friction
 energy = {name: recording[name] for name in ("kinetic", "potential", "dissipated")}
 work = recording["work"]
 left = work - sum(x - x[0] for x in energy.values())

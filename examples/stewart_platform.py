@@ -8,13 +8,13 @@ import crane
 
 HEIGHT, MASS = 0.8, 100.0  # of the platform [m], [kg]
 around = np.deg2rad([50, 70, 170, 190, 290, 310])  # of the joints below
-above = np.deg2rad([10, 110, 130, 230, 250, 350])  # of those on the platform
+above = np.deg2rad([10, 110, 130, 230, 250, 350])  # of the joints on the platform
 low = np.column_stack([0.8 * np.cos(around), 0.8 * np.sin(around), 0 * around])  # [m]
 high = np.column_stack([0.5 * np.cos(above), 0.5 * np.sin(above), 0 * above])
 
 
 def link(name, mass, size):
-    """A body with its mass at its origin, and a size for its inertia [kg], [m]."""
+    """A body with its mass at its origin; `size` sets its inertia [kg], [m]."""
     inertia = " ".join(f'{axis}="{mass * size**2 / 12}"' for axis in ("ixx", "iyy", "izz"))
     return f"""
   <link name="{name}"><inertial><mass value="{mass}"/>
@@ -22,7 +22,7 @@ def link(name, mass, size):
 
 
 def joint(name, kind, parent, child, axis, place=(0, 0, 0), rpy=(0, 0, 0)):
-    """A joint of the URDF; strokes are driven."""
+    """A joint of the URDF; prismatic joints are driven."""
     xyz, rpy, axis = (" ".join(map(str, x)) for x in (place, rpy, axis))
     more = '<limit lower="-0.3" upper="0.3" effort="5e3" velocity="1"/>'
     return f"""
@@ -60,7 +60,7 @@ rotation = place.rotation(strokes)
 legs = np.linalg.norm(goal + high @ rotation.T - low, axis=1)  # by hand
 assert np.allclose(strokes, legs - length, atol=1e-9)
 
-force = crane.Dynamics(machine).gravity(np.zeros(6))  # level, at home [N]
-up = force @ (way[:, 2] / length)  # of all legs together [N]
+force = crane.Dynamics(machine).gravity(np.zeros(6))  # platform level, at home [N]
+up = force @ (way[:, 2] / length)  # vertical force of all legs [N]
 print(f"each leg carries {force.mean():.1f} N; together they hold {up / 9.81:.1f} kg")
-assert np.isclose(up / 9.81, MASS + 6 * 1.0)  # the platform, and rods, which end at it
+assert np.isclose(up / 9.81, MASS + 6 * 1.0)  # the platform and the rods attached to it

@@ -1,4 +1,4 @@
-"""Where should a pin sit for the least force of a cylinder?"""
+"""Which position of a pin gives the least force of a cylinder?"""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ if __name__ == "__main__":  # several processes import this file
     best = found.best_row("peak_X2")
     print(f"best: pin at {1e3 * best['link3_G.x']:.0f} mm, {best['peak_X2']:.2f} N at most")
 
-    # the same of one variant by hand: inverse dynamics along the task
+    # check of one variant: inverse dynamics along the task
     machine = crane.load("mini_forwarder", changes={"link3_G.x": best["link3_G.x"]})
     time = np.arange(0.0, 10.0025, 0.005)
     q, v, a = crane.task_trajectory(machine, "loading")(time)

@@ -7,7 +7,7 @@ import crane
 
 if __name__ == "__main__":  # workers import this file
     vary = {"payload.mass": np.linspace(0.0, 0.2, 5)}  # [kg]
-    # this computer stands for a cluster; of a real one the scheduler tells its address
+    # a local cluster; for a real one, use the address that its scheduler prints
     with LocalCluster(
         n_workers=2, threads_per_worker=1, dashboard_address=":0", silence_logs=50
     ) as cluster:

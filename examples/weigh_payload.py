@@ -1,4 +1,4 @@
-"""How heavy is the log that the crane just lifted?"""
+"""How heavy is the log that the crane has lifted?"""
 
 from dataclasses import replace
 
@@ -6,14 +6,14 @@ import numpy as np
 
 import crane
 
-LOG = 0.15  # [kg], to be found: the crane is a model on a table
+LOG = 0.15  # [kg], to be estimated; the crane is a table-top model
 
 empty = crane.load("mini_forwarder")
 loaded = crane.load("mini_forwarder", changes={"payload.mass": LOG})
 trajectory = crane.task_trajectory(loaded, "loading")
 run = crane.simulate(loaded, crane.ComputedTorque(loaded, trajectory), step=0.005)
 noise = np.random.default_rng(0).normal(size=run.tau.shape)
-recording = replace(run, tau=run.tau + 0.1 * noise)  # sensors of force: 0.1 N, 0.1 N m
+recording = replace(run, tau=run.tau + 0.1 * noise)  # noise of force sensors: 0.1 N, 0.1 N m
 
 found = crane.identification.identify_payload(empty, recording)
 low, high = found.interval()[0]

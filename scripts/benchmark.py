@@ -1,10 +1,10 @@
-"""Speed of crane against its peers on the mini forwarder, written as tables and a picture.
+"""Compare the speed of crane with other engines on the mini forwarder; write tables and a figure.
 
-All candidates of a table take turns in one process, and medians of CPU time over the rounds are
-given. Ratios carry over to other machines, times do not. Needs MuJoCo (extra "bench").
+All candidates of a table run in turns in one process; the tables give medians of CPU times over
+the rounds. Ratios apply to other computers, too, times do not. Needs MuJoCo (extra "mjcf").
 
     python scripts/benchmark.py                              # print
-    python scripts/benchmark.py --write docs/performance.md  # also into the page, with its picture
+    python scripts/benchmark.py --write docs/performance.md  # also into the page, with its figure
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""What the benchmark simulates: the mini forwarder in springs and dampers, and its own motions."""
+"""The machine of the benchmark, the mini forwarder in springs and dampers, and its motions."""
 
 import dataclasses
 
@@ -8,13 +8,9 @@ import pinocchio as pin
 import crane
 from crane.codegen import Program
 from crane.control import ControlLaw, ValveDrive
-from crane.simulation.integration import (
-    Chart,
-    ErrorControlledIntegrator,
-    FixedStepIntegrator,
-    RosenbrockStepper,
-    row_layout,
-)
+from crane.simulation.integration.charts import Chart, row_layout
+from crane.simulation.integration.integrators import ErrorControlledIntegrator, FixedStepIntegrator
+from crane.simulation.integration.rosenbrock import RosenbrockStepper
 
 Array = np.ndarray
 
@@ -118,7 +114,7 @@ class FormulaLoop:
                 r.call("formula", r.geometry, r.numbers, *rows, r.out.row(i, formula.size))
             r.return_value(r.count)
         program.compile()
-        constants = formula._compiled_closure.geometry.constants, formula._formula_constants
+        constants = formula._constants
         address = formula._program.function_address("formula")
         self._loop = program.bind("loop", len(q), address, *constants, q, self._x, self.out)
         self._each = [

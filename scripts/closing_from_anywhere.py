@@ -1,10 +1,10 @@
-"""Random mechanisms from random starts: how many close, beside scipy.optimize.least_squares.
+"""Close random mechanisms from random starts; compare with scipy.optimize.least_squares.
 
     python scripts/closing_from_anywhere.py [COUNT]
 
-Each mechanism of `mechanisms.py` is written as a file that says a random posture of its home,
-within limits, with the driven joints where it closes. Beside the search of the package stands
-scipy's trust region method with bounds, on the same residual from the same start.
+Each mechanism of `mechanisms.py` is written as a file with a random home configuration within
+limits, in which the driven joints have a value at which it closes. The search of the package is
+compared with scipy's trust region method with bounds, on the same residual from the same start.
 """
 
 import sys

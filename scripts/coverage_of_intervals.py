@@ -1,13 +1,13 @@
-"""How often the intervals of `crane.identify` cover the truth, parameter by parameter.
+"""Compute how often the intervals of `crane.identify` cover the true value of each parameter.
 
-    python scripts/coverage_of_intervals.py                       # 50 rigs as users identify them
+    python scripts/coverage_of_intervals.py                       # 50 rigs, default settings
     python scripts/coverage_of_intervals.py --method huber
-    python scripts/coverage_of_intervals.py --tuned               # settings of a user who knows
-    python scripts/coverage_of_intervals.py --noise 0.1           # sensors ten times as good
+    python scripts/coverage_of_intervals.py --tuned               # settings of an expert
+    python scripts/coverage_of_intervals.py --noise 0.1           # sensors ten times as accurate
 
-Each rig is a plant of its own, see `identify_mini_forwarder.py`. z is the error of a parameter
-over its standard deviation: its mean over the rigs tells a bias, its deviation whether standard
-deviations are right.
+Each rig has its own plant, see `identify_mini_forwarder.py`. z is the error of a parameter divided
+by its standard deviation: its mean over the rigs shows a bias, its standard deviation shows
+whether the standard deviations are correct.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Single evaluations, steps, tasks and stacks of samples, and that all engines agree."""
+"""Times of single evaluations, steps, tasks and stacks of samples; agreement of all engines."""
 
 import os
 import subprocess
@@ -71,7 +71,7 @@ def forward_dynamics(machine: crane.Machine, rounds: int) -> str:
     model, data = machine.model, machine.model.createData()
     few = samples[:100]
     calls: dict[str, Call] = {
-        "compiled backend, the formula in a loop of machine code, posture given": formula.run,
+        "compiled backend, formula in a loop of machine code, configuration given": formula.run,
         "the same, called through ctypes": formula.call_each,
         "compiled backend, a stack (loops closed, everything in machine code)": (
             lambda: ours.forward(q_a, v_a, tau)
@@ -82,10 +82,10 @@ def forward_dynamics(machine: crane.Machine, rounds: int) -> str:
         "`pin.rnea` of the spanning tree, called from Python": (
             lambda: [pin.rnea(model, data, x, rate, rate) for x, rate in states]
         ),
-        "`pin.constraintDynamics`, posture given, called from Python": (
+        "`pin.constraintDynamics`, configuration given, called from Python": (
             lambda: [peer.forward(x, rate, force) for x, rate in states]
         ),
-        "`pin.normalize`, which has nothing to do here, called from Python": (
+        "`pin.normalize`, which does nothing here, called from Python": (
             lambda: [pin.normalize(model, x) for x, _ in states]
         ),
         "Pinocchio backend, one sample called from Python (loops closed)": (
@@ -192,7 +192,7 @@ def stacks(machine: crane.Machine, rounds: int) -> str:
         {
             "`closure.solve` along a motion": lambda: closure.solve(q_a),
             "`closure.solve` at random": lambda: closure.solve(random),
-            "`closure.gamma`, postures given": lambda: closure.gamma(q),
+            "`closure.gamma`, configurations given": lambda: closure.gamma(q),
             "`Dynamics.forward` along a motion": lambda: ours.forward(q_a, v_a, rest),
             "`Dynamics.regressor` along a motion": lambda: ours.regressor(q_a, v_a, v_a),
         },

@@ -1,11 +1,12 @@
-"""Machines of any number of joints, generated: chains, trees and rings, closed at zero.
+"""Generate machines of any number of joints: chains, trees and rings, closed at zero.
 
 `chain`: four-bars in space, each on the rocker or the coupler of the one before, on a slewing
-column. `tree`: such chains as branches of a trunk, about as many as four-bars on each. `ring`: one
-large loop of revolute joints in a vertical plane; `spatial ring`: one whose axes point anywhere.
+column. `tree`: a trunk of four-bars, each with a chain of about as many four-bars as branch.
+`ring`: one large loop of revolute joints in a vertical plane; `spatial ring`: one with arbitrary
+axes.
 
-Dimensions, masses and inertias are drawn, the same ones for the same family and size. All
-machines are written as URDF with `<loop>` elements, their active joints named.
+Dimensions, masses and inertias are random, the same ones for the same family and size. All
+machines are written as URDF with `<loop>` elements and named active joints.
 """
 
 import math

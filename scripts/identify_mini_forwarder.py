@@ -1,12 +1,12 @@
-"""The mini forwarder identified on virtual rigs, whose truth is known.
+"""Identify the mini forwarder on virtual rigs with known true parameters.
 
     python scripts/identify_mini_forwarder.py            # 50 rigs, some ten minutes
     python scripts/identify_mini_forwarder.py --rigs 5
 
-Each rig is a plant with masses, inertias, centres of mass and friction drawn within tolerances. It
-follows an optimised periodic reference, and then another one that it is judged by. Geometry is
-taken as known and currents as calibrated: resistors that are off by 5 to 10 % move all forces, and
-with them all parameters, by as much, which no estimator can see.
+Each rig is a plant with random masses, inertias, centres of mass and friction within tolerances.
+It follows an optimised periodic reference, and then another one for validation. Geometry is
+assumed to be known and currents to be calibrated: resistors that are off by 5 to 10 % scale all
+forces, and with them all parameters, which no estimator can detect.
 """
 
 import argparse
@@ -18,10 +18,9 @@ from rig import Converter, Rig, Tolerances, default_sensors
 
 import crane
 from crane.identification.excitation.periodic_excitation import excite
-from crane.identification.mechanics.force_terms import friction_term
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.model_term import InertialTerm, ModelTerm
+from crane.identification.mechanics.model_terms import InertialTerm, ModelTerm, friction_term
 
 SLOW = (0.05, 0.004, 0.004)  # beyond Stribeck velocities [rad/s], [m/s]: below, friction sticks
 BANDWIDTH = 5.0  # [Hz], five times the highest harmonic

@@ -1,8 +1,8 @@
-"""Forward dynamics over the number of joints, beside pin.constraintDynamics.
+"""Forward dynamics over the number of joints, compared with pin.constraintDynamics.
 
-Every machine of `families.py` is loaded twice, in processes of their own that share a new cache
-folder: the first compiles, the second finds machine code kept. Times are CPU times; those of a
-call and of its peer take turns in one process.
+Every machine of `families.py` is loaded twice, in separate processes that share a new cache
+folder: the first compiles, the second finds machine code in the cache. Times are CPU times; calls
+of crane and of Pinocchio alternate in one process.
 
     python scripts/large_machines.py                               # all, printed
     python scripts/large_machines.py --only chain --joints 30      # one of them
@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from measuring import conditions, put, table
 
-from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR
+from crane.view.plots.figure_style import FIGURE_STYLE, INK_COLOUR
 
 SIZES = {
     "chain": (10, 19, 28, 40, 61, 100, 151, 199),
@@ -36,9 +36,9 @@ SIZES = {
 MARKS = "<!-- large machines: written by scripts/large_machines.py -->", "<!-- end of them -->"
 PICTURE = "images/large_machines.png"
 HEAD = (
-    "machine", "joints", "loops", "freedoms", "load [s]", "first call [s]", "kept [s]",
-    "one call [us], ratio", "of a stack", "of closed postures", "`pin.constraintDynamics` [us]",
-    "difference", "iterations, mu",
+    "machine", "joints", "loops", "degrees of freedom", "load [s]", "first call [s]", "kept [s]",
+    "one call [us], ratio", "of a stack", "of closed configurations",
+    "`pin.constraintDynamics` [us]", "difference", "iterations, mu",
 )  # fmt: skip
 
 

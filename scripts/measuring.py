@@ -1,4 +1,4 @@
-"""Measured times, their tables, and the section of a page that they are written into."""
+"""Measure times, format tables, and write them into a section of a page."""
 
 import importlib.metadata
 import os
@@ -51,9 +51,10 @@ def conditions() -> str:
     names = ("pin", "mujoco", "numpy", "scipy", "llvmlite")
     versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in names)
     return (
-        f"Measured with Python {platform.python_version()}, {versions} on {platform.system()}, "
-        f"{platform.machine()}, {os.cpu_count()} cores, with other work on them as of a load "
-        f"average of {os.getloadavg()[0]:.1f}: wall times suffer from it, CPU times hardly."
+        f"Measured with Python {platform.python_version()}, {versions} on "
+        f"{platform.system()}, {platform.machine()}, {os.cpu_count()} cores, at a load "
+        f"average of {os.getloadavg()[0]:.1f} due to other programs, which affects wall times "
+        "but hardly CPU times."
     )
 
 

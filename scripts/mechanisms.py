@@ -1,8 +1,8 @@
-"""Random mechanisms of twelve kinds, closed at zero by their construction, and starts far off.
+"""Random mechanisms of twelve kinds, closed at zero by construction, and distant starts.
 
 Each is built in the world: joints and loops have a point and an axis there while the machine is
-closed, and every body a frame that is turned at random. So zero closes all loops, and nothing of
-the search is used to get there.
+closed, and every body has a frame with random orientation. So all loops are closed at zero,
+without any use of the search.
 """
 
 from dataclasses import dataclass, field

@@ -1,9 +1,10 @@
-"""Forward dynamics of one machine beside pin.constraintDynamics, in a process of its own.
+"""Measure forward dynamics of one machine and pin.constraintDynamics in a process of its own.
 
     python scripts/one_machine.py MACHINE --rounds 15
 
-prints what it took as JSON: CPU times of loading, of the first call (tracing, and compiling or
-reading what is kept), and of a call, the medians of `rounds` turns; 0 rounds leave out the latter.
+prints the times as JSON: CPU times of loading, of the first call (tracing and compiling, or
+reading from the cache), and of a call, the medians of `rounds` turns; with 0 rounds the latter are
+omitted.
 """
 
 import argparse

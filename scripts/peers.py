@@ -1,7 +1,7 @@
 """The other engines of the benchmark: Pinocchio's constraint dynamics, and MuJoCo.
 
 Both simulate a machine without friction and end stops, with springs and dampers at its joints,
-from the same closed posture and the same velocities as `crane.simulate` does.
+from the same closed configuration and the same velocities as `crane.simulate`.
 """
 
 from typing import Any

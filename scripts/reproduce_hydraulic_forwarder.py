@@ -1,10 +1,10 @@
-"""The electro-hydraulic forwarder paper's experiment on the full-size crane, in simulation.
+"""Repeat the experiment of the electro-hydraulic forwarder paper on a simulated full-size crane.
 
     python scripts/reproduce_hydraulic_forwarder.py                # print
     python scripts/reproduce_hydraulic_forwarder.py --write docs/validation/hydraulic_forwarder.md
 
-Motions, logger with noise, Kalman estimates, averages, least squares: as the paper did, with the
-calls that serve a real crane, and the truth to compare with.
+Motions, logger with noise, Kalman estimates, averages and least squares are those of the paper,
+with the functions that are used for a real crane; the results are compared with the true values.
 """
 
 import argparse

@@ -1,9 +1,9 @@
-"""The reduced-scale forwarder paper again: its tables and figures beside ours.
+"""Repeat the reduced-scale forwarder paper: compare its tables and figures with this package.
 
     python scripts/reproduce_mini_forwarder.py                        # print
     python scripts/reproduce_mini_forwarder.py --write docs/validation/mini_forwarder.md
 
-Nothing is fitted to the published numbers except the two pins that the paper does not print.
+Nothing is fitted to the published values except the two pins that the paper does not give.
 """
 
 import argparse

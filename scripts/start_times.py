@@ -1,4 +1,4 @@
-"""What starting costs in the benchmark: processes, tracing and compiling."""
+"""Starting times in the benchmark: processes, tracing and compiling."""
 
 import json
 import os
@@ -19,7 +19,8 @@ from crane.control import PI
 from crane.description import example_robots
 from crane.dynamics.compiled_dynamics import QUANTITIES
 from crane.motion.task_trajectories import task_trajectory
-from crane.simulation.integration import Chart, RungeKuttaStepper
+from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.machine_code_stepper import RungeKuttaStepper
 
 _MAIN = "import sys; sys.argv[0] = 'crane'; import crane.cli; crane.cli.main()"
 _FORWARD = (
@@ -45,14 +46,14 @@ def starts(rounds: int) -> str:
             for name, arguments in _processes()
         ]
     first = _both(lambda: _process((_MAIN, *_RUN), None), rounds)
-    rows.append(("the simulation, where neither bytecode nor machine code is kept", *first))
-    title = "process; bytecode, machine code and results are kept"
+    rows.append(("the simulation with an empty cache (no bytecode, no machine code)", *first))
+    title = "process; bytecode, machine code and results in the cache"
     processes = table((title, "wall [s]", "CPU [s]"), rows)
     # in processes of their own: machines of equal formulas share their machine code
     with tempfile.TemporaryDirectory() as kept:
         first, later = (_spent(kept) for _ in range(2))
     each = [(name, f"{seconds:.3f}", f"{later[name]:.3f}") for name, seconds in first.items()]
-    title = "tracing and compiling, or reading what is kept"
+    title = "tracing and compiling, or reading from the cache"
     return f"{processes}\n\n{table((title, 'first time [s]', 'later [s]'), each)}"
 
 

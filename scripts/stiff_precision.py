@@ -1,8 +1,9 @@
-"""Work and precision of the methods on stiff machines, times over errors: picture and table.
+"""Work and precision of the methods on stiff machines, times over errors: figure and table.
 
-All in one run on one machine; what counts are ratios. Errors are those of recorded coordinates,
-in rad and machine's size, against DOP853 with a tolerance of 1e-13. What a call costs beside its
-steps, reading its arguments and judging what came out, is told apart: a run of a nanosecond.
+All methods run in one process on one computer; only ratios are significant. Errors are those of
+recorded coordinates, in rad and characteristic lengths, against DOP853 with a tolerance of 1e-13.
+The overhead of a call (reading its arguments, checking the result) is measured separately by a run
+of a nanosecond.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Cranes on their valves: minutes of levers, beside scipy, with a grapple and on the ground."""
+"""Cranes on valves: minutes of levers, compared with scipy, with a grapple and on the ground."""
 
 import tempfile
 import time

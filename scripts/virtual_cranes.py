@@ -1,10 +1,10 @@
-"""Calibrations of virtual log cranes whose files are wrong, and how often intervals hold.
+"""Calibrate virtual log cranes with wrong files; count how often intervals cover the true values.
 
     python scripts/virtual_cranes.py [COUNT]
 
-Each crane is `patu655` with twelve numbers that are off: friction ten times, modulus half, air in
-a chamber, neutrals by up to 30 mV, all else by up to 30 %. A joystick's motion of 20 s is recorded
-at 100 Hz with noise, its first 12 s are fitted from the file's numbers, the rest is held out.
+Each crane is `patu655` with twelve wrong parameters: friction ten times, modulus half, air in
+a chamber, neutrals by up to 30 mV, all others by up to 30 %. A lever motion of 20 s is recorded
+at 100 Hz with noise; its first 12 s are fitted from the file's values, the rest is held out.
 """
 
 import fnmatch

@@ -1,4 +1,4 @@
-"""Tip error over CPU time of all engines: table, interpolation and picture."""
+"""Tip error over CPU time of all engines: table, interpolation and figure."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,8 +14,9 @@ from scipy.integrate import solve_ivp
 import crane
 from crane.control import ZeroForce
 from crane.motion.kinematics import Kinematics
-from crane.simulation.integration import Chart, PythonStepper
-from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, RECORDED_COLOUR
+from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.python_stepper import PythonStepper
+from crane.view.plots.figure_style import FIGURE_STYLE, INK_COLOUR, RECORDED_COLOUR
 
 Tip = Callable[[], np.ndarray | None]  # its position (3,) [m], None if unstable
 Engine = Callable[[float], Tip]  # runs with a step [s]

@@ -11,7 +11,6 @@ import pytest
 import crane
 from crane.closure.active_joint_selection import (
     condition_number,
-    motion_scales,
     null_space_basis,
     select_columns,
 )
@@ -289,7 +288,7 @@ def everywhere(machine):
 def test_condition_is_that_of_the_orthonormal_equations(mini, stewart, five_bar):
     """||D^-1 gamma D_A|| against 1 / sigma_min(N_A) and 1 / sigma_min(J_P), rows orthonormal."""
     for machine in (mini, stewart, five_bar):
-        closure, scale = machine.closure, motion_scales(machine.model)
+        closure, scale = machine.closure, machine.closure.equations.motion_scales
         jacobian = closure.equations.evaluate(machine.home)[1]
         basis = null_space_basis(jacobian, scale, 1e-8)
         found = float(closure.condition_number(machine.home))
@@ -316,7 +315,7 @@ def test_choices_are_near_the_best(mini, five_bar, tmp_path):
             continue
     assert len(machines) > 6
     for machine in machines:
-        closure, scale = machine.closure, motion_scales(machine.model)
+        closure, scale = machine.closure, machine.closure.equations.motion_scales
         jacobian = closure.equations.evaluate(machine.home)[1]
         basis = null_space_basis(jacobian, scale, 1e-8)
         chosen = select_columns(basis, range(machine.model.nv))
@@ -333,7 +332,7 @@ def test_choices_are_near_the_best(mini, five_bar, tmp_path):
 
 def test_condition_does_not_depend_on_units(five_bar):
     """Equations multiplied by anything, a machine ten times as large."""
-    closure, scale = five_bar.closure, motion_scales(five_bar.model)
+    closure, scale = five_bar.closure, five_bar.closure.equations.motion_scales
     gamma = closure.gamma(five_bar.home)
     assert condition_number(gamma, 7.0 * scale, closure.active) == pytest.approx(
         float(condition_number(gamma, scale, closure.active))

@@ -22,7 +22,7 @@ from crane.codegen import Program
 from crane.codegen.llvm.machine_code import emit_module
 from crane.codegen.program_cache import cache_entry_name
 from crane.dynamics import compiled_dynamics as quantities
-from crane.motion.compiled_frame import CompiledFrame, CompiledPoint
+from crane.motion.frame_kinematics import CompiledFrame, CompiledPoint
 
 DATA = Path(__file__).parent / "data"
 MACHINES = ("slider_crank.yaml", "five_bar.urdf", "stewart.urdf")

@@ -19,8 +19,8 @@ from matplotlib.path import Path
 import crane
 from crane.ratings.capacity_report import load_table, slew_labels
 from crane.view.page.capacity_page import capacity_page_data, write_capacity_page
-from crane.view.plots.capacity_figure import _draw_contours, capacity_figure, load_contours
 from crane.view.plots.capacity_sheet import capacity_sheet_figure
+from crane.view.plots.rating_figures import _draw_contours, capacity_figure, load_contours
 from crane.view.sketches.mechanism_projection import machine_outline
 
 G = np.array([0.0, 0.0, -9.81])

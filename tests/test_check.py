@@ -639,10 +639,10 @@ SECTIONS = [
         "a loop with four slips",
         [
             "four_bar.yaml:10: error: 'name' of a loop is 4, give text (or quote it)",
+            "four_bar.yaml:10: error: 'type' of a loop: 'hinge' is unknown, known: "
+            "cylindrical, fixed, planar, prismatic, revolute, spherical",
             "four_bar.yaml:10: error: a loop has the unknown predecessor 'coupler_pn', did "
             "you mean 'coupler_pin'?",
-            "four_bar.yaml:10: error: a loop has the unknown type 'hinge', known: "
-            "cylindrical, fixed, planar, prismatic, revolute, spherical",
             "four_bar.yaml:10: error: the axis of a loop is no direction, give three "
             "numbers, not all zero",
         ],

@@ -10,7 +10,7 @@ import crane
 from crane.common.errors import SimulationError
 from crane.control.levers import LeverPhases
 from crane.description import bundled_machines
-from crane.description.task_phases import Phase
+from crane.description.specification import Phase
 from crane.formats.checks import check
 
 VIA = (

@@ -14,8 +14,8 @@ import pytest
 from crane.codegen import Program, SymbolicExpression, Tape, max_abs, maximum
 from crane.codegen.llvm import formula_emitter as llvm_formulas
 from crane.codegen.llvm.machine_code import emit_module
-from crane.codegen.matrix_factorization import LdltFactorization
 from crane.codegen.symbolic import (
+    LdltFactorization,
     add_vectors,
     apply_function,
     copysign,

@@ -269,7 +269,7 @@ def test_postures_equal_those_tracked_in_numpy(machines, name, share):
     q_a = draw(machine, 60, 3, share)["q"]
     if name == "slider_crank":
         q_a = np.random.default_rng(1).uniform(0.15, 2.9, (60, 1))
-    branch = closure._solver.continuation
+    branch = closure.continuation
     wanted = np.array([branch.continue_to(target, branch.home).q for target in q_a])
     assert np.abs(closure.solve(q_a) - wanted).max() < 1e-12
     assert np.abs(closure.solve(q_a[::-1])[::-1] - wanted).max() < 1e-12
@@ -286,7 +286,7 @@ def test_postures_equal_those_tracked_in_numpy(machines, name, share):
 def test_a_folded_region_is_told_apart_from_the_branch(five_bar):
     """Five-bar far apart: same verdict as the closure in numpy, and the same posture."""
     closure = five_bar.closure
-    branch = closure._solver.continuation
+    branch = closure.continuation
     home = np.array(five_bar.home[closure.active])
     closed = 0
     for target in home + np.random.default_rng(2).uniform(-2.5, 2.5, (80, 2)):

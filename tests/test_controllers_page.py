@@ -10,7 +10,8 @@ import pytest
 import crane
 from crane.common.errors import CraneWarning, InputError
 from crane.control import ControlLaw
-from crane.simulation.integration import PythonStepper, RungeKuttaStepper
+from crane.simulation.integration.machine_code_stepper import RungeKuttaStepper
+from crane.simulation.integration.python_stepper import PythonStepper
 
 PAGE = Path(__file__).parents[1] / "docs" / "controllers.md"
 

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from crane.view.plots import figure_text
+from crane.view.plots import figure_style
 
 
 @pytest.mark.parametrize("count", [1, 7, 100, 101, 999, 4321])
 def test_an_envelope_has_all_that_can_be_seen(monkeypatch, count):
-    monkeypatch.setattr(figure_text, "_MAX_POINTS", 100)
+    monkeypatch.setattr(figure_style, "_MAX_POINTS", 100)
     rng = np.random.default_rng(count)
     time, values = np.arange(float(count)), rng.normal(size=count)
-    at, kept = figure_text.envelope(time, values)
+    at, kept = figure_style.envelope(time, values)
     assert len(at) <= max(2 * 100, 6) and (np.diff(at) > 0).all()
     np.testing.assert_array_equal(values[at.astype(int)], kept)
     assert (at[0], at[-1]) == (0, count - 1)
@@ -28,9 +28,9 @@ def test_an_envelope_has_all_that_can_be_seen(monkeypatch, count):
 
 
 def test_a_path_keeps_its_ends(monkeypatch):
-    monkeypatch.setattr(figure_text, "_MAX_POINTS", 100)
+    monkeypatch.setattr(figure_style, "_MAX_POINTS", 100)
     points = np.random.default_rng(0).normal(size=(1234, 3))
-    path = figure_text.thin_path(points)
+    path = figure_style.thin_path(points)
     assert len(path) <= 101
     np.testing.assert_array_equal(path[[0, -1]], points[[0, -1]])
-    np.testing.assert_array_equal(figure_text.thin_path(points[:100]), points[:100])
+    np.testing.assert_array_equal(figure_style.thin_path(points[:100]), points[:100])

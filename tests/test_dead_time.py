@@ -9,7 +9,7 @@ import crane
 from crane.common.errors import CraneError
 from crane.control import ValveCommand, ValveSignals
 from crane.control.control_law import ControllerInputs
-from crane.identification.excitation.pulse_signals import PulseSignals
+from crane.identification.excitation.exchange_algorithm import PulseSignals
 
 W = 40.0  # of a critically damped spool [rad/s]
 LATE = 0.01337  # [s], no multiple of anything

@@ -5,18 +5,16 @@ import pytest
 
 from crane.codegen import Program, Tape
 from crane.codegen.differentiation import differentiate, weighted_gradient
-from crane.codegen.matrix_factorization import (
-    load_matrix,
-    lu_factorize,
-    lu_solve,
-    symbolic_entries,
-)
 from crane.codegen.symbolic import (
     apply_function,
     copysign,
     dot_products,
+    load_matrix,
+    lu_factorize,
+    lu_solve,
     maximum,
     minimum,
+    symbolic_entries,
     where_positive,
 )
 

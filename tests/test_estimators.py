@@ -7,12 +7,12 @@ from scipy.stats import f, t
 
 from crane.common.errors import InputError
 from crane.identification.estimation.estimators import (
-    essential_parameters,
     huber,
     instrumental_variables,
     least_squares,
     weighted_least_squares,
 )
+from crane.identification.mechanics.identifiability import essential_parameters
 
 
 def white(count=800, size=4, seed=0, noise=0.5):
@@ -145,13 +145,6 @@ def test_intervals_cover_the_truth(estimator, kind, strength, gaps, count):
         low, high = estimator(W[kept], y[kept], groups[kept], samples[kept]).interval().T
         covered.append((low < truth) & (truth < high))
     assert 0.90 <= np.mean(covered) <= 0.99
-
-
-def test_effective_rows_of_autoregressive_noise():
-    rng = np.random.default_rng(5)
-    W = rng.standard_normal((20_000, 2))
-    found = least_squares(W, draw("ar", 0.9, rng, 20_000, 1)[:, 0])
-    assert found.effective_samples[0] == pytest.approx(20_000 * 0.1 / 1.9, rel=0.15)
 
 
 def test_essential_parameters():

@@ -7,7 +7,7 @@ from forwarder_motions import motion
 
 import crane
 from crane.dynamics import Dynamics
-from crane.identification.mechanics import force_delays
+from crane.identification.mechanics import force_comparison
 from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.identify_payload import identify_payload
 from crane.recordings import Recording
@@ -51,7 +51,7 @@ def test_delays_are_looked_for_in_few_samples(mini, recording, monkeypatch):
     N = len(recording.time)
     with passes(monkeypatch) as count:
         identify(mini, recording)
-    assert count["closed"] <= N + min(force_delays._MAX_SAMPLES, N) + ASIDE
+    assert count["closed"] <= N + min(force_comparison._MAX_SAMPLES, N) + ASIDE
 
 
 def test_a_sample_is_closed_once_on_its_way_to_the_payload(mini, recording, monkeypatch):

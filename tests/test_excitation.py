@@ -9,7 +9,7 @@ from crane.common.errors import InputError
 from crane.identification.excitation.fisher_information import FisherInformation
 from crane.identification.excitation.fourier_trajectory import FourierTrajectory, fourier_basis
 from crane.identification.excitation.periodic_excitation import excite
-from crane.identification.excitation.trajectory_limits import singularity_proximity
+from crane.identification.excitation.trajectory_optimizer import singularity_proximity
 from crane.identification.mechanics.base_parameters import base_parameters, random_samples
 from crane.identification.mechanics.identification_model import IdentificationModel
 

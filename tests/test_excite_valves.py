@@ -9,7 +9,7 @@ from hydraulic_rig import COMPENSATED, ORIFICE, rig
 
 import crane
 from crane.common.errors import CraneError
-from crane.identification.excitation.pulse_signals import full_opening_speed
+from crane.identification.excitation.exchange_algorithm import full_opening_speed
 from crane.identification.excitation.signal_information import SignalInformation
 from crane.recordings import timeseries
 

@@ -334,7 +334,7 @@ def test_wrong_loads_of_a_machine_file_are_told_with_their_line(pushed):
         ("force: [3, 0, 0], name", "name", "yaml:7: .*does nothing"),
         ("frame: block, force", "frame: base, force", "yaml:7: .*does not move"),
         ("frame: block, force", "frame: nix, force", "yaml:7: .*'nix'"),
-        ("name: push}", "axes: up}", "yaml:7: .*'world' or 'frame'"),
+        ("name: push}", "axes: up}", "yaml:7: 'axes' of a load: 'up' is unknown"),
         ("name: push}", "name: block}", "two loads are called 'block'"),
         ("times: [0, 2]", "times: [2, 0]", "yaml:8: .*do not rise"),
     ):

@@ -12,9 +12,8 @@ from matplotlib.figure import Figure
 import crane
 from crane.recordings.recording import Recording
 from crane.view.plots.calibration_figure import comparison_figure
-from crane.view.plots.figure_text import escape_label
+from crane.view.plots.figure_style import escape_label, joint_symbol, write_figure
 from crane.view.plots.identification_figures import correlation_figure
-from crane.view.plots.recording_figure import joint_symbol, write_figure
 from crane.view.result_files import plot_result
 from crane.view.sketches.sketch_canvas import format_joint_symbol
 from crane.view.sketches.sketch_figure import sketch

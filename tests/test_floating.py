@@ -88,6 +88,15 @@ def test_an_open_tree_is_pinocchios(arm):
         np.testing.assert_allclose(dynamics.inverse(q, v, x), wanted, atol=1e-11)
 
 
+def coordinates_of(machine, configuration):
+    """Coordinates (nv,) from Pinocchio's configuration with one floating base."""
+    coordinates, first = machine.coordinates, machine.coordinates.floating_base_columns[0]
+    at = machine.model.joints[int(coordinates.joints[first])].idx_q
+    out = configuration[coordinates._configuration_indices]
+    out[first + 3 : first + 6] = pin.log3(pin.Quaternion(configuration[at + 3 : at + 7]).matrix())
+    return out
+
+
 def test_the_tip_moves_as_its_jacobian_says(arm):
     kinematics = crane.Kinematics(arm, "lower")
     for q, v, _ in states(arm, 3, seed=2):
@@ -95,7 +104,7 @@ def test_the_tip_moves_as_its_jacobian_says(arm):
         ends = []
         for sign in (1, -1):
             at = pin.integrate(arm.model, arm.coordinates.configuration(q), sign * h * v)
-            ends.append(kinematics.position(arm.coordinates.from_configuration(at)))
+            ends.append(kinematics.position(coordinates_of(arm, at)))
         slope = (ends[0] - ends[1]) / (2 * h)
         np.testing.assert_allclose(kinematics.jacobian(q) @ v, slope, atol=1e-8)
 

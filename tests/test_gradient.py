@@ -122,13 +122,13 @@ def both(machine, controller, initial, duration, by, outputs, accuracy):
     base = asked.directions.nominal_constants(track.time)
     sizes = {name: asked.directions.typical_change(name) for name in by}
     stacked = SimulationConstants(*map(np.array, zip(*directions.values(), strict=True)))
-    forward = variational_integration.integrate_sensitivities(
+    _, forward = variational_integration.integrate_sensitivities(
         asked.simulation,
         outputs,
         lambda _: (base, stacked),
         np.array(list(sizes.values())),
         accuracy,
-    ).derivatives
+    )
     weights = np.random.default_rng(0).normal(size=(several, *forward.shape[:2]))
     gatherer = adjoint_integration.AdjointIntegrator(
         track, outputs, base, _largest_changes(directions, sizes), accuracy

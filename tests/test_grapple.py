@@ -10,8 +10,8 @@ from scipy.interpolate import make_interp_spline
 import crane
 from crane.common.errors import CraneError
 from crane.control.valve_feedforward import largest_flow_share
-from crane.motion.sway import Sway
-from crane.motion.sway_suppression import SWAY_METHODS, input_shaper, retime, suppress_sway
+from crane.motion.sway import SWAY_METHODS, Sway, input_shaper, suppress_sway
+from crane.motion.trajectory import retime
 
 pytestmark = pytest.mark.slow
 
@@ -436,4 +436,6 @@ def test_a_run_of_the_command_line(tmp_path):
     done = typed("simulate", NAME, "--duration", "1", "--sway", "flat", "--out", tmp_path / "x")
     assert done.stderr == "error: --sway changes a reference, name a --task or a --path\n"
     done = typed("simulate", NAME, "--task", "stir", "--sway", "flat", "--out", tmp_path / "x")
-    assert done.stderr == "error: task 'stir' moves levers, leave --sway out\n"
+    assert done.stderr == (
+        "error: --sway does not go with task 'stir', which moves levers, leave it out\n"
+    )

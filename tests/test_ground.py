@@ -284,7 +284,9 @@ def test_a_root_has_the_freedoms_that_are_named(block, tmp_path):
     with pytest.raises(CraneError, match="floating is 'z', give True or some of x, y, z"):
         crane.load(tmp_path / "root.urdf", floating="z")
     path.write_text(text.replace("[ry, z]", "[ry, zz]"))
-    with pytest.raises(CraneError, match=r"rocking.yaml:\d+: freedom 'zz' of the root is unknown"):
+    with pytest.raises(
+        CraneError, match=r"rocking.yaml:\d+: 'floating' of the machine file: 'zz' is unknown"
+    ):
         crane.load(path)
 
 

@@ -25,7 +25,7 @@ from crane.identification.hydraulics.orifice_equations import (
     chamber_terms,
 )
 from crane.identification.hydraulics.valve_curve import identify_valve
-from crane.identification.signals.steady_samples import steady_means, steady_samples
+from crane.identification.signals.signal_quality import steady_means, steady_samples
 
 pytestmark = pytest.mark.slow
 

@@ -13,18 +13,15 @@ from crane.identification.mechanics.base_parameters import (
     group_parameters,
     random_samples,
 )
-from crane.identification.mechanics.force_terms import (
-    ForceElementTerm,
+from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.model_terms import (
+    ForceDirection,
     GasSpringTerm,
+    InertialTerm,
     PreslidingFriction,
+    RotorInertiaTerm,
     VelocityFriction,
     friction_term,
-)
-from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.model_term import (
-    ForceDirection,
-    InertialTerm,
-    RotorInertiaTerm,
 )
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
@@ -255,7 +252,7 @@ def test_the_model_is_the_inverse_dynamics(mini):
         assert np.abs(found - tau).max() < 1e-11 * np.abs(tau).max()
 
 
-def test_gas_and_springs_of_unknown_scale(mini):
+def test_gas_of_unknown_scale(mini):
     gas = crane.description.GasSpring("q7", 1e-4, 1e5, 1e-4, 0.7, 1.3)
     machine = mini.replace(friction={}, gas_springs=(gas,))
     model = IdentificationModel(machine, [InertialTerm(machine), GasSpringTerm(machine, "q7")])
@@ -264,17 +261,6 @@ def test_gas_and_springs_of_unknown_scale(mini):
     found = model.regressor(samples) @ model.nominal + model.known_forces(samples)
     assert np.abs(found - tau).max() < 1e-11 * np.abs(tau).max()
     assert model.names[-1] == "q7.gas_scale" and model.nominal[-1] == 1.0
-    spring = mini.replace(
-        friction={}, forces=(crane.description.ForceElement("q3", stiffness=2.0),)
-    )
-    shaped = IdentificationModel(
-        mini.replace(friction={}, forces=()),
-        [InertialTerm(mini), ForceElementTerm(mini, "q3", lambda q: -q, "stiffness", 2.0)],
-    )
-    tau = crane.Dynamics(spring).inverse(samples.q_a, samples.v_a, samples.a_a)
-    found = shaped.regressor(samples) @ shaped.nominal + shaped.known_forces(samples)
-    bare = crane.Dynamics(mini.replace(friction={})).passive(samples.q_a, samples.v_a)
-    assert np.abs(found - tau).max() < 1e-10 * np.abs(tau).max() and np.isfinite(bare).all()
 
 
 def test_friction_along_a_coupled_motor():

@@ -16,10 +16,9 @@ from crane.identification.estimation.estimators import least_squares
 from crane.identification.excitation.periodic_excitation import excite
 from crane.identification.mechanics.base_parameters import base_parameters, random_samples
 from crane.identification.mechanics.feasible_parameters import pseudo_inertia
-from crane.identification.mechanics.force_terms import friction_term
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.model_term import InertialTerm
+from crane.identification.mechanics.model_terms import InertialTerm, friction_term
 from crane.identification.mechanics.smoothed_motion import smoothed_motion
 from crane.identification.signals.signal_processing import Motion
 

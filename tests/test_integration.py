@@ -6,8 +6,9 @@ from scipy.integrate import solve_ivp
 
 import crane
 import crane.codegen.program
-import crane.simulation.integration
 from crane.common.errors import SimulationError
+from crane.simulation.integration.machine_code_stepper import RungeKuttaStepper
+from crane.simulation.integration.python_stepper import PythonStepper
 
 
 def simulate(*arguments, method="rk4", **settings):
@@ -84,8 +85,8 @@ def steps(monkeypatch):
     """How many steps were done in machine code and how many in Python."""
     done = {"compiled": 0, "python": 0}
     run, advance = (
-        crane.simulation.integration.RungeKuttaStepper.run,
-        crane.simulation.integration.PythonStepper.advance,
+        RungeKuttaStepper.run,
+        PythonStepper.advance,
     )
 
     def counted_run(self, *rest):
@@ -97,8 +98,8 @@ def steps(monkeypatch):
         done["python"] += 1
         return advance(self, *rest)
 
-    monkeypatch.setattr(crane.simulation.integration.RungeKuttaStepper, "run", counted_run)
-    monkeypatch.setattr(crane.simulation.integration.PythonStepper, "advance", counted_advance)
+    monkeypatch.setattr(RungeKuttaStepper, "run", counted_run)
+    monkeypatch.setattr(PythonStepper, "advance", counted_advance)
     return done
 
 
@@ -242,7 +243,7 @@ def test_durations_around_whole_chunks(springy, steps, count):
 def test_steps_that_machine_code_leaves_are_done_in_python(forwarder, path, monkeypatch):
     control = crane.PI(forwarder, path)
     whole = simulate(forwarder, control, duration=0.1)
-    run = crane.simulation.integration.RungeKuttaStepper.run
+    run = RungeKuttaStepper.run
     left = []
 
     def hesitant(self, times, *rest):
@@ -251,7 +252,7 @@ def test_steps_that_machine_code_leaves_are_done_in_python(forwarder, path, monk
         left.append(len(few))
         return run(self, few, *rest)
 
-    monkeypatch.setattr(crane.simulation.integration.RungeKuttaStepper, "run", hesitant)
+    monkeypatch.setattr(RungeKuttaStepper, "run", hesitant)
     parts = simulate(forwarder, control, duration=0.1)
     assert len(left) > 5
     assert off(parts, whole) < 1e-11

@@ -216,7 +216,7 @@ def test_the_machine_is_in_view_and_above_the_panel_of_a_phone(patu, aspect):
     pytest.importorskip("viser")
     from crane.view.live.live_scene import LiveScene, _shape_corners
     from crane.view.live.live_server import AccessGuard, start_server, stop_server
-    from crane.view.page.machine_visuals import read_visuals
+    from crane.view.page.scene import read_visuals
 
     session = Session(patu)
     server = start_server(AccessGuard("127.0.0.1"), 0)

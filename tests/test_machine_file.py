@@ -563,12 +563,12 @@ NAMES = [
     ),
     case(
         "misspelt loop type",
-        "four_bar.yaml:10: loop 'pin' has the unknown type 'revolve', did you mean 'revolute'?",
+        "four_bar.yaml:10: 'type' of loop 'pin': 'revolve' is unknown, did you mean 'revolute'?",
         swap("type: revolute", "type: revolve"),
     ),
     case(
         "unknown loop type",
-        "four_bar.yaml:10: loop 'pin' has the unknown type 'hinge', known: "
+        "four_bar.yaml:10: 'type' of loop 'pin': 'hinge' is unknown, known: "
         "cylindrical, fixed, planar, prismatic, revolute, spherical",
         swap("type: revolute", "type: hinge"),
     ),

@@ -14,7 +14,7 @@ from linkages import WRITERS, assert_same, postures, rewritten
 import crane
 from crane.common.errors import CraneError, CraneWarning
 from crane.formats.checks import check
-from crane.formats.mjcf.unsupported_features import colliding_geoms
+from crane.formats.mjcf.model_features import colliding_geoms
 
 TREE = """<mujoco model="tree">
   <compiler angle="degree" eulerseq="zyx"/>

@@ -44,7 +44,6 @@ CLASSES = {
     *("Strokes", "Study", "Supply", "Sway", "Table", "Tape", "Task", "Torques", "Trajectory"),
     *("Transmission", "Tree", "Unknown", "Valve", "Visual", "Workspace", "Wrench"),
     *("_Line", "_Stream", "_Subtree"),
-    *("Assign", "Break", "Call", "Copy", "If", "Loop", "Return", "Store"),  # statements
 }
 FILES = {
     *(

@@ -15,9 +15,9 @@ from executed_lines import at_most
 import crane
 from crane.common.errors import CraneWarning, RecordingError
 from crane.recordings.recording import Recording
-from crane.view.page.machine_visuals import read_visuals
 from crane.view.page.page_channels import ThinningGrid, page_columns, plot_groups
-from crane.view.page.run_summary import mechanical_work, reached_limit_sentences, summarize_run
+from crane.view.page.report_page import mechanical_work, reached_limit_sentences, summarize_run
+from crane.view.page.scene import read_visuals
 
 DATA = Path(__file__).parent / "data"
 WEBGL = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]

@@ -11,8 +11,7 @@ import crane
 from crane.common.errors import CraneWarning
 from crane.formats.visuals.urdf_shapes import BoxShape, CylinderShape
 from crane.view.page.force_markers import full_arrow_forces, spring_markers
-from crane.view.page.machine_visuals import read_visuals, sliding_body_visuals
-from crane.view.page.scene import build_scene, link_poses
+from crane.view.page.scene import build_scene, link_poses, read_visuals, sliding_body_visuals
 
 DATA = Path(__file__).parent / "data"
 SPRINGS = """forces:

@@ -8,9 +8,9 @@ import crane
 from crane.common.errors import InputError
 from crane.description import Friction
 from crane.description.estimation_settings import ParameterPrior
+from crane.identification.mechanics.identifiability import prior_from_names
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.identify import Motion, identify
-from crane.identification.mechanics.priors import prior_from_names
 
 TIME = np.arange(0, 8, 0.01)
 W = np.pi

@@ -9,9 +9,10 @@ from pathlib import Path
 import forwarder_motions
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import crane
-from crane.identification.estimation import regression_problem, regressor
+from crane.identification.estimation import estimators, regressor
 from crane.identification.estimation.estimators import (
     huber,
     instrumental_variables,
@@ -19,11 +20,13 @@ from crane.identification.estimation.estimators import (
     weighted_least_squares,
 )
 from crane.identification.mechanics import regression_equations
-from crane.identification.mechanics.equation_setup import build_equations
-from crane.identification.mechanics.force_terms import PreslidingFriction
 from crane.identification.mechanics.identification_model import IdentificationModel, default_terms
-from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.regression_equations import RegressionEquations
+from crane.identification.mechanics.identify import build_equations, identify
+from crane.identification.mechanics.model_terms import PreslidingFriction
+from crane.identification.mechanics.regression_equations import (
+    ProjectedRegressor,
+    RegressionEquations,
+)
 from crane.identification.signals import kalman_smoother
 from crane.identification.signals.signal_processing import Motion, filter_rows
 
@@ -60,10 +63,10 @@ def test_estimates_do_not_depend_on_the_blocks(estimator, prior, monkeypatch):
     whole = estimator(parts[0], y, *parts[1:], groups=groups, samples=samples, prior=prior)
     stored = regressor.StoredRegressor.__init__.__defaults__
     monkeypatch.setattr(regressor.StoredRegressor.__init__, "__defaults__", (50,))
-    monkeypatch.setattr(regression_problem, "_GAP_BLOCK", 7)
+    monkeypatch.setattr(estimators, "_GAP_BLOCK", 7)
     found = estimator(parts[0], y, *parts[1:], groups=groups, samples=samples, prior=prior)
     assert stored == (8192,)  # what the first call had: all rows in one block
-    keys = ("values", "covariance", "residuals", "noise", "effective_samples")
+    keys = ("values", "covariance", "residuals", "noise")
     for key in (*keys, "degrees_of_freedom", "condition"):
         one, other = getattr(found, key), getattr(whole, key)
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(other).max())
@@ -79,7 +82,7 @@ def test_covariance_is_that_of_all_rows_at_once():
     found = least_squares(W, y, groups - 1, samples)
     noise = NoiseModel.fit(found.residuals / found.noise, samples)
     impulse = np.eye(1, 2000)
-    answer, _ = noise.apply_filter(impulse, noise.zero_state(1))
+    answer = lfilter([1.0], noise.a, impulse)
     lags = np.correlate(answer[0], answer[0], "full")[1999:]
     C = toeplitz(lags)[samples][:, samples]
     inverse = np.linalg.inv(W.T @ W)
@@ -142,7 +145,7 @@ def test_what_is_held_does_not_grow_with_the_recording(mini, monkeypatch):
         rows, base = build_equations(
             IdentificationModel(mini), [Motion(time, *parts)], bandwidth=100.0
         )
-        columns = rows.projected_regressor(rows.column_selection(base))
+        columns = ProjectedRegressor(rows, rows.column_selection(base))
         assert len(list(columns.blocks())) >= copies
         assert max(sizes) < 1.5 * (1 << 21)  # with what the filter needs around
         assert sum(W.nbytes for W in rows._block_cache.values()) <= 1 << 20

@@ -11,7 +11,7 @@ from crane.identification.hydraulics.orifice_coefficients import OrificeCoeffici
 from crane.identification.hydraulics.orifice_equations import EquationSides
 from crane.identification.hydraulics.valve_curve import ValveCurve
 from crane.recordings.run_folder import read_run
-from crane.simulation.linear import linear_models
+from crane.simulation.linear.linearization import linear_models
 from crane.view.result_files import RESULT_FILES, plot_result, result_summary
 
 

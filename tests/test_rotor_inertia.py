@@ -11,7 +11,7 @@ import crane
 from crane.common.errors import CraneError, CraneWarning
 from crane.dynamics.quantity_evaluator import BACKENDS
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.model_term import InertialTerm, RotorInertiaTerm
+from crane.identification.mechanics.model_terms import InertialTerm, RotorInertiaTerm
 
 BARE = {"friction": {}, "forces": (), "end_stops": ()}
 RATIO, DISC = 2.0, 5e-3  # rotor's speed over the joint's, [kg m2]

@@ -13,7 +13,7 @@ import crane
 from crane.common.errors import CraneError
 from crane.description.parameter_changes import parameters
 from crane.dynamics.compiled_dynamics import DERIVATIVES_OF
-from crane.dynamics.constant_derivatives import ConstantDerivatives
+from crane.dynamics.quantity_evaluator import ConstantDerivatives
 from crane.formats.machine_loading import MachineVariants
 
 ORDER_8 = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])

@@ -9,9 +9,11 @@ import pytest
 from scipy.linalg import block_diag
 
 from crane.common.errors import CraneWarning, InputError, RecordingError
-from crane.identification.mechanics import recording_checks
 from crane.identification.mechanics.force_comparison import check_forces
-from crane.identification.mechanics.recording_checks import check_recording, check_samples
+from crane.identification.mechanics.smoothed_motion import (
+    check_recording,
+    signal_delay,
+)
 from crane.identification.signals import kalman_smoother
 from crane.identification.signals import signal_processing as signals
 from crane.identification.signals.signal_processing import Motion, differentiate
@@ -291,12 +293,6 @@ def test_a_filtered_row_sees_its_neighbourhood_and_nothing_else(cutoff, decimati
     np.testing.assert_array_equal(W[:, :, 0], y)
 
 
-def test_moving():
-    v = np.array([[0.1, -0.3], [-0.2, 0.0]])
-    np.testing.assert_array_equal(signals.is_moving(v, 0.15), [[False, True], [True, False]])
-    np.testing.assert_array_equal(signals.is_moving(v, [0.05, 1]), [[True, False], [True, False]])
-
-
 def recorded():
     time = np.arange(5000) * 4e-3
     q, v, a = movement(time)
@@ -376,7 +372,6 @@ SPOILT = {
 @pytest.mark.parametrize(("spoil", "message"), SPOILT.values(), ids=SPOILT.keys())
 def test_bad_recordings_are_explained(spoil, message):
     def judge():
-        check_samples(recording["time"])
         check_recording(**recording)
 
     recording = recorded()
@@ -463,7 +458,5 @@ def test_forces_come_late():
 
 def test_delay_between_samples():
     time = np.arange(5000) * 4e-3
-    found = recording_checks.signal_delay(
-        time, movement(time)[1][:, 0], movement(time - 0.0615)[1][:, 0]
-    )
+    found = signal_delay(time, movement(time)[1][:, 0], movement(time - 0.0615)[1][:, 0])
     assert abs(found - 0.0615) < 1e-3

@@ -329,7 +329,7 @@ def test_what_cuts_nothing_is_refused():
     for make, text in (
         (
             lambda: crane.description.Soil(-1.0, 0.0, 0.5),
-            "unit_weight of the soil is -1, it must not",
+            "unit_weight of the soil is -1 N/m3, it must not",
         ),
         (lambda: crane.description.Soil(1.0, 0.0, 30.0), "30 rad, give at most 1.05 rad"),
         (

@@ -191,7 +191,7 @@ def test_hydraulics_change_no_forces_of_a_given_motion(name):
 @pytest.mark.parametrize(
     ("text", "draws", "message"),
     [
-        ("x", None, "give NAME=start:stop:count"),
+        ("x", None, "write NAME=start:stop:count"),
         ("x=1:2", None, "'1:2' is no grid"),
         ("x=1:b:3", None, "'1:b' are no numbers"),
         ("x=1:2:0", None, "'0' is no count"),
@@ -211,7 +211,7 @@ def test_what_cannot_be_varied(text, draws, message):
 def test_ranges():
     assert parse_grids(["a.x=0:1:3"])["a.x"] == pytest.approx([0, 0.5, 1])
     assert parse_ranges(["a=-1~2e-1"])["a"] == pytest.approx([-1, 0.2])
-    with pytest.raises(InputError, match="varied twice"):
+    with pytest.raises(InputError, match="--vary names 'a' twice, give it once"):
         parse_grids(["a=0:1:3", "a=0:1:3"])
 
 

@@ -131,7 +131,7 @@ def test_folder(tmp_path):
 def test_binary_file(tmp_path, rows):
     path = tmp_path / "table.csv"
     path.write_bytes(rows + b"\x1f\x8b\xff\xfe\x00\n")
-    with pytest.raises(RecordingError, match="is not text, give a CSV in UTF-8"):
+    with pytest.raises(RecordingError, match="is not text, give a file in UTF-8"):
         read_table(path)
 
 

@@ -13,11 +13,11 @@ from forwarder_motions import NOISE, noisy
 
 import crane
 from crane.common.errors import CraneWarning, RecordingError
-from crane.identification.mechanics.feasible_estimate import thicken_body
 from crane.identification.mechanics.feasible_parameters import (
     body_parameters,
     divergence_hessian_root,
     pseudo_inertia,
+    thicken_body,
 )
 from crane.identification.mechanics.identifiability import weak_directions
 from crane.identification.mechanics.identification_model import IdentificationModel

@@ -6,7 +6,7 @@ import pytest
 from broken_machines import DATA, LOOPED, copy_machine, swap
 
 import crane
-import crane.view.page.machine_visuals
+import crane.view.page.scene
 from crane.common.errors import CraneWarning
 from crane.formats import write_urdf_plus
 from crane.formats.checks import check
@@ -118,4 +118,4 @@ def test_a_mesh_that_is_not_there_is_a_finding(name, tmp_path):
         (finding,) = check(path).findings
         assert "is not there, correct its path or install the package" in finding.message
         with pytest.warns(CraneWarning, match="mesh files? "):
-            crane.view.page.machine_visuals.read_visuals(crane.load(path))
+            crane.view.page.scene.read_visuals(crane.load(path))

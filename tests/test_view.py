@@ -16,7 +16,6 @@ from crane.common.errors import CraneError, CraneWarning, InputError, OutputErro
 from crane.formats.visuals.urdf_shapes import BoxShape, CylinderShape, MeshShape
 from crane.recordings.recording import Recording
 from crane.view.page import build_scene, report
-from crane.view.page.machine_visuals import read_visuals, skeleton_visuals
 from crane.view.page.page_motion import (
     frame_rows,
     joint_tree,
@@ -25,7 +24,7 @@ from crane.view.page.page_motion import (
     payload_frame_data,
     quantise,
 )
-from crane.view.page.scene import link_poses
+from crane.view.page.scene import link_poses, read_visuals, skeleton_visuals
 
 CORNERS = [[0.0, 0.0221, 0.0108], [0.4, 0.03, 0.0], [1.1, 0.0, 0.03], [-0.7, 0.002, 0.004]]
 

@@ -26,7 +26,7 @@ from crane.formats.visuals.urdf_shapes import (
 )
 from crane.formats.xml_file import XmlFile
 from crane.view.page import report
-from crane.view.page.machine_visuals import read_visuals
+from crane.view.page.scene import read_visuals
 
 ARM = """<robot name="arm">
   <link name="foot">

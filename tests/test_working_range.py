@@ -5,7 +5,7 @@ import pytest
 from free_bodies import places
 
 import crane
-from crane.view.plots.working_range_figure import working_range_figure
+from crane.view.plots.workspace_figures import working_range_figure
 
 COUNT = 31  # values of each stroke in the grid
 

@@ -1,10 +1,11 @@
 """Commands that describe machines: list, info, check, add."""
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+import crane
 from crane.cli.command import app, command
 from crane.cli.options import (
     AssemblyOptions,
@@ -13,10 +14,12 @@ from crane.cli.options import (
     PackageOptions,
 )
 from crane.common.errors import InputError
-from crane.common.package_search import NEAREST_ASSEMBLY
-
-if TYPE_CHECKING:
-    from crane.machine.machine import Machine
+from crane.common.one_line_repr import format_count
+from crane.common.package_search import (
+    NEAREST_ASSEMBLY,
+    check_package_folders,
+    use_load_options,
+)
 
 
 @command("list")
@@ -26,17 +29,16 @@ def list_machines(
     ] = False,
 ) -> None:
     """List the bundled machines."""
-    from crane.common.one_line_repr import format_count
-    from crane.description.machine_lookup import bundled_machines, example_robots, machine_summary
+    from crane.description.machine_lookup import machine_summary
 
-    others = example_robots()
+    others = crane.description.example_robots()
     if robots:
         if not others:
             raise InputError("there are no robots here, install example-robot-data")
         print("Robots of example-robot-data, open chains; some are refused by the strict reading:")
         print("\n".join(f"  {name}" for name in others))
         return
-    machines = bundled_machines()
+    machines = crane.description.bundled_machines()
     width = max(map(len, machines))
     print("Bundled machines; crane info NAME says more of one:")
     for name, path in machines.items():
@@ -68,25 +70,22 @@ def info(
     ] = False,
 ) -> None:
     """Show joints, loops, forces and parameters of a machine."""
-    from crane.formats.machine_loading import load
-
     if parameters or pattern is not None:
         _print_names(machine, assembly, pattern)
         return
-    for line in _describe(load(machine, **assembly.assembly())):
+    for line in _describe(crane.load(machine, **assembly.assembly())):
         print(line)
 
 
 def _print_names(machine: str, assembly: AssemblyOptions, pattern: str | None) -> None:
-    from crane.common.package_search import check_package_folders, use_load_options
-    from crane.description.machine_parameters import parameters
     from crane.description.name_search import names_by_kind, search_names
-    from crane.formats.machine_file.machine_reader import read_machine_spec
 
     files = assembly.package_values()
     with use_load_options(check_package_folders(files["packages"]), files["arguments"]):
-        spec = read_machine_spec(machine)
-    names = {"parameter": {name: f"{x:.6g}" for name, x in parameters(spec).items()}}
+        spec = crane.formats.read_machine_spec(machine)
+    names = {
+        "parameter": {name: f"{x:.6g}" for name, x in crane.description.parameters(spec).items()}
+    }
     if pattern is not None:
         names = search_names(names_by_kind(spec), pattern)
     width = max((len(name) for values in names.values() for name in values), default=0)
@@ -96,7 +95,7 @@ def _print_names(machine: str, assembly: AssemblyOptions, pattern: str | None) -
             print(f"{before}{name:{width}}  {text}".rstrip())
 
 
-def _describe(machine: "Machine") -> Iterator[str]:
+def _describe(machine: "crane.Machine") -> Iterator[str]:
     """Facts of a machine, each followed by the rows of its table without empty cells."""
     from crane.view.machine_facts import machine_facts
 
@@ -126,17 +125,14 @@ def check(
 
     The exit status is 0 without findings, 1 with warnings only, 2 with errors.
     """
-    from crane.formats.checks import check as check_machine
-    from crane.formats.home_writer import write_home as write
-
     values = assembly.assembly()
     driven = values["active"], values["free"]
     packages, arguments = values["packages"], values["arguments"]
     options = {**arguments, NEAREST_ASSEMBLY: True} if write_home else arguments
-    report = check_machine(machine, *driven, assembly.floating, packages, options)
+    report = crane.check(machine, *driven, assembly.floating, packages, options)
     if write_home and not report.errors:
-        print(f"home written to {write(machine, *driven, packages, arguments)}")
-        report = check_machine(machine, *driven, assembly.floating, packages, arguments)
+        print(f"home written to {crane.formats.write_home(machine, *driven, packages, arguments)}")
+        report = crane.check(machine, *driven, assembly.floating, packages, arguments)
     print(report)
     raise typer.Exit(report.status)
 
@@ -174,10 +170,8 @@ def cylinder(
 
     The cylinder becomes the actuator in place of the joint that it turns.
     """
-    from crane.formats.additions import add_cylinder
-
     print(
-        add_cylinder(
+        crane.formats.add_cylinder(
             machine, between, bore, rod, stroke,
             name=name, dead_length=dead_length, out=output.out, force=output.force,
         )
@@ -187,6 +181,8 @@ def cylinder(
 @command(registry=add)
 def loops(machine: MachineName, packages: PackageOptions, output: OutputFile) -> None:
     """Add the loop joints that `crane check` proposes."""
-    from crane.formats.additions import add_loops
-
-    print(add_loops(machine, out=output.out, force=output.force, **packages.package_values()))
+    print(
+        crane.formats.add_loops(
+            machine, out=output.out, force=output.force, **packages.package_values()
+        )
+    )

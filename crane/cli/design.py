@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+import crane
 from crane.cli.command import command
 from crane.cli.options import (
     Frame,
@@ -51,11 +52,9 @@ def study(
     seed: Seed = 0,
 ) -> None:
     """Compute measures of variants, on a grid or at random."""
-    from crane.studies.variant_study import study as compute
-
     axes = parse_grids(vary) if draws is None else parse_ranges(vary)
     with progress_bar("computing variants") as progress:
-        result = compute(
+        result = crane.study(
             options.load(machine), axes, task, measure, require=require or (),
             user_measures=measures, frame=frame, rule=rule, draws=draws, seed=seed,
             progress=progress, **parallel.arguments(),
@@ -93,11 +92,9 @@ def design(
     seed: Seed = 0,
 ) -> None:
     """Optimize parameters for objectives and constraints."""
-    from crane.studies.optimization import design as compute
-
     loaded = options.load(machine)
     with progress_bar("searching") as progress:
-        result = compute(
+        result = crane.design(
             loaded, parse_ranges(vary), minimise=minimise or (), maximise=maximise or (),
             require=require or (), measures=measures, frame=frame, rule=rule, tasks=task,
             starts=starts, points=points, seed=seed, progress=progress, **parallel.arguments(),

@@ -87,41 +87,39 @@ def main() -> None:
             raise KeyboardInterrupt
         if sys.stdout is not None:  # it is where the shell has closed it
             sys.stdout.flush()
-    except CraneError as error:
-        if debug:
-            raise
-        _exit_with_error(str(error))
     except KeyboardInterrupt:
         print_message("error: interrupted, nothing was written")
         sys.exit(INTERRUPTED)
-    except OSError as error:
+    except Exception as error:
         if debug:
             raise
-        _abandon_output()
-        if isinstance(error, BrokenPipeError):  # the reader has closed the pipe
-            sys.exit(1)
-        place, reason = error.filename or "output", error.strerror or error
-        text = format_one_line(f"{place}: {reason}")
-        _exit_with_error(f"{text}, check the place and try again")
-    except Exception as error:
-        # errors of the command line parser, whose class is not public
-        message = getattr(error, "format_message", None)
-        if debug or message is None:
-            raise
-        if not (text := message()):  # the help was shown
-            sys.exit(2)
-        command = getattr(getattr(error, "ctx", None), "command_path", "crane")
-        shows = "the commands" if command == "crane" else "what it takes"
-        line = format_one_line(" ".join(text.split()))
-        _exit_with_error(f"{line} ({command} --help shows {shows})")
+        print_message(f"error: {_error_text(error)}")
+        sys.exit(2)
     if not arguments:  # the help was shown, but nothing was done
         sys.exit(2)
     sys.exit(status if isinstance(status, int) else 0)
 
 
-def _exit_with_error(text: str) -> None:
-    print_message(f"error: {text}")
-    sys.exit(2)
+def _error_text(error: Exception) -> str:
+    """The line about an error that is handled; exits, or raises it, where there is none."""
+    if isinstance(error, CraneError):
+        return str(error)
+    if isinstance(error, OSError):
+        if sys.stdout is not None:  # nor may the interpreter's end complain about the output
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if isinstance(error, BrokenPipeError):  # the reader has closed the pipe
+            sys.exit(1)
+        place, reason = error.filename or "output", error.strerror or error
+        return f"{format_one_line(f'{place}: {reason}')}, check the place and try again"
+    # errors of the command line parser, whose class is not public
+    message = getattr(error, "format_message", None)
+    if message is None:
+        raise
+    if not (text := message()):  # the help was shown
+        sys.exit(2)
+    command = getattr(getattr(error, "ctx", None), "command_path", "crane")
+    shows = "the commands" if command == "crane" else "what it takes"
+    return f"{format_one_line(' '.join(text.split()))} ({command} --help shows {shows})"
 
 
 def _show_version(is_given: bool) -> None:
@@ -144,9 +142,3 @@ def _options(
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
     print_message(f"warning: {format_one_line(str(message))}")
-
-
-def _abandon_output() -> None:
-    """Let the interpreter end without errors about output that cannot be written."""
-    if sys.stdout is not None:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

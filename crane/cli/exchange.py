@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+import crane
 from crane.cli.command import command
 from crane.cli.options import (
     MachineName,
@@ -14,8 +15,12 @@ from crane.cli.options import (
     RequiredOutputFile,
     TimeOptions,
 )
-from crane.common.atomic_output import check_file_is_writable, check_folder_is_writable
-from crane.common.errors import CraneError, CraneWarning, InputError, suggest_names
+from crane.common.atomic_output import (
+    check_file_is_writable,
+    check_folder_is_writable,
+    replace_file,
+)
+from crane.common.errors import CraneError, CraneWarning, InputError, check_name
 
 _FORMATS = ("urdf+", "urdf", "mjcf", "machine")
 _SUFFIXES = {".urdf": "urdf+", ".xml": "mjcf", ".mjcf": "mjcf"}
@@ -42,22 +47,18 @@ def convert(
     ] = None,
 ) -> None:
     """Convert a machine to URDF, MJCF or a machine file."""
-    from crane.common.atomic_output import replace_file
-    from crane.formats.machine_file.machine_writer import write_machine
-    from crane.formats.mjcf.mjcf_writer import write_mjcf
-    from crane.formats.urdf.urdf_writer import robot_description, write_urdf_plus
-
     kind = _output_format(out, to)
     check = check_folder_is_writable if kind == "machine" else check_file_is_writable
     check(out, output.force)
     loaded, written = options.load(machine), out
     if kind == "machine":
-        written = write_machine(loaded, out, overwrite=output.force)
+        written = crane.write_machine(loaded, out, overwrite=output.force)
     elif kind == "urdf":
         with replace_file(out) as temporary_file:
-            temporary_file.write_text(robot_description(loaded), encoding="utf-8")
+            temporary_file.write_text(crane.formats.robot_description(loaded), encoding="utf-8")
     else:
-        (write_urdf_plus if kind == "urdf+" else write_mjcf)(loaded, out)
+        write = crane.formats.write_urdf_plus if kind == "urdf+" else crane.formats.write_mjcf
+        write(loaded, out)
     print(f"written to {written}")
 
 
@@ -69,8 +70,7 @@ def _output_format(out: Path, to: str | None) -> str:
     """
     suffix = out.suffix.lower()
     kind = to or _SUFFIXES.get(suffix, "machine")
-    if kind not in _FORMATS:
-        raise InputError(f"--to is '{kind}', {suggest_names(_FORMATS, kind)}")
+    check_name(kind, _FORMATS, f"--to is '{kind}'")
     if kind == "machine" and suffix in {*_SUFFIXES, ".yaml", ".yml"}:
         raise InputError(f"{out}: a machine file comes with its URDFs, give the name of a folder")
     if to is None and suffix and suffix not in _SUFFIXES:
@@ -96,7 +96,6 @@ def import_log(
     output: RequiredOutputFile,
 ) -> None:
     """Convert a log of another program to a recording."""
-    from crane.formats.machine_loading import load_from_expression
     from crane.recordings import timeseries
     from crane.recordings.logs import read_log_columns
     from crane.recordings.recording_reader import read_sensor_readings, select_time_span
@@ -106,10 +105,13 @@ def import_log(
     check_file_is_writable(output.out, output.force)
     machine, name = None, read_log_columns(columns)[0].get("machine", "")
     try:
-        machine = load_from_expression(name) if name else None
+        machine = crane.formats.load_from_expression(name) if name else None
     except CraneError as error:
-        text = f"{columns}: names of columns are not checked, its machine cannot be read: {error}"
-        warnings.warn(text, CraneWarning, stacklevel=2)
+        warnings.warn(
+            f"{columns}: names of columns are not checked, its machine cannot be read: {error}",
+            CraneWarning,
+            stacklevel=2,
+        )
     table = select_time_span(read_sensor_readings(log, machine, columns), window.span, log)
     timeseries.write_table(output.out, table)
     print(f"{len(table.values)} samples of {len(table.units)} columns written to {output.out}")

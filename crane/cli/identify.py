@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import crane
 from crane.cli.command import OptionBlock, command, refuse_options
 from crane.cli.options import (
     ComparedColumns,
@@ -37,13 +38,11 @@ from crane.cli.parsing import (
     parse_window,
 )
 from crane.cli.terminal import progress_bar, status
-from crane.common.errors import CraneWarning, InputError, RecordingError, suggest_names
+from crane.common.errors import CraneWarning, InputError, RecordingError, check_name
+from crane.common.result import Result
 
 if TYPE_CHECKING:
-    from crane.common.result import Result
     from crane.identification.signals.signal_processing import Motion
-    from crane.machine.machine import Machine
-    from crane.recordings.recording import Recording
 
 _MIN_HELD_OUT_SAMPLES = 50
 _CIRCUIT_MODELS = ("orifices", "valve", "friction")
@@ -129,18 +128,15 @@ def excite(
     calibrate fits.
     """
     from crane.description.machine_lookup import command_line_arguments
-    from crane.identification.excitation.periodic_excitation import excite as design_motion
-    from crane.identification.excitation.signal_excitation import excite_valves
 
     if fit is None:
         signals.refuse("only goes with --fit, name parameters to fit or leave it out")
     else:
         motion.refuse("does not go with --fit, leave it out")
     fits = None if fit is None else parse_fits(fit)
-    deviations = parse_values("--noise", noise)
     common: dict[str, Any] = {
         "criterion": criterion,
-        "noise": deviations,
+        "noise": parse_values("--noise", noise),
         "step": step,
         "seed": seed,
     }
@@ -148,10 +144,10 @@ def excite(
     result: Result
     with progress_bar("optimising") as progress:
         if fits is None:
-            result = design_motion(loaded, **motion.arguments(), **common, progress=progress)
+            result = crane.excite(loaded, **motion.arguments(), **common, progress=progress)
             note = f"see it with: crane view {output.out}/reference.csv"
         else:
-            result = excite_valves(
+            result = crane.identification.excite_valves(
                 loaded, fits, **signals.arguments(), **common, progress=progress
             )
             same = command_line_arguments(
@@ -227,12 +223,7 @@ def identify(
     The recordings have coordinates and forces. Held-out data validate the estimate.
     """
     from crane.common.samples import as_number
-    from crane.identification.mechanics.cross_validation import (
-        cross_validate,
-        format_trials,
-        identify_options,
-    )
-    from crane.identification.mechanics.identify import identify as estimate
+    from crane.identification.mechanics.cross_validation import format_trials, identify_options
     from crane.identification.mechanics.write_identified import check_rewritable
 
     window, terms, priors = parse_window(train), parse_terms(model.term), parse_priors(model.prior)
@@ -243,10 +234,13 @@ def identify(
     if model.feasible:
         check_rewritable(loaded)
     inside, outside = _split(_read(recording, loaded, reading), window)
-    judges: list[Recording | Motion] = [*_usable_motions(loaded, outside, trust)]
+    judges: list[crane.Recording | Motion] = [*_usable_motions(loaded, outside, trust)]
     if train is not None and not outside:
-        text = f"nothing of use lies outside of --train {train}, so nothing judges"
-        warnings.warn(text, CraneWarning, stacklevel=1)
+        warnings.warn(
+            f"nothing of use lies outside of --train {train}, so nothing judges",
+            CraneWarning,
+            stacklevel=1,
+        )
     names = _recording_names(recording, validation, train, bool(judges))
     judges += _read(validation or [], loaded, RecordingOptions(columns=reading.columns))
     if bandwidth is not None:
@@ -258,11 +252,13 @@ def identify(
     }  # fmt: skip
     if trials:
         with progress_bar("cross-validating") as progress:
-            tried_settings = cross_validate(loaded, inside, trials, progress, **settings)
+            tried_settings = crane.identification.cross_validate(
+                loaded, inside, trials, progress, **settings
+            )
         print(f"{format_trials(tried_settings)}\n")
-        settings = identify_options(tried_settings[0], settings)
+        settings = identify_options(tried_settings[0].settings, settings)
     with progress_bar("identifying") as progress:
-        result = estimate(loaded, inside, judges or None, progress=progress, **settings)
+        result = crane.identify(loaded, inside, judges or None, progress=progress, **settings)
     if result.validation is None:
         names["validation"] = ""
     output.write(result, f"; see {output.out}/report.html", **names)
@@ -271,7 +267,6 @@ def identify(
 def _recording_names(
     recordings: Sequence[Path], validation: Sequence[Path] | None, train: str | None, rest: bool
 ) -> dict[str, str]:
-    """Names of training and held-out data, for the report; `rest`: that outside of --train."""
     trained, held_out = (
         ", ".join(x.name for x in paths or ()) for paths in (recordings, validation)
     )
@@ -283,10 +278,10 @@ def _recording_names(
 
 def _read(
     paths: Sequence[Path],
-    machine: "Machine",
+    machine: "crane.Machine",
     reading: RecordingOptions,
     needs: Sequence[Sequence[str]] = (),
-) -> "list[Recording]":
+) -> "list[crane.Recording]":
     recordings = []
     for path in paths:
         with status(f"reading {path.name}"):
@@ -295,21 +290,19 @@ def _read(
 
 
 def _split(
-    recordings: "list[Recording]", window: tuple[float, float]
-) -> "tuple[list[Recording], list[Recording]]":
+    recordings: "list[crane.Recording]", window: tuple[float, float]
+) -> "tuple[list[crane.Recording], list[crane.Recording]]":
     """The parts of recordings inside a window [s], and those outside with enough samples."""
-    inside = [recording.between(*window) for recording in recordings]
-    outside = [
+    return [recording.between(*window) for recording in recordings], [
         recording.at(part)
         for recording in recordings
         for part in (recording.time < window[0], recording.time > window[1])
         if part.sum() >= _MIN_HELD_OUT_SAMPLES
     ]
-    return inside, outside
 
 
 def _usable_motions(
-    machine: "Machine", recordings: "list[Recording]", trust: bool
+    machine: "crane.Machine", recordings: "list[crane.Recording]", trust: bool
 ) -> "Iterator[Motion]":
     """Motions of recordings; with a warning about each that cannot be used."""
     from crane.identification.mechanics.smoothed_motion import smoothed_motion
@@ -319,8 +312,11 @@ def _usable_motions(
             yield smoothed_motion(machine, recording, trust=trust)
         except RecordingError as error:
             where = "{:.4g} to {:.4g} s".format(*recording.time[[0, -1]])
-            text = f"what lies outside of --train, {where}, judges nothing: {error}"
-            warnings.warn(text, CraneWarning, stacklevel=1)
+            warnings.warn(
+                f"what lies outside of --train, {where}, judges nothing: {error}",
+                CraneWarning,
+                stacklevel=1,
+            )
 
 
 @command()
@@ -334,12 +330,12 @@ def payload(
     trust: Trust = False,
 ) -> None:
     """Estimate mass and centre of mass of the payload."""
-    from crane.identification.mechanics.identify_payload import identify_payload
-
     loaded = options.load(machine)
     (carried,) = _read([recording], loaded, reading)
     with progress_bar("estimating") as progress:
-        estimate = identify_payload(loaded, carried, frame, method, trust=trust, progress=progress)
+        estimate = crane.identification.identify_payload(
+            loaded, carried, frame, method, trust=trust, progress=progress
+        )
     print(estimate.to_text(), end="")
 
 
@@ -379,23 +375,18 @@ def circuit(
 
     The recordings have valve signals and pressures. Bulk modulus is estimated with the orifices.
     """
-    from crane.identification.hydraulics.cylinder_friction import identify_cylinder_friction
     from crane.identification.hydraulics.cylinder_signals import required_channels
-    from crane.identification.hydraulics.orifice_coefficients import identify_orifices
-    from crane.identification.hydraulics.valve_curve import identify_valve
 
-    if model not in _CIRCUIT_MODELS:
-        raise InputError(f"model '{model}' is unknown, {suggest_names(_CIRCUIT_MODELS, model)}")
+    check_name(model, _CIRCUIT_MODELS, f"model '{model}' is unknown")
     if model != "orifices":
-        given = {"--method": method, "--period": period, "--validation": validation or None}
-        refuse_options(given, "is for --model orifices, leave it out")
+        refuse_options(
+            {"--method": method, "--period": period, "--validation": validation or None},
+            "is for --model orifices, leave it out",
+        )
         if len(recording) > 1:
             raise InputError(f"--model {model} takes one recording, {len(recording)} are given")
     loaded = options.load(machine)
-    if joint not in loaded.active:
-        raise InputError(
-            f"'{joint}' is not an active joint, {suggest_names(loaded.active, joint)}"
-        )
+    check_name(joint, loaded.active, f"'{joint}' is not an active joint")
     needs = required_channels(joint) if model == "orifices" else []
     if model == "valve":
         needs.append((f"voltage_{joint}",))
@@ -405,11 +396,13 @@ def circuit(
     options_of_write: dict[str, Any] = {"unit": loaded.unit(joint)}
     with status("identifying"):
         if model == "valve":
-            result = identify_valve(loaded, runs[0], joint)
+            result = crane.identification.identify_valve(loaded, runs[0], joint)
         elif model == "friction":
-            result = identify_cylinder_friction(loaded, runs[0], joint)
+            result = crane.identification.identify_cylinder_friction(loaded, runs[0], joint)
         else:
-            result = identify_orifices(loaded, runs, joint, method or "weak", period=period)
+            result = crane.identification.identify_orifices(
+                loaded, runs, joint, method or "weak", period=period
+            )
             options_of_write["validation"] = [result.predict(x, period) for x in held_out]
     output.write(result, **options_of_write)
 
@@ -427,7 +420,6 @@ def calibrate(
     sensors: ComparedColumns = None,
 ) -> None:
     """Fit parameters through simulations of valve signals."""
-    from crane.identification.calibration.calibrate import calibrate as run
     from crane.recordings.run_folder import recording_file
 
     fits, window = parse_fits(fit), parse_window(train)
@@ -436,7 +428,7 @@ def calibrate(
         [recording_file(x) for x in given or ()] for given in (recording, validation)
     )
     with progress_bar("simulating") as progress:
-        result = run(
+        result = crane.calibrate(
             loaded, paths, fits, train=window, validation=held_out,
             columns=reading.columns, span=reading.span, sensors=parse_names(sensors),
             progress=progress,

@@ -1,22 +1,20 @@
 """Arguments and options that several commands share, each declared once."""
 
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+import crane
 from crane.cli.command import OptionBlock
 from crane.cli.parsing import parse_arguments, parse_names, parse_values
 from crane.cli.terminal import status
 from crane.common.atomic_output import check_file_is_writable, check_folder_is_writable
 from crane.common.errors import InputError, OutputError
-
-if TYPE_CHECKING:
-    from crane.common.result import Result
-    from crane.machine.machine import Machine
-    from crane.recordings.recording import Recording
+from crane.common.result import Result
 
 # Arguments and options of several commands that are not part of a block.
 MachineName = Annotated[
@@ -173,12 +171,11 @@ class ParameterOptions(ChangeOptions):
         ),
     ] = None
 
-    def load(self, name: str) -> "Machine":
+    def load(self, name: str) -> "crane.Machine":
         """Load a machine by its name or path."""
-        from crane.formats.machine_loading import load
-
-        held = parse_values("--lock", self.lock)
-        return load(name, self.changed_values(), held, **self.assembly())
+        return crane.load(
+            name, self.changed_values(), parse_values("--lock", self.lock), **self.assembly()
+        )
 
     def assembly(self) -> dict[str, Any]:
         """Arguments of `crane.load` about how a description is read and assembled."""
@@ -283,7 +280,9 @@ class RecordingOptions(TimeOptions):
         ),
     ] = None
 
-    def read(self, path: Path, machine: "Machine | None" = None, needs: Any = ()) -> "Recording":
+    def read(
+        self, path: Path, machine: "crane.Machine | None" = None, needs: Any = ()
+    ) -> "crane.Recording":
         """Read a recording, see `crane.recordings.run_folder.read_run`."""
         from crane.recordings.run_folder import read_run
 
@@ -305,10 +304,10 @@ class ParallelOptions(OptionBlock):
 
     def arguments(self) -> dict[str, Any]:
         """Arguments of `crane.study` and `crane.design` by name."""
-        import os
-
-        processes = (os.cpu_count() or 1) if self.processes is None else self.processes
-        return {"processes": processes, "scheduler": self.scheduler}
+        return {
+            "processes": (os.cpu_count() or 1) if self.processes is None else self.processes,
+            "scheduler": self.scheduler,
+        }
 
 
 def _as_path(text: str | Path) -> Path:
@@ -321,40 +320,6 @@ def _default_folder(context: typer.Context, folder: Path) -> Path:
     source = context.get_parameter_source("out")
     is_given = source is not None and source.name != "DEFAULT"
     return folder if is_given else Path(str(context.info_name).replace("-", "_"))
-
-
-@dataclass(frozen=True, kw_only=True)
-class OutputFolder(OptionBlock):
-    """The folder that a result is written to; one named like the command by default."""
-
-    panel = "Output options"
-    out: Annotated[
-        Path,
-        typer.Option(
-            metavar="FOLDER",
-            parser=_as_path,
-            callback=_default_folder,
-            show_default=False,
-            help="Folder of the results; named like the command by default.",
-        ),
-    ] = Path()
-    force: Force = False
-
-    def check(self) -> None:
-        """Raise an error if the folder cannot be written."""
-        check_folder_is_writable(self.out, self.force)
-
-    def write(self, result: "Result", note: str = "", **options: Any) -> None:
-        """Write a result into the folder, and print its summary.
-
-        Args:
-            result: The result.
-            note: Text after the name of the folder.
-            options: Options of `Result.write`.
-        """
-        with status("writing the results"):
-            text = result.write(self.out, self.force, **options)
-        print(f"{text.rstrip()}\n\nwritten to {self.out}{note}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -375,14 +340,38 @@ class OptionalOutputFolder(OptionBlock):
         if self.out is not None:
             check_folder_is_writable(self.out, self.force)
 
-    def write(self, result: "Result", note: str = "", **options: Any) -> None:
-        """Print the summary of a result, and write it if there is a folder; as `OutputFolder`."""
-        if self.out is not None:
-            OutputFolder(out=self.out, force=self.force).write(result, note, **options)
-            return
+    def write(self, result: Result, note: str = "", **options: Any) -> None:
+        """Print the summary of a result, and write it if there is a folder.
+
+        Args:
+            result: The result.
+            note: Text after the name of the folder.
+            options: Options of `Result.write`.
+        """
         from crane.view.result_files import result_summary
 
-        print(result_summary(result, **options).rstrip())
+        if self.out is None:
+            print(result_summary(result, **options).rstrip())
+            return
+        with status("writing the results"):
+            text = result.write(self.out, self.force, **options)
+        print(f"{text.rstrip()}\n\nwritten to {self.out}{note}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputFolder(OptionalOutputFolder):
+    """The folder that a result is written to; one named like the command by default."""
+
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="FOLDER",
+            parser=_as_path,
+            callback=_default_folder,
+            show_default=False,
+            help="Folder of the results; named like the command by default.",
+        ),
+    ] = Path()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -394,15 +383,6 @@ class OverwriteOptions(OptionBlock):
 
 
 _OUT_FILE = typer.Option(metavar="FILE", parser=_as_path, help="The file to write.")
-
-
-@dataclass(frozen=True, kw_only=True)
-class RequiredOutputFile(OptionBlock):
-    """The file that a command writes, without a default."""
-
-    panel = "Output options"
-    out: Annotated[Path, _OUT_FILE]
-    force: Force = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -422,3 +402,10 @@ class OutputFile(OptionBlock):
         file = self.out or default
         check_file_is_writable(file, self.force)
         return file
+
+
+@dataclass(frozen=True, kw_only=True)
+class RequiredOutputFile(OutputFile):
+    """The file that a command writes, without a default."""
+
+    out: Annotated[Path, _OUT_FILE] = field()

@@ -6,12 +6,12 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from crane.common.errors import InputError, suggest_names
+import crane
+from crane.common.errors import InputError, check_name
 
 if TYPE_CHECKING:
     from crane.common.samples import Array
     from crane.description.estimation_settings import ParameterPrior, TermValues
-    from crane.description.external_forces import Wrench
 
 CONFIGURATION_FORM = "JOINT=VALUE,..., as in q1=0.1,X1=0.02"
 _VALUE_FORM = "JOINT=VALUE, as in X1=0.5"
@@ -30,6 +30,39 @@ def parse_names(text: str | None) -> list[str] | None:
     return None if text is None else [word.strip() for word in text.split(",") if word.strip()]
 
 
+def _parse_named(
+    option: str,
+    texts: Sequence[str] | None,
+    form: str,
+    parse: Callable[[str, str | None], _Value],
+) -> dict[str, _Value]:
+    """Values by name from texts NAME=VALUE or NAME.
+
+    Args:
+        option: Name of the option, for errors.
+        texts: The texts.
+        form: The form that an error asks for.
+        parse: Returns the value for a name and its text, None of a name alone.
+
+    Raises:
+        InputError: A text has another form, or a name is given twice.
+    """
+    values: dict[str, _Value] = {}
+    for text in texts or ():
+        name, equals, value = text.rpartition("=") if "=" in text else (text, "", "")
+        name = name.strip()
+        try:
+            parsed = parse(name, value if equals else None)
+        except (InputError, TypeError, ValueError):
+            name = ""
+        if not name:
+            raise InputError(f"{option} is '{text}', write {form}")
+        if name in values:
+            raise InputError(f"{option} names '{name}' twice, give it once")
+        values[name] = parsed
+    return values
+
+
 def parse_values(
     option: str, texts: Sequence[str] | None, form: str = _VALUE_FORM
 ) -> dict[str, float]:
@@ -45,19 +78,8 @@ def parse_values(
     """
     from crane.common.samples import as_number
 
-    values: dict[str, float] = {}
-    for text in texts or ():
-        name, _, number = text.rpartition("=")
-        try:
-            value = float(number)
-        except ValueError:
-            name, value = "", 0.0
-        if not name:
-            raise InputError(f"{option} is '{text}', write {form}")
-        if name in values:
-            raise InputError(f"{option} names '{name}' twice, give it once")
-        values[name] = as_number(value, f"{option} {name}", "")
-    return values
+    values = _parse_named(option, texts, form, lambda _, value: float(value or ""))
+    return {name: as_number(value, f"{option} {name}", "") for name, value in values.items()}
 
 
 def parse_configuration(option: str, text: str | None) -> dict[str, float]:
@@ -133,28 +155,16 @@ def parse_fits(texts: Sequence[str]) -> dict[str, object]:
         InputError: A text has another form, or a name is given twice.
     """
 
-    def parse(text: str) -> object:
+    def parse(_: str, text: str | None) -> object:
+        if text is None:
+            return None
         start, comma, bounds = text.partition(",")
-        low, tilde, high = bounds.partition("~")
         if not comma:
             return float(start)
-        if not tilde:
-            raise ValueError
+        low, _, high = bounds.partition("~")
         return float(start), float(low), float(high)
 
-    fits: dict[str, object] = {}
-    for text in texts:
-        name, equals, value = text.partition("=")
-        name = name.strip()
-        if not name:
-            raise InputError(f"--fit is '{text}', write {_FIT_FORM}")
-        if name in fits:
-            raise InputError(f"--fit names '{name}' twice, give it once")
-        try:
-            fits[name] = parse(value) if equals else None
-        except ValueError:
-            raise InputError(f"--fit is '{text}', write {_FIT_FORM}") from None
-    return fits
+    return _parse_named("--fit", texts, _FIT_FORM, parse)
 
 
 def parse_terms(texts: Sequence[str] | None) -> "dict[str, TermValues | None]":
@@ -163,16 +173,13 @@ def parse_terms(texts: Sequence[str] | None) -> "dict[str, TermValues | None]":
     Raises:
         InputError: A text has another form, or a name is given twice.
     """
-    terms: dict[str, TermValues | None] = {}
-    for text in texts or ():
-        name, equals, values = text.partition("=")
-        is_word = not equals or values in ("on", "off")
-        message = f"--term is '{text}', write {_TERM_FORM}"
-        numbers = () if is_word else tuple(parse_numbers(values.split(","), message))
-        if name in terms:
-            raise InputError(f"--term names '{name}' twice, give it once")
-        terms[name] = None if values == "off" else numbers
-    return terms
+
+    def parse(_: str, values: str | None) -> "TermValues | None":
+        if values == "off":
+            return None
+        return () if values in (None, "on") else tuple(map(float, values.split(",")))
+
+    return _parse_named("--term", texts, _TERM_FORM, parse)
 
 
 def parse_priors(texts: Sequence[str] | None) -> "dict[str, ParameterPrior] | None":
@@ -207,20 +214,11 @@ def parse_trials(texts: Sequence[str] | None) -> "dict[str, list[float | Paramet
     """
     from crane.description.estimation_settings import ParameterPrior
 
-    trials: dict[str, list[float | ParameterPrior]] = {}
-    for text in texts or ():
-        name, _, values = text.rpartition("=")
-        name = name.strip()
-        parse: Callable[[str], float | ParameterPrior]
-        parse = float if name == "bandwidth" else ParameterPrior.parse
-        try:
-            parsed = [parse(each) for each in values.split(",")]
-        except (ValueError, InputError):
-            name = ""
-        if not name or name in trials:
-            raise InputError(f"--try is '{text}', write {_TRIAL_FORM}")
-        trials[name] = parsed
-    return trials
+    def parse(name: str, values: str | None) -> "list[float | ParameterPrior]":
+        words = (values or "").split(",")
+        return [float(x) if name == "bandwidth" else ParameterPrior.parse(x) for x in words]
+
+    return _parse_named("--try", texts, _TRIAL_FORM, parse)
 
 
 def parse_grids(texts: Sequence[str] | None) -> "dict[str, Array]":
@@ -231,7 +229,7 @@ def parse_grids(texts: Sequence[str] | None) -> "dict[str, Array]":
     """
     import numpy as np
 
-    def parse(text: str, name: str, values: str) -> "Array":
+    def parse(text: str, values: str) -> "Array":
         if "~" in values:
             raise InputError(f"--vary {text}: a range is drawn from, say how often with --draws")
         words = values.split(":")
@@ -248,7 +246,7 @@ def parse_grids(texts: Sequence[str] | None) -> "dict[str, Array]":
             raise InputError(f"--vary {text}: one value cannot be both ends, give a larger count")
         return np.linspace(start, stop, count)
 
-    return _parse_varied(texts or (), parse)
+    return _parse_varied(texts, parse)
 
 
 def parse_ranges(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
@@ -258,9 +256,9 @@ def parse_ranges(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
         InputError: A text has another form, or a name is given twice.
     """
 
-    def parse(text: str, name: str, values: str) -> tuple[float, float]:
+    def parse(text: str, values: str) -> tuple[float, float]:
         if "~" not in values:
-            raise InputError(f"--vary {text}: give a range, {name}=low~high")
+            raise InputError(f"--vary {text}: give a range, {text.partition('=')[0]}=low~high")
         words = values.split("~")
         if len(words) != 2:
             raise InputError(f"--vary {text}: a range has two ends, give {_RANGE_FORM}")
@@ -273,18 +271,17 @@ def parse_ranges(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
 
 
 def _parse_varied(
-    texts: Sequence[str], parse: Callable[[str, str, str], _Value]
+    texts: Sequence[str] | None, parse: Callable[[str, str], _Value]
 ) -> dict[str, _Value]:
-    varied: dict[str, _Value] = {}
-    for text in texts:
-        name, equals, values = text.partition("=")
-        name = name.strip()
-        if not (equals and name and values.strip()):
-            raise InputError(f"--vary {text}: give {_GRID_FORM}, or {_RANGE_FORM}")
-        if name in varied:
-            raise InputError(f"--vary {text}: '{name}' is varied twice, give it once")
-        varied[name] = parse(text, name, values)
-    return varied
+    """Values by parameter; `parse` gets NAME=VALUES for errors, and VALUES."""
+
+    def check(_: str, values: str | None) -> str:
+        if not values or values.isspace():
+            raise ValueError
+        return values
+
+    varied = _parse_named("--vary", texts, f"{_GRID_FORM}, or {_RANGE_FORM}", check)
+    return {name: parse(f"{name}={values}", values) for name, values in varied.items()}
 
 
 def _finite_numbers(text: str, words: list[str], form: str) -> list[float]:
@@ -295,19 +292,13 @@ def _finite_numbers(text: str, words: list[str], form: str) -> list[float]:
     return numbers
 
 
-def parse_loads(texts: Sequence[str] | None) -> "list[Wrench]":
-    """External forces from FRAME=FX,FY,FZ, FRAME=FX,FY,FZ,MX,MY,MZ or FRAME=FILE.
+def parse_load(text: str) -> "crane.Wrench":
+    """External force from FRAME=FX,FY,FZ, FRAME=FX,FY,FZ,MX,MY,MZ or FRAME=FILE.
 
     Raises:
-        InputError: A text has another form.
+        InputError: The text has another form.
         RecordingError: A file cannot be read.
     """
-    return [_parse_load(text) for text in texts or ()]
-
-
-def _parse_load(text: str) -> "Wrench":
-    from crane.description.external_forces import Wrench
-
     head, equals, wrench = text.partition("=")
     frame, _, axes = head.partition("@")
     what = f"--load {text!r}"
@@ -316,12 +307,12 @@ def _parse_load(text: str) -> "Wrench":
     axes = axes or "world"
     if Path(wrench).suffix.lower() in (".csv", ".npz"):
         times, force, moment = _read_wrenches(Path(wrench))
-        return Wrench(frame, force, moment, times, axes)
+        return crane.Wrench(frame, force, moment, times, axes)
     message = f"{what}: give 3 or 6 numbers with commas, or a CSV file"
     numbers = parse_numbers(wrench.split(","), message)
     if len(numbers) not in (3, 6):
         raise InputError(message)
-    return Wrench(frame, numbers[:3], numbers[3:] or (0.0, 0.0, 0.0), axes=axes)
+    return crane.Wrench(frame, numbers[:3], numbers[3:] or (0.0, 0.0, 0.0), axes=axes)
 
 
 def _read_wrenches(path: Path) -> "tuple[Array, Array, Array]":
@@ -336,11 +327,8 @@ def _read_wrenches(path: Path) -> "tuple[Array, Array, Array]":
     if "time" not in names:
         raise InputError(f"{path}: has no column 'time', add it")
     for name in names:
-        if name != "time" and name not in WRENCH_COMPONENTS:
-            raise InputError(
-                f"{path}: '{name}' is no part of a wrench, "
-                f"{suggest_names(WRENCH_COMPONENTS, name)}"
-            )
+        if name != "time":
+            check_name(name, WRENCH_COMPONENTS, f"{path}: '{name}' is no part of a wrench")
     if len(names) < 2:
         raise InputError(f"{path}: has no force, add columns such as force_z")
     columns = dict(zip(names, table.values.T, strict=True))

@@ -3,11 +3,13 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import radians
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+import crane
 from crane.cli.command import OptionBlock, command, refuse_options
 from crane.cli.options import (
     Bucket,
@@ -27,9 +29,7 @@ from crane.cli.parsing import parse_numbers, parse_slew_angles
 from crane.cli.show import active_coordinates
 from crane.cli.terminal import status
 from crane.common.errors import CraneWarning, InputError
-
-if TYPE_CHECKING:
-    from crane import ratings
+from crane.common.result import Result
 
 ChartStep = Annotated[
     float | None, typer.Option("--step", metavar="M", help="Distance of grid points in m.")
@@ -46,11 +46,9 @@ def workspace(
     seed: Seed = 0,
 ) -> None:
     """Compute the reachable workspace and its singular curves."""
-    from crane.motion.workspaces import workspace as compute
-
     loaded = options.load(machine)
     with status("exploring"):
-        result = compute(loaded, samples, frame, seed)
+        result = crane.workspace(loaded, samples, frame, seed)
     output.write(result)
 
 
@@ -66,11 +64,9 @@ def working_range(
     ] = 2.44,
 ) -> None:
     """Compute reach, digging depth and dump height (ISO 7135)."""
-    from crane.ratings.working_ranges import working_range as compute
-
     loaded = options.load(machine)
     with status("measuring"):
-        result = compute(loaded, frame, bucket=bucket, level=level)
+        result = crane.working_range(loaded, frame, bucket=bucket, level=level)
     output.write(result)
 
 
@@ -98,24 +94,25 @@ def breakout(
     step: ChartStep = None,
 ) -> None:
     """Compute break-out forces (ISO 6015) or tool forces."""
-    from crane.ratings.breakout_forces import breakout as compute
-    from crane.ratings.tool_forces import tool_force
-
     if direction is None and step is not None:
         raise InputError("--step is for the reach, add --direction")
     if direction is not None and arm is not None:
         raise InputError("--arm is for break-out forces, leave it out with --direction")
     loaded = options.load(machine)
-    result: ratings.Breakout | ratings.ToolForce
+    result: Result
     with status("computing forces"):
         if direction is None:
-            result = compute(loaded, frame, bucket=bucket, arm=arm, weights=weights)
+            result = crane.ratings.breakout(loaded, frame, bucket=bucket, arm=arm, weights=weights)
         else:
             vector: str | list[float] = direction
             if "," in direction:
-                message = f"--direction {direction} is no X,Y,Z, give three numbers"
-                vector = parse_numbers(direction.split(","), message)
-            result = tool_force(loaded, vector, frame, joint=bucket, weights=weights, step=step)
+                vector = parse_numbers(
+                    direction.split(","),
+                    f"--direction {direction} is no X,Y,Z, give three numbers",
+                )
+            result = crane.ratings.tool_force(
+                loaded, vector, frame, joint=bucket, weights=weights, step=step
+            )
     output.write(result)
 
 
@@ -163,19 +160,6 @@ class RatingOptions(OptionBlock):
         Raises:
             InputError: The rule is unknown, or a number is out of range.
         """
-        from math import radians
-
-        from crane.common.samples import as_number
-
-        slope = radians(as_number(self.slope, "--slope", "degrees", max_magnitude=45.0))
-        slews = None if self.slew is None else [radians(x) for x in parse_slew_angles(self.slew)]
-        return {
-            "rule": self._applied_rule(), "raising": self.raising or None, "slope": slope,
-            "slews": slews, "friction": self.friction,
-        }  # fmt: skip
-
-    def _applied_rule(self) -> "ratings.Rule":
-        """The rule, with the shares that are given instead of its own."""
         from crane.common.samples import as_number
         from crane.ratings.rating_rules import find_rule
 
@@ -187,7 +171,12 @@ class RatingOptions(OptionBlock):
                 words.append(f"{100 * share:g} % of the {what} load")
         if words:
             rule = replace(rule, description=f"{rule.description}; here {' and '.join(words)}")
-        return rule
+        slope = radians(as_number(self.slope, "--slope", "degrees", max_magnitude=45.0))
+        slews = None if self.slew is None else [radians(x) for x in parse_slew_angles(self.slew)]
+        return {
+            "rule": rule, "raising": self.raising or None, "slope": slope, "slews": slews,
+            "friction": self.friction,
+        }  # fmt: skip
 
 
 @command()
@@ -209,22 +198,21 @@ def capacity(
 ) -> None:
     """Compute rated loads over the reach (load chart)."""
     from crane.dynamics.tipping_stability import has_supports
-    from crane.ratings.lifting_capacity import capacity as compute
-    from crane.ratings.lifting_capacity import torques
 
     conditions = rating.arguments()
     loaded, tipping_share = options.load(machine), conditions["rule"].tipping
     if tipping_share < 1 and not has_supports(loaded):
-        text = (
+        warnings.warn(
             f"'{loaded.name}' has no supports, so that nothing tips and the rule's "
             f"{100 * tipping_share:.3g} % of the tipping load are left out: name what it stands "
-            "on under 'supports' of the machine file"
+            "on under 'supports' of the machine file",
+            CraneWarning,
+            stacklevel=2,
         )
-        warnings.warn(text, CraneWarning, stacklevel=2)
     with status("rating"):
-        chart, lifting = compute(loaded, frame, step=step, **conditions), None
+        chart, lifting = crane.capacity(loaded, frame, step=step, **conditions), None
         if torque is not None:
-            lifting = torques(loaded, frame, radius=torque, **conditions)
+            lifting = crane.ratings.torques(loaded, frame, radius=torque, **conditions)
     output.write(chart, torques=lifting, parameters=by or ())
 
 
@@ -240,15 +228,12 @@ def stability(
 
     With --task, also the payload that tips the machine during the task.
     """
-    from crane.dynamics.tipping_stability import TippingStability
-    from crane.studies.task_tipping_load import tipping_load
-
     loaded = options.load(machine)
-    tipping, q_a = TippingStability(loaded), active_coordinates(loaded, at)
+    tipping, q_a = crane.dynamics.TippingStability(loaded), active_coordinates(loaded, at)
     found = None
     if task is not None:
         with status("simulating"):
-            found = tipping_load(loaded, task)
+            found = crane.studies.tipping_load(loaded, task)
     (moments,), (shares,) = tipping.static_margins(q_a)
     load_text = ""
     if loaded.tip is not None or frame is not None:
@@ -293,8 +278,6 @@ def power(
     """
     from crane.control.valve_commands import require_circuit
     from crane.recordings.run_folder import recorded_machine
-    from crane.studies.hydraulic_power_balance import power_balance
-    from crane.studies.power_balance_result import PowerComparison
 
     if not beside:
         refuse_options(
@@ -305,14 +288,14 @@ def power(
     require_circuit(loaded)  # before anything is read
     run = reading.read(recording, loaded)
     with status("adding up"):
-        balances = {names[0]: power_balance(loaded, run)}
+        balances = {names[0]: crane.power_balance(loaded, run)}
     for name, path in zip(names[1:], beside or (), strict=True):
         other = reading.read(path)
         other_machine = recorded_machine(path, other.machine)
         require_circuit(other_machine)
         with status("adding up"):
-            balances[name] = power_balance(other_machine, other)
-    output.write(PowerComparison(balances, moved) if beside else balances[names[0]])
+            balances[name] = crane.power_balance(other_machine, other)
+    output.write(crane.studies.PowerComparison(balances, moved) if beside else balances[names[0]])
 
 
 def _run_names(paths: Sequence[Path]) -> list[str]:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import crane
 from crane.cli.command import command, refuse_options
 from crane.cli.options import (
     Configuration,
@@ -16,12 +17,11 @@ from crane.cli.options import (
 )
 from crane.cli.parsing import parse_configuration
 from crane.cli.terminal import hide_activity_line
-from crane.common.errors import InputError, suggest_names
+from crane.common.atomic_output import portable_file_name
+from crane.common.errors import InputError, check_name
 
 if TYPE_CHECKING:
     from crane.common.samples import Array
-    from crane.machine.machine import Machine
-    from crane.recordings.recording import Recording
 
 ShownName = Annotated[
     str,
@@ -52,9 +52,8 @@ def view(
 
     The page of a run plays its motion, and plots its forces and all recorded quantities.
     """
-    from crane.common.atomic_output import portable_file_name
     from crane.recordings.recording_summary import joint_differences
-    from crane.view.page.report_page import open_in_browser, report
+    from crane.view.page.report_page import open_in_browser
     from crane.view.result_files import PAGE
 
     if not _is_run(what):
@@ -67,7 +66,7 @@ def view(
         page = output.path(Path(portable_file_name(loaded.name) + ".html"))
     else:
         page = output.path(_folder(Path(what)) / PAGE)
-    report(loaded, first, page, second)
+    crane.report(loaded, first, page, second)
     if first is not None and second is not None:
         for one in joint_differences(first, second):
             print(f"{one.joint} differs by at most {' at '.join(one.formatted)}")
@@ -121,22 +120,22 @@ def sketch(
 
     The suffix of the file chooses the format: png, svg or pdf.
     """
-    from crane.common.atomic_output import portable_file_name
     from crane.formats.assembly_warnings import alternative_configurations
-    from crane.view.sketches.circuit import sketch_circuit
-    from crane.view.sketches.sketch_figure import sketch as draw
 
     if circuit:
-        text = "is for the mechanism, leave it out with --circuit"
-        refuse_options({"--at": at, "--plane": plane, "--com": com}, text)
+        refuse_options(
+            {"--at": at, "--plane": plane, "--com": com},
+            "is for the mechanism, leave it out with --circuit",
+        )
     loaded = options.load(machine)
-    suffix = "_circuit.png" if circuit else "_sketch.png"
-    figure = output.path(Path(portable_file_name(loaded.name) + suffix))
+    figure = output.path(
+        Path(portable_file_name(loaded.name) + ("_circuit.png" if circuit else "_sketch.png"))
+    )
     if circuit:
-        sketch_circuit(loaded, figure)
+        crane.view.sketch_circuit(loaded, figure)
     else:
         others = [] if at else alternative_configurations(loaded)
-        draw(loaded, figure, active_coordinates(loaded, at), plane, com, others)
+        crane.sketch(loaded, figure, active_coordinates(loaded, at), plane, com, others)
         if others:
             many = f"{len(others)} other assemblies" if len(others) > 1 else "the other assembly"
             print(
@@ -171,8 +170,7 @@ def live(
 
     The loops are closed at every move; a run is played.
     """
-    from crane.view.live.live_server import serve_live_view
-    from crane.view.live.live_session import Playback, Session
+    from crane.view.live.live_session import Playback
 
     if _is_run(what):
         if run is not None:
@@ -188,10 +186,10 @@ def live(
     loaded, played = _load(what, machine, options, recording, run)
     playback = None if played is None else Playback(loaded, played)
     with hide_activity_line():
-        serve_live_view(Session(loaded), playback, host, port)
+        crane.view.serve_live_view(crane.view.Session(loaded), playback, host, port)
 
 
-def active_coordinates(machine: "Machine", at: str | None) -> "Array":
+def active_coordinates(machine: "crane.Machine", at: str | None) -> "Array":
     """Active coordinates (n,): those of the home configuration, or of --at.
 
     Raises:
@@ -199,16 +197,12 @@ def active_coordinates(machine: "Machine", at: str | None) -> "Array":
     """
     q_a = machine.home[machine.closure.active].copy()
     for joint, value in parse_configuration("--at", at).items():
-        if joint not in machine.active:
-            raise InputError(
-                f"--at: '{joint}' is no active joint, {suggest_names(machine.active, joint)}"
-            )
+        check_name(joint, machine.active, f"--at: '{joint}' is no active joint")
         q_a[machine.active.index(joint)] = value
     return q_a
 
 
 def _is_run(what: str) -> bool:
-    """Whether a name is that of a run or recording, and not of a machine."""
     from crane.description.machine_lookup import FOLDER_FILES
 
     if any((Path(what) / name).is_file() for name in FOLDER_FILES):  # a machine in a folder
@@ -226,7 +220,7 @@ def _load(
     options: ParameterOptions,
     recording: RecordingOptions,
     run: Path | None = None,
-) -> "tuple[Machine, Recording | None]":
+) -> "tuple[crane.Machine, crane.Recording | None]":
     """The machine, and the recording of what is a run, or of a run of the machine."""
     from crane.recordings.run_folder import recorded_machine
 
@@ -238,7 +232,7 @@ def _load(
     return given or recorded_machine(what, read.machine), read
 
 
-def _run_machine(name: str | None, options: ParameterOptions) -> "Machine | None":
+def _run_machine(name: str | None, options: ParameterOptions) -> "crane.Machine | None":
     """The machine that is given beside a run; None if the recorded one is meant."""
     if name is None:
         options.refuse("is for a machine, name it by --machine")

@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import crane
 from crane.cli.command import OptionBlock, command, refuse_options
 from crane.cli.options import (
     ChangeOptions,
@@ -27,22 +28,17 @@ from crane.cli.options import (
 from crane.cli.parsing import (
     parse_configuration,
     parse_grids,
-    parse_loads,
+    parse_load,
     parse_names,
     parse_numbers,
 )
 from crane.cli.terminal import INTERRUPTED, print_message, progress_bar, status
-from crane.common.errors import CraneError, InputError, SimulationError, suggest_names
+from crane.common.atomic_output import replace_folder
+from crane.common.errors import CraneError, InputError, SimulationError, check_name
+from crane.common.result import Result
 
 if TYPE_CHECKING:
-    from crane.common.result import Result
-    from crane.control.control_law import Controller
-    from crane.control.valve_commands import ValveCommand
-    from crane.machine.machine import Machine
-    from crane.motion.trajectory import Trajectory
-    from crane.simulation.simulation_run import Progress
-
-    Control = Controller | ValveCommand
+    Control = crane.control.Controller | crane.control.ValveCommand
 
 DEMO_MACHINES = "mini_forwarder", "excavator"
 _SIMULATED_SHARE = 0.3  # of the time of a task of the demonstration; drawing takes the rest
@@ -68,7 +64,6 @@ Step = Annotated[float, typer.Option(metavar="SECONDS", help="Step of the record
 @command()
 def demo(output: OutputFolder) -> None:
     """Simulate and show all tasks of two bundled machines."""
-    from crane.common.atomic_output import replace_folder
     from crane.view.result_files import FIGURE, PAGE
 
     with progress_bar("simulating") as progress, replace_folder(output.out, output.force) as part:
@@ -78,17 +73,17 @@ def demo(output: OutputFolder) -> None:
     print(f"animations: {folder}/*/{PAGE} (open them in a browser)")
 
 
-def write_demo(folder: Path, progress: "Progress") -> str:
+def write_demo(folder: Path, progress: Callable[[float], None]) -> str:
     """Simulate the tasks of the demonstration, and write a folder of each into a folder.
 
     Returns:
         The summaries of all tasks, Markdown.
     """
-    from crane.formats.machine_loading import load
-    from crane.simulation.simulation_run import simulate as run
     from crane.view.result_files import SUMMARY
 
-    tasks = [(machine, task) for machine in map(load, DEMO_MACHINES) for task in machine.tasks]
+    tasks = [
+        (machine, task) for machine in map(crane.load, DEMO_MACHINES) for task in machine.tasks
+    ]
     texts = []
     for i, (machine, task) in enumerate(tasks):
 
@@ -96,7 +91,9 @@ def write_demo(folder: Path, progress: "Progress") -> str:
             progress((done + _SIMULATED_SHARE * share) / len(tasks))
 
         control = task_control(machine, task, None)
-        recording = run(add_task_loads(machine, task), control, label=task, progress=report)
+        recording = crane.simulate(
+            add_task_loads(machine, task), control, label=task, progress=report
+        )
         texts.append(recording.write(folder / task, views=True))
     progress(1.0)
     text = "\n".join(texts)
@@ -129,20 +126,20 @@ class MotionOptions(OptionBlock):
     ] = None
     duration: Duration = None
 
-    def control(self, machine: "Machine", step: float) -> "tuple[Control | None, float | None]":
+    def control(
+        self, machine: "crane.Machine", step: float
+    ) -> "tuple[Control | None, float | None]":
         """Controller and duration [s] of the motion, as `task_control` and `task_duration`."""
-        from crane.motion.path_reader import read_path
-
         if self.path is None:
             control = task_control(machine, self.task, self.controller, self.sway)
             return control, task_duration(machine, self.task, self.duration)
         refuse_options({"--task": self.task}, "does not go with --path, leave one out")
-        reference, duration = read_path(machine, self.path), self.duration
+        reference, duration = crane.motion.read_path(machine, self.path), self.duration
         if duration is None and step > 0:
             duration = math.ceil(reference.duration / step - 1e-9) * step  # whole steps
         return tracking_control(machine, reference, self.controller, self.sway), duration
 
-    def label(self, machine: "Machine", control: "Control | None") -> str:
+    def label(self, machine: "crane.Machine", control: "Control | None") -> str:
         """Name of the motion in the recording."""
         uncontrolled = "free motion" if machine.hydraulics is None else "valves at rest"
         path = None if self.path is None else self.path.stem
@@ -205,23 +202,20 @@ def simulate(
 
     Without these it simulates the home configuration, held by a controller or released.
     """
-    from crane.simulation.recording_replay import replay
-    from crane.simulation.simulation_run import simulate as run
-
     loaded = add_task_loads(options.load(machine), motion.task)
-    loaded = loaded.with_external_forces(*parse_loads(load))
+    loaded = loaded.with_external_forces(*map(parse_load, load or ()))
     result: Result
     if inputs is not None:
         for block in (motion, integration):
             block.refuse("does not go with --inputs, leave it out")
         with _write_stopped_run(output, npz), progress_bar("simulating") as progress:
-            _, result = replay(loaded, inputs, step, progress, reading.columns, reading.span)
+            _, result = crane.replay(loaded, inputs, step, progress, reading.columns, reading.span)
     else:
         reading.refuse("is for --inputs, leave it out")
         control, duration = motion.control(loaded, step)
         label = motion.label(loaded, control)
         with _write_stopped_run(output, npz), progress_bar("simulating") as progress:
-            result = run(
+            result = crane.simulate(
                 loaded, control, duration=duration, step=step, label=label,
                 method=integration.method, tolerance=integration.tolerance, progress=progress,
             )  # fmt: skip
@@ -235,11 +229,9 @@ def _write_stopped_run(output: OutputFolder, npz: bool) -> Iterator[None]:
     Raises:
         CraneError: The error, with the folder of the run.
     """
-    from crane.simulation.recorded_run import InterruptedRun
-
     try:
         yield
-    except (CraneError, InterruptedRun) as stop:
+    except (CraneError, crane.simulation.InterruptedRun) as stop:
         recording = getattr(stop, "recording", None)
         if recording is None:
             raise
@@ -252,56 +244,51 @@ def _write_stopped_run(output: OutputFolder, npz: bool) -> Iterator[None]:
 
 
 def task_control(
-    machine: "Machine", task: str | None, controller: str | None, sway: str | None = None
+    machine: "crane.Machine", task: str | None, controller: str | None, sway: str | None = None
 ) -> "Control | None":
     """The controller of a task, by the controller's name and a method of `suppress_sway`.
 
     Raises:
         InputError: There is no such task or controller.
     """
-    from crane.control.controller_registry import make_controller
-    from crane.control.levers import joystick
-    from crane.motion.task_trajectories import task_trajectory
-    from crane.motion.trajectory import point_to_point
-
     if task is None:
         refuse_options({"--sway": sway}, "changes a reference, name a --task or a --path")
         if controller is None:
             return None
         home = machine.home[machine.closure.active]
-        return make_controller(controller, machine, point_to_point(home, home, 1.0))
-    if task not in machine.tasks:
-        raise InputError(
-            f"machine '{machine.name}' has no task '{task}', {suggest_names(machine.tasks, task)}"
-        )
+        trajectory = crane.point_to_point(home, home, 1.0)
+        return crane.control.make_controller(controller, machine, trajectory)
+    check_name(task, machine.tasks, f"machine '{machine.name}' has no task '{task}'")
     if machine.tasks[task].space == "joystick":
-        for option, value in {"--controller": controller, "--sway": sway}.items():
-            if value is not None:
-                raise InputError(f"task '{task}' moves levers, leave {option} out")
-        return joystick(machine, task)
-    return tracking_control(machine, task_trajectory(machine, task), controller, sway)
+        text = f"does not go with task '{task}', which moves levers, leave it out"
+        refuse_options({"--controller": controller, "--sway": sway}, text)
+        return crane.joystick(machine, task)
+    return tracking_control(machine, crane.task_trajectory(machine, task), controller, sway)
 
 
 def tracking_control(
-    machine: "Machine", reference: "Trajectory", controller: str | None, sway: str | None = None
+    machine: "crane.Machine",
+    reference: "crane.motion.Trajectory",
+    controller: str | None,
+    sway: str | None = None,
 ) -> "Control":
     """The controller that tracks a reference, see `task_control`."""
-    from crane.control.controller_registry import default_controller_name, make_controller
-    from crane.motion.sway_suppression import suppress_sway
-
     if sway is not None:
-        reference = suppress_sway(machine, reference, sway)
-    return make_controller(controller or default_controller_name(machine), machine, reference)
+        reference = crane.motion.suppress_sway(machine, reference, sway)
+    name = controller or crane.control.default_controller_name(machine)
+    return crane.control.make_controller(name, machine, reference)
 
 
-def add_task_loads(machine: "Machine", task: str | None) -> "Machine":
+def add_task_loads(machine: "crane.Machine", task: str | None) -> "crane.Machine":
     """The machine with the external forces of a task; unchanged if there is no such task."""
     if task is None or task not in machine.tasks:
         return machine
     return machine.with_external_forces(*machine.tasks[task].loads)
 
 
-def task_duration(machine: "Machine", task: str | None, duration: float | None) -> float | None:
+def task_duration(
+    machine: "crane.Machine", task: str | None, duration: float | None
+) -> float | None:
     """Duration [s] of a simulation; None if it ends by itself.
 
     Raises:
@@ -310,8 +297,10 @@ def task_duration(machine: "Machine", task: str | None, duration: float | None) 
     if duration is not None:
         return duration
     if task is None:
-        tasks = ", ".join(machine.tasks) or "none"
-        raise InputError(f"no task: name a --task ({tasks}), or a --duration to let it go")
+        raise InputError(
+            f"no task: name a --task ({', '.join(machine.tasks) or 'none'}), or a --duration to "
+            "let it go"
+        )
     return None if machine.tasks[task].phases else machine.tasks[task].duration
 
 
@@ -330,11 +319,11 @@ def sway(
     ] = 0.2,
 ) -> None:
     """Compare methods that suppress the sway of a load."""
-    from crane.studies.residual_sway_study import sway_study
-
     masses = parse_numbers(payload.split(","), f"--payload {payload}: give masses as 0,200,500")
     with progress_bar("simulating") as progress:
-        result = sway_study(machine, task, masses, damping, options.changed_values(), progress)
+        result = crane.studies.sway_study(
+            machine, task, masses, damping, options.changed_values(), progress
+        )
     print(result.to_text())
 
 
@@ -368,17 +357,19 @@ def modes(
     ] = None,
 ) -> None:
     """Compute frequencies, damping and shapes of modes."""
-    from crane.simulation.linear import linear_models, linearize
-
     axes = parse_grids(vary)
     loaded = options.load(machine)
     q_a, v_a = parse_configuration("--at", at), parse_configuration("--velocity", velocity)
     with status("linearizing"):
-        model = linearize(loaded, q_a, velocity=v_a, drive=drive, outputs=parse_names(outputs))
+        model = crane.linearize(
+            loaded, q_a, velocity=v_a, drive=drive, outputs=parse_names(outputs)
+        )
     models = []
     if axes:
         with progress_bar("linearizing") as progress:
-            models = linear_models(loaded, axes, q_a, drive=drive, progress=progress)
+            models = crane.simulation.linear_models(
+                loaded, axes, q_a, drive=drive, progress=progress
+            )
     output.write(model, models=models)
 
 
@@ -395,12 +386,10 @@ def sensitivities(
     outputs: Outputs = None,
 ) -> None:
     """Compute derivatives of a motion by parameters."""
-    from crane.simulation.sensitivity import sensitivities as run
-
     loaded = add_task_loads(options.load(machine), task)
     control = task_control(loaded, task, controller)
     with progress_bar("simulating") as progress:
-        result = run(
+        result = crane.sensitivities(
             loaded, control, duration=task_duration(loaded, task, duration), step=step,
             parameters=by, outputs=parse_names(outputs), progress=progress,
         )  # fmt: skip

@@ -9,7 +9,7 @@ to the active ones is
 
 It is 1 where no other joint moves, and infinite at a dead centre: sigma_min(N_A) is also the least
 singular value of J_P once the rows of J D are orthonormal. It depends neither on how the equations
-are written nor on units, see `motion_scales`.
+are written nor on units, see `Coordinates.motion_scales`.
 """
 
 import re
@@ -17,13 +17,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pinocchio as pin
-from numpy.typing import NDArray
 
-from crane.closure.coordinates import Coordinates
+from crane.closure.coordinates import Indices
+from crane.closure.loop_equations import LoopEquations
 from crane.common.samples import Array
-
-Indices = NDArray[np.intp]
 
 # sigma_min below which a selection drives nothing at home, see `constraint_structure`
 DEAD_CENTRE_TOLERANCE = 1e-5
@@ -50,46 +47,6 @@ class ActiveJointSelection:
         return f"[{', '.join(self.joints)}] (condition {self.condition_number:.3g})"
 
 
-def translational_coordinates(model: pin.Model) -> NDArray[np.bool_]:
-    """Mask (nv,) of the coordinates that are lengths."""
-    return Coordinates(model).is_translation
-
-
-def characteristic_length(model: pin.Model) -> float:
-    """The characteristic length of a machine [m]: the largest distance between adjacent joints.
-
-    Where all joints coincide: the largest distance of a link from its joint, else the largest
-    limit of a prismatic joint, else 1 m.
-    """
-    joints = (place.translation for place in list(model.jointPlacements)[1:])
-    links = (frame.placement.translation for frame in model.frames)
-    coordinates = Coordinates(model)
-    limits = np.abs(np.stack([coordinates.lower, coordinates.upper]))[
-        :, coordinates.is_translation
-    ]
-    distances = (float(np.abs(list(places)).max(initial=0.0)) for places in (joints, links))
-    return (
-        next(filter(None, distances), float(limits[np.isfinite(limits)].max(initial=0.0))) or 1.0
-    )
-
-
-def coordinate_units(model: pin.Model) -> Array:
-    """(nv,) units that make coordinates comparable: 1 rad, and the characteristic length [m]."""
-    return np.where(translational_coordinates(model), characteristic_length(model), 1.0)
-
-
-def motion_scales(model: pin.Model) -> Array:
-    """(nv,) comparable displacements of the joints.
-
-    The range of a joint, at most 1 rad or the characteristic length; that bound for joints without
-    limits.
-    """
-    units_of_coordinates = coordinate_units(model)
-    coordinates = Coordinates(model)
-    ranges = coordinates.upper - coordinates.lower
-    return np.where(ranges > 0, np.minimum(ranges, units_of_coordinates), units_of_coordinates)
-
-
 def null_space_basis(jacobian: Array, scales_of_motion: Array, tolerance: float) -> Array:
     """N (nv, n): orthonormal basis of the scaled motions that the equations allow to first order.
 
@@ -109,14 +66,17 @@ def condition_number(gamma: Array, scales_of_motion: Array, active: Indices) -> 
 
     Args:
         gamma: (nv, n) or (N, nv, n), of closed configurations.
-        scales_of_motion: (nv,), see `motion_scales`.
+        scales_of_motion: (nv,), see `Coordinates.motion_scales`.
         active: (n,) columns of the active joints.
 
     Returns:
         () or (N,), at least 1.
     """
-    scaled_gamma = gamma * scales_of_motion[active] / scales_of_motion[:, None]
-    return np.asarray(np.linalg.norm(scaled_gamma, 2, axis=(-2, -1)))
+    return np.asarray(
+        np.linalg.norm(
+            gamma * scales_of_motion[active] / scales_of_motion[:, None], 2, axis=(-2, -1)
+        )
+    )
 
 
 def select_columns(
@@ -182,9 +142,8 @@ def _argmax_up_to_rounding(values: Array) -> int:
 
 
 def propose_active_joints(
-    model: pin.Model,
+    equations: LoopEquations,
     jacobian: Array,
-    coupled: Sequence[int] = (),
     candidates: Sequence[int] | None = None,
     required: Sequence[int] = (),
 ) -> list[ActiveJointSelection]:
@@ -192,54 +151,47 @@ def propose_active_joints(
 
     Actuators are preferred if their condition number is below 100: prismatic joints, and joints
     with an effort limit. Joints whose name contains "passive" or "free" are only used if the
-    others do not suffice. The second proposal is the selection with the best condition number of
-    all joints, or the best one without that joint of the first proposal that is needed least.
+    others do not suffice, joints in couplings last. The second proposal is the selection with the
+    best condition number of all joints, or the best one without that joint of the first proposal
+    that is needed least.
 
     Args:
-        model: The spanning tree.
-        jacobian: (m, nv) of all loop equations.
-        coupled: Columns of joints in couplings, which are used last.
+        equations: The loop equations.
+        jacobian: (m, nv) of all loop equations, or of the independent ones.
         candidates: Columns to select from; all if not given.
         required: Columns that are selected in any case.
     """
-    scale = motion_scales(model)
-    basis = null_space_basis(jacobian, scale, DEAD_CENTRE_TOLERANCE)
-    coordinates = Coordinates(model)
-    names = coordinates.names
-    columns = range(model.nv) if candidates is None else candidates
-    free = [i for i in columns if i not in coupled]
-    effort = np.asarray(model.effortLimit)
-    looks_actuated = translational_coordinates(model) | (np.isfinite(effort) & (effort > 0))
-    actuators = [i for i in free if looks_actuated[i]]
+    basis = null_space_basis(jacobian, equations.motion_scales, DEAD_CENTRE_TOLERANCE)
     if basis.shape[1] == 0:
         return []
+    coordinates, effort = equations.coordinates, np.asarray(equations.model.effortLimit)
+    names = coordinates.names
+    columns = range(len(names)) if candidates is None else candidates
+    is_coupled = (equations.coupling_factors != 0).any(axis=0)
+    free = [i for i in columns if not is_coupled[i]]
+    looks_actuated = coordinates.is_translation | (np.isfinite(effort) & (effort > 0))
+    actuators = [i for i in free if looks_actuated[i]]
 
-    def valued(found: Indices | None) -> ActiveJointSelection | None:
-        if found is None:
-            return None
-        least = float(np.linalg.svd(basis[found], compute_uv=False)[-1])
-        return ActiveJointSelection(tuple(names[i] for i in found), 1.0 / least)
+    def select_first(*alternatives: Sequence[int]) -> ActiveJointSelection | None:
+        """The selection from the first columns that drive the machine."""
+        for some in alternatives:
+            found = select_columns(basis, some, required)
+            if found is not None:
+                least = float(np.linalg.svd(basis[found], compute_uv=False)[-1])
+                return ActiveJointSelection(tuple(names[i] for i in found), 1.0 / least)
+        return None
 
-    best = valued(select_columns(basis, free, required)) or valued(
-        select_columns(basis, columns, required)
-    )
+    best = select_first(free, columns)
     if best is None:
         return []
-    not_idle_by_name = [i for i in actuators if not _UNDRIVEN_NAME.search(names[i])]
-    driven = valued(select_columns(basis, not_idle_by_name, required)) or valued(
-        select_columns(basis, actuators, required)
-    )
-    first = (
-        driven
-        if driven is not None and driven.condition_number < _MAX_ACTUATOR_CONDITION
-        else best
-    )
-    out = [first]
-    if first.joints != best.joints:
-        return [first, best]
+    driven = select_first([i for i in actuators if not _UNDRIVEN_NAME.search(names[i])], actuators)
+    if driven is None or driven.condition_number >= _MAX_ACTUATOR_CONDITION:
+        driven = best
+    if driven.joints != best.joints:
+        return [driven, best]
     others = [
-        valued(select_columns(basis, [i for i in free if names[i] != name], required))
-        for name in first.joints
+        select_first([i for i in free if names[i] != name])
+        for name in driven.joints
         if names.index(name) not in required
     ]
     acceptable = [
@@ -247,9 +199,4 @@ def propose_active_joints(
         for choice in others
         if choice is not None and choice.condition_number < _MAX_ACTUATOR_CONDITION
     ]
-    return out + sorted(acceptable, key=lambda choice: choice.condition_number)[:1]
-
-
-def format_selections(selections: Sequence[ActiveJointSelection]) -> str:
-    """The selections as text for error messages."""
-    return ", or ".join(str(choice) for choice in selections)
+    return [driven, *sorted(acceptable, key=lambda choice: choice.condition_number)[:1]]

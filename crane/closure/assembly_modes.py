@@ -14,8 +14,8 @@ import numpy as np
 import pinocchio as pin
 
 from crane.closure.closure import Closure
-from crane.closure.constraint_structure import Indices
 from crane.closure.constraint_tolerances import FILE_PRECISION
+from crane.closure.coordinates import Indices
 from crane.closure.home_search import within_limits
 from crane.closure.loop_equations import LoopEquations
 from crane.closure.multi_start_search import MultiStartSearch, low_discrepancy_steps
@@ -102,12 +102,17 @@ def _find_alternatives(search: "_AssemblyModeSearch", max_starts: int) -> list[A
             if (one := search.assess_block_solution(q, index)) is not None
         )
         found += itertools.islice(candidates, 1)
-    for columns in search.passive_groups() if closure.home_search is not None else ():
+    if closure.home_search is None:
+        return found
+    # passive joints that loops connect, directly or through others
+    group, group_of_row = closure.equations.coupled_groups(closure.passive)
+    for index in np.unique(group_of_row[group_of_row >= 0]):
+        columns = closure.passive[group == index]
+        rows = search.independent_rows_of(columns)
         group_candidates = (
             one
-            for q in search.find_group_solutions(columns, max_starts)
-            if (one := search.assess_assembly_mode(q, search.independent_rows_of(columns)))
-            is not None
+            for q in search.find_group_solutions(rows, columns, max_starts)
+            if (one := search.assess_assembly_mode(q, rows)) is not None
             and not any(search.is_same_for_masses(q, other.q) for other in found)
         )
         found += itertools.islice(group_candidates, 1)
@@ -157,12 +162,15 @@ class _AssemblyModeSearch:
         rows, columns = self._block_indices(block)
         found = [self.home]
         sign = self._determinant_sign(self.home, rows, columns)
-        two_solutions = len(columns) <= 2 and self._is_dyad(block)
-        starts = [
+        # circles or lines that intersect: translations of one loop only
+        one_loop = len(set(self.equations.loop_of_row[rows].tolist())) == 1
+        two_solutions = (
+            len(columns) <= 2 and one_loop and self.equations.is_translation[rows].all()
+        )
+        for start in [
             *self._starts_across_home(rows, columns),
             *self._starting_points(columns, _STARTS_PER_UNKNOWN * len(columns)),
-        ]
-        for start in starts[:max_starts]:
+        ][:max_starts]:
             q = self._solve_newton(start, rows, columns, found)
             if q is None or any(
                 self.coordinate_differences(q, x)[columns].max() < _SAME_CONFIGURATION_TOLERANCE
@@ -174,12 +182,6 @@ class _AssemblyModeSearch:
                 break  # mirror images: there are no others
         return found[1:]
 
-    def passive_groups(self) -> list[Indices]:
-        """Columns of passive joints that loops connect, directly or through others."""
-        passive = self.closure.passive
-        group, group_of_row = self.equations.coupled_groups(passive)
-        return [passive[group == i] for i in np.unique(group_of_row[group_of_row >= 0])]
-
     def independent_rows_of(self, columns: Indices) -> Indices:
         """Independent rows of the loops that contain some joints."""
         involved = (
@@ -188,11 +190,12 @@ class _AssemblyModeSearch:
         rows = self.closure.structure.independent_rows
         return rows[involved[self.equations.loop_of_row[rows]]]
 
-    def find_group_solutions(self, columns: Indices, max_starts: int) -> list[Array]:
+    def find_group_solutions(
+        self, rows: Indices, columns: Indices, max_starts: int
+    ) -> list[Array]:
         """Closed configurations with all other joints as at home, nearest to the guess first."""
         initial_guess = self.home.copy()
         initial_guess[columns] = self.guess[columns]
-        rows = self.independent_rows_of(columns)
         search = MultiStartSearch(
             self._equations_of_rows(rows)[0], initial_guess, self.specified_columns, max_starts
         )
@@ -211,23 +214,19 @@ class _AssemblyModeSearch:
             self._loop_subsets[loop_indices] = self.equations.subset(
                 [names[i] for i in loop_indices]
             )
-        subset_rows = np.flatnonzero(np.isin(loop_of_row, loop_indices))
-        return self._loop_subsets[loop_indices], np.searchsorted(subset_rows, rows)
+        return self._loop_subsets[loop_indices], np.searchsorted(
+            np.flatnonzero(np.isin(loop_of_row, loop_indices)), rows
+        )
 
     def _block_indices(self, block: int) -> tuple[Indices, Indices]:
         rows, columns = self.blocks[block]
         return self.closure.structure.independent_rows[rows], self.closure.passive[columns]
 
-    def _is_dyad(self, block: int) -> bool:
-        """Whether a block has translations of one loop only: circles or lines that intersect."""
-        rows, _ = self._block_indices(block)
-        loops = set(self.equations.loop_of_row[rows].tolist())
-        return len(loops) == 1 and bool(self.equations.is_translation[rows].all())
-
     def _starts_across_home(self, rows: Indices, columns: Indices) -> Array:
         """(4, nq) configurations on both sides of home, along the least determined direction."""
-        jacobian = self.equations.evaluate_scaled(self.home)[1][np.ix_(rows, columns)]
-        least_determined_direction = np.linalg.svd(jacobian)[2][-1]
+        least_determined_direction = np.linalg.svd(
+            self.equations.evaluate_scaled(self.home)[1][np.ix_(rows, columns)]
+        )[2][-1]
         out = np.tile(self.home, (4, 1))
         out[:, columns] += np.outer(
             [0.5, -0.5, 1.5, -1.5], least_determined_direction * self._coordinate_units[columns]
@@ -265,8 +264,7 @@ class _AssemblyModeSearch:
         equations, rows = self._equations_of_rows(rows)
         for _ in range(_MAX_ITERATIONS):
             phi, jacobian = equations.evaluate_scaled(q)
-            residual = np.abs(phi[rows]).max(initial=0.0)
-            if residual < 1e-13:
+            if np.abs(phi[rows]).max(initial=0.0) < 1e-13:
                 break
             try:
                 step = solve_linear(jacobian[np.ix_(rows, columns)], -phi[rows])
@@ -293,30 +291,22 @@ class _AssemblyModeSearch:
         return q
 
     def _determinant_sign(self, q: Array, rows: Indices, columns: Indices) -> float:
-        jacobian = self.equations.evaluate(q)[1][np.ix_(rows, columns)]
-        return float(np.linalg.slogdet(jacobian)[0])
-
-    def _block_solutions_from_guesses(self, q: Array, block: int) -> list[Array]:
-        """Solutions of a block with all else fixed, started from the guess and from home."""
-        rows, columns = self._block_indices(block)
-        found = []
-        for start in (self.guess, self.home):
-            start_configuration = q.copy()
-            start_configuration[columns] = start[columns]
-            if (solution := self._solve_newton(start_configuration, rows, columns)) is not None:
-                found.append(solution)
-        return found
+        return float(np.linalg.slogdet(self.equations.evaluate(q)[1][np.ix_(rows, columns)])[0])
 
     def assess_block_solution(self, q: Array, block: int) -> AssemblyMode | None:
         """The assembly mode with another solution of a block, or None."""
         for later_block in range(block + 1, len(self.blocks)):
-            solutions, (_, columns) = (
-                self._block_solutions_from_guesses(q, later_block),
-                self._block_indices(later_block),
-            )
-            if not solutions:
+            later_rows, columns = self._block_indices(later_block)
+            solutions = []
+            for start in (self.guess, self.home):
+                start_configuration = q.copy()
+                start_configuration[columns] = start[columns]
+                solutions.append(self._solve_newton(start_configuration, later_rows, columns))
+            closed = [found for found in solutions if found is not None]
+            if not closed:
                 return None
-            q = min(solutions, key=lambda way: self.distance_from_guess(way, columns))
+            distances = [self.distance_from_guess(found, columns) for found in closed]
+            q = closed[int(np.argmin(distances))]
         return self.assess_assembly_mode(q, self._block_indices(block)[0])
 
     def assess_assembly_mode(self, q: Array, rows: Indices) -> AssemblyMode | None:
@@ -348,8 +338,9 @@ class _AssemblyModeSearch:
         ratio = _DISTANCE_RATIO if is_decisive else _LOOSE_DISTANCE_RATIO
         if distance > ratio * home_distance and not home_outside_limits:
             return None
-        loops = sorted(set(self.equations.loop_of_row[rows].tolist()))
-        names = tuple(self.equations.names[i] for i in loops)
+        names = tuple(
+            self.equations.names[i] for i in sorted(set(self.equations.loop_of_row[rows].tolist()))
+        )
         largest_deviation, home_deviation = (
             self._largest_deviation(q, compared),
             self._largest_deviation(self.home, compared),

@@ -1,84 +1,106 @@
-"""Closing loops on one branch: by machine code where possible, else by `NewtonContinuation`."""
+"""Closing loops on one branch: by machine code where possible, else by `NewtonContinuation`.
 
-import copy
-import threading
+Samples of a stack are sorted where they need not be a path. A recorded motion may leave the
+branch at dead centres of the recorded coordinates, see `follow_motion`.
+"""
+
 from functools import cached_property
 
 import numpy as np
 
+from crane.closure.active_joint_selection import null_space_basis
 from crane.closure.compiled_closure import CompiledClosure, ContinuationCursor
-from crane.closure.constraint_structure import ConstraintStructure, Indices
+from crane.closure.constraint_structure import ConstraintStructure
+from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
-from crane.closure.motion_continuation import sort_samples
-from crane.closure.newton_continuation import ClosedConfiguration, NewtonContinuation
+from crane.closure.newton_continuation import NewtonContinuation
 from crane.codegen import FormulaTooLongError, run_with_fallback
-from crane.common.errors import SingularConfigurationError, WrongBranchError
+from crane.common.errors import ClosureError, SingularConfigurationError, WrongBranchError
 from crane.common.samples import Array
+from crane.common.threads import ThreadLocal
 
 _SAME_CONFIGURATION_TOLERANCE = 1e-6  # scaled distance of equal configurations
 _CONTINUATION_STEPS = 8  # steps from home to a target far from the previous one
 
+_SINGULAR_TOLERANCE = 1e-9  # relative singular value that counts as zero
+# least singular value of A below which q_A does not determine q
+_WEAK_SINGULAR_VALUE = 0.05
+# weight w of the extrapolated motion
+_EXTRAPOLATION_WEIGHT = 3e-3
+_MAX_ITERATIONS, _STEP_TOLERANCE = 40, 1e-13
+_CLOSED_TOLERANCE = 1e-9  # residual of closed loops
+# scaled distance to the extrapolation that means another branch
+_MAX_EXTRAPOLATION_ERROR = 0.5
+
+# samples worth sorting: number, and mean distance of neighbours as a fraction of the range
+_MIN_SAMPLES_TO_SORT, _FAR_SAMPLE_DISTANCE = 100, 0.1
+
 
 class BranchSolver:
-    """Closes loops on the branch of a home configuration.
+    """Closes loops on the branch of a home configuration; base class of `Closure`.
 
     Each thread has a cursor: the last configuration, from which the next one is continued.
 
-    Args:
+    Attributes:
         equations: All loop equations.
         structure: Independent equations, and home.
         active: Columns of the active joints.
         passive: Columns of the other joints.
-        with_machine_code: Whether to compile the loops.
-
-    Attributes:
+        home: (nq,) closed home configuration.
         continuation: Newton's method without machine code.
     """
 
-    def __init__(
-        self,
-        equations: LoopEquations,
-        structure: ConstraintStructure,
-        active: Indices,
-        passive: Indices,
-        with_machine_code: bool = True,
-    ):
-        self._parts = equations, structure, active, passive
-        self._units, self._with_machine_code = equations.coordinate_units, with_machine_code
-        coordinates = equations.coordinates
-        ranges = (coordinates.upper - coordinates.lower)[active]
-        limited = np.isfinite(ranges) & (ranges > 0)
-        self._active_ranges = np.where(limited, ranges, self._units[active])
-        self.continuation = NewtonContinuation(*self._parts, self._active_ranges)
-        self._thread_local = threading.local()
+    equations: LoopEquations
+    structure: ConstraintStructure
+    active: Indices
+    passive: Indices
 
-    def with_new_cursors(self) -> "BranchSolver":
-        """A copy whose threads begin at home."""
-        other = copy.copy(self)
-        other._thread_local = threading.local()
-        return other
+    def _start_solver(self, with_machine_code: bool = True) -> None:
+        """Close home, from which the branch is followed."""
+        coordinates, units = self.equations.coordinates, self.equations.coordinate_units
+        ranges = (coordinates.upper - coordinates.lower)[self.active]
+        limited = np.isfinite(ranges) & (ranges > 0)
+        self._active_ranges = np.where(limited, ranges, units[self.active])
+        self._parts = self.equations, self.structure, self.active, self.passive
+        self.continuation = NewtonContinuation(*self._parts, self._active_ranges)
+        self.home = self.continuation.home.q.copy()
+        self.home.flags.writeable = False
+        self._with_machine_code = with_machine_code
+        self.__dict__.pop("_machine_code", None)  # of the closure that this one is a copy of
+        self.__dict__.pop("_cursors", None)
 
     @cached_property
-    def compiled_closure(self) -> CompiledClosure | None:
+    def _machine_code(self) -> CompiledClosure | None:
         """Machine code of the loops, None if they are too many for it."""
+        if not self._with_machine_code:
+            return None
         home = self.continuation.home
         try:
-            return (
-                CompiledClosure(*self._parts, home, self.continuation.rounding_scale(home.q))
-                if self._with_machine_code
-                else None
-            )
+            return CompiledClosure(*self._parts, home, self.continuation.rounding_scale(home.q))
         except FormulaTooLongError:
             return None
 
-    def _cursor(self, compiled: CompiledClosure) -> ContinuationCursor:
-        try:
-            return self._thread_local.cursor
-        except AttributeError:
-            self._thread_local.cursor = compiled.new_cursor()
-            return self._thread_local.cursor
+    @property
+    def is_compiled(self) -> bool:
+        """Whether the loops are solved by machine code."""
+        return self._machine_code is not None
 
-    def solve(self, targets: Array, guess: Array | None, stacked: bool, out: Array) -> None:
+    @property
+    def compiled_closure(self) -> CompiledClosure:
+        """Machine code of the loops, compiled on first use.
+
+        Raises:
+            FormulaTooLongError: The machine is too large for it.
+        """
+        if self._machine_code is None:
+            raise FormulaTooLongError
+        return self._machine_code
+
+    @cached_property
+    def _cursors(self) -> ThreadLocal[ContinuationCursor]:
+        return ThreadLocal(self.compiled_closure.new_cursor)
+
+    def _solve_stack(self, targets: Array, guess: Array | None, stacked: bool, out: Array) -> None:
         """Close the loops at targets (N, n) into out (N, nq).
 
         Args:
@@ -87,12 +109,12 @@ class BranchSolver:
             stacked: Whether errors contain the number of the sample.
             out: (N, nq).
         """
-        compiled, nearest = self.compiled_closure, self.continuation.nearest_closed_configuration
-        if compiled is not None:
-            cursor = self._cursor(compiled)
-            if guess is not None and not compiled.start_cursor_at(cursor, guess):
+        nearest = self.continuation.nearest_closed_configuration
+        if self.is_compiled:
+            cursor = self._cursors.value
+            if guess is not None and not self.compiled_closure.start_cursor_at(cursor, guess):
                 cursor.start_from(nearest(guess))
-            self._follow_stack(compiled, targets, out, stacked)
+            self._follow_stack(cursor, targets, out, stacked)
             return
         solution = self.continuation.home if guess is None else nearest(guess)
         for i, target in enumerate(targets):
@@ -101,9 +123,9 @@ class BranchSolver:
             out[i] = solution.q
 
     def _follow_stack(
-        self, compiled: CompiledClosure, targets: Array, out: Array, stacked: bool
+        self, cursor: ContinuationCursor, targets: Array, out: Array, stacked: bool
     ) -> None:
-        cursor, passive_gamma = self._cursor(compiled), self.continuation.home.passive_gamma
+        compiled, passive_gamma = self.compiled_closure, self.continuation.home.passive_gamma
         moves_passive_joints = np.abs(passive_gamma).max(axis=0, initial=0.0) > 0
         order = sort_samples((targets / self._active_ranges)[:, moves_passive_joints])
         sorted_targets = np.ascontiguousarray(targets if order is None else targets[order])
@@ -111,7 +133,7 @@ class BranchSolver:
 
         def continue_from_home(i: int) -> None:
             sample = f" (sample {i if order is None else order[i]})" if stacked else ""
-            closed[i] = self.continue_from_home(compiled, cursor, sorted_targets[i], sample)
+            closed[i] = self.continue_from_home(cursor, sorted_targets[i], sample)
 
         run_with_fallback(
             len(targets),
@@ -122,16 +144,27 @@ class BranchSolver:
             out[order] = closed
 
     def continue_from_home(
-        self, compiled: CompiledClosure, cursor: ContinuationCursor, target: Array, sample: str
+        self, cursor: ContinuationCursor, target: Array, sample: str = ""
     ) -> Array:
-        """See `Closure.continue_from_home`."""
+        """Close the loops at a target that is too far for one step, and move the cursor there.
+
+        In several steps from home, or else by `NewtonContinuation`.
+
+        Args:
+            cursor: Cursor to move.
+            target: (n,).
+            sample: Name of the target in errors.
+
+        Returns:
+            q (nq,).
+        """
         home, n = self.continuation.home, _CONTINUATION_STEPS
         line = home.q_a + np.linspace(0, 1, n + 1)[1:, None] * (target - home.q_a)
         line[-1] = target
         out = np.empty((n, len(home.q)))
         for waypoints in (line[-1:], line[1::2], line):
             cursor.start_from(home)
-            if compiled.follow_targets(cursor, waypoints, out) == len(waypoints):
+            if self.compiled_closure.follow_targets(cursor, waypoints, out) == len(waypoints):
                 return out[len(waypoints) - 1]
         solution = self.continuation.continue_to(target, home, sample)
         cursor.start_from(solution)
@@ -139,17 +172,18 @@ class BranchSolver:
 
     def is_on_branch(self, q: Array) -> bool:
         """Whether a closed configuration (nq,) lies on the branch of home."""
-        if self.compiled_closure is not None:
-            return self.compiled_closure.start_cursor_at(self._cursor(self.compiled_closure), q)
+        if self.is_compiled:
+            return self.compiled_closure.start_cursor_at(self._cursors.value, q)
         try:
-            found: ClosedConfiguration = self.continuation.nearest_closed_configuration(q)
+            found = self.continuation.nearest_closed_configuration(q)
         except WrongBranchError:
             return False
-        return bool(np.abs((found.q - q) / self._units).max() < _SAME_CONFIGURATION_TOLERANCE)
+        difference = (found.q - q) / self.equations.coordinate_units
+        return bool(np.abs(difference).max() < _SAME_CONFIGURATION_TOLERANCE)
 
-    def gamma(self, q: Array, stacked: bool, out: Array) -> None:
-        """Evaluate gamma at closed configurations (N, nq) into out (N, nv, n)."""
-        compiled = self.compiled_closure
+    def _gamma_stack(self, q: Array, stacked: bool) -> Array:
+        """Gamma at closed configurations (N, nq), (N, nv, n)."""
+        compiled, out = self._machine_code, np.empty((*q.shape, len(self.active)))
 
         def check_singularity(i: int) -> None:
             try:
@@ -163,3 +197,95 @@ class BranchSolver:
             None if compiled is None else lambda i, _: compiled.evaluate_gamma(q[i:], out[i:]),
             check_singularity,
         )
+        return out
+
+
+def sort_samples(scaled: Array) -> Indices | None:
+    """An order of samples (N, n) with close neighbours; None if they need no sorting.
+
+    Samples are sorted into cells of all coordinates but the last, and by the last one within a
+    cell.
+
+    Args:
+        scaled: (N, n) coordinates as fractions of their ranges.
+    """
+    if len(scaled) <= _MIN_SAMPLES_TO_SORT or not scaled.size:
+        return None
+    if np.abs(np.diff(scaled, axis=0)).max(axis=1).mean() < _FAR_SAMPLE_DISTANCE:
+        return None
+    cells = np.floor(scaled * len(scaled) ** (1 / scaled.shape[1]))
+    return np.asarray(np.lexsort((scaled[:, -1], *cells[:, :-1].T)))
+
+
+def follow_motion(
+    equations: LoopEquations,
+    active_columns: Indices,
+    motion_scales: Array,
+    q_a: Array,
+    first_configuration: Array,
+) -> Array:
+    """Configurations of recorded active coordinates, by continuity of the motion.
+
+    Where an active coordinate turns back at a dead centre, two configurations have the same q_A.
+    The one nearest to the extrapolated motion is taken: with N the motions that the loops allow, A
+    its rows of the active joints, r the remaining step of the recorded coordinates and p that of
+    the extrapolated motion,
+
+        min |A y - r|^2 + w^2 |y - p|^2,
+
+    with a small w near a dead centre, and w = 0 where A is regular, so that the recorded
+    coordinates are met exactly.
+
+    Args:
+        equations: The loop equations.
+        active_columns: (n,) columns of the active joints.
+        motion_scales: (nq,) comparable displacements of the joints.
+        q_a: (N, n), sampled densely enough to extrapolate.
+        first_configuration: (nq,) closed configuration of the first sample.
+
+    Raises:
+        ClosureError: The motion does not continue to a sample.
+    """
+    out = np.empty((len(q_a), len(first_configuration)))
+    for k, target in enumerate(q_a):
+        if not k:
+            out[0] = first_configuration
+            continue
+        extrapolated = out[k - 1] if k < 2 else 2 * out[k - 1] - out[k - 2]
+        if k > 2:
+            extrapolated = 3 * out[k - 1] - 3 * out[k - 2] + out[k - 3]
+        q, is_weak = extrapolated.copy(), True
+        for _ in range(_MAX_ITERATIONS):
+            residual, jacobian = equations.evaluate(q)
+            null_space = null_space_basis(jacobian, motion_scales, _SINGULAR_TOLERANCE)
+            normal_step = -np.linalg.lstsq(
+                jacobian * motion_scales, residual, rcond=_SINGULAR_TOLERANCE
+            )[0]
+            corrected = q + motion_scales * normal_step
+            active_rows = null_space[active_columns]
+            remaining = (target - corrected[active_columns]) / motion_scales[active_columns]
+            is_weak = bool(
+                np.linalg.svd(active_rows, compute_uv=False).min(initial=1.0)
+                < _WEAK_SINGULAR_VALUE
+            )
+            weight = _EXTRAPOLATION_WEIGHT * is_weak
+            system = np.vstack([active_rows, weight * np.eye(active_rows.shape[1])])
+            right = np.concatenate(
+                [remaining, weight * (null_space.T @ ((extrapolated - corrected) / motion_scales))]
+            )
+            step = normal_step + null_space @ np.linalg.lstsq(system, right, rcond=None)[0]
+            q = q + motion_scales * step
+            if np.abs(step).max(initial=0.0) < _STEP_TOLERANCE:
+                break
+        residual, _ = equations.evaluate(q)
+        deviation = float(np.abs((q - extrapolated) / motion_scales).max(initial=0.0))
+        if not (
+            np.abs(residual).max(initial=0.0) < _CLOSED_TOLERANCE
+            and deviation < _MAX_EXTRAPOLATION_ERROR
+        ):
+            raise ClosureError(
+                f"sample {k}: the motion does not go on to it, it is {deviation:.2g} of a way "
+                "off: record more samples, or see that zeros and signs are the machine's"
+            )
+        out[k] = q
+    return out

@@ -13,30 +13,23 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from crane.closure.active_joint_selection import (
     ActiveJointSelection,
     condition_number,
     propose_active_joints,
 )
-from crane.closure.branch_solver import BranchSolver
-from crane.closure.compiled_closure import CompiledClosure, ContinuationCursor
-from crane.closure.constraint_structure import ConstraintStructure
+from crane.closure.branch_solver import BranchSolver, follow_motion
 from crane.closure.constraint_tolerances import (
     CLOSED_TOLERANCE,
     ExactConstraints,
     RoundedConstraints,
 )
-from crane.closure.home_search import HomeSearchResult, find_cached_home
+from crane.closure.home_search import find_cached_home
 from crane.closure.kinematics_formulas import tree_geometry
 from crane.closure.loop_equations import LoopEquations
-from crane.closure.motion_continuation import follow_motion
-from crane.codegen import FormulaTooLongError
-from crane.common.errors import (
-    InputError,
-    MechanismError,
-)
+from crane.common.errors import InputError, MechanismError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, apply_per_sample, as_samples
 from crane.description.specification import Coupling, LoopSpec
@@ -45,7 +38,7 @@ from crane.description.specification import Coupling, LoopSpec
 _MIN_SINGULAR_VALUE_SHARE = 0.1
 
 
-class Closure(OneLineRepr):
+class Closure(BranchSolver, OneLineRepr):
     """The loops of a machine as functions of its active coordinates.
 
     Park, Choi, Ploen (1999); equations (3) and (4) of the reduced-scale forwarder paper, for any
@@ -80,12 +73,6 @@ class Closure(OneLineRepr):
         structure: Independent equations and the order in which they are solved.
         home_search: How home was found where it did not follow from the guess, else None.
     """
-
-    home: Array
-    initial_guess: Array
-    specified_columns: NDArray[np.intp]
-    structure: ConstraintStructure
-    home_search: HomeSearchResult | None
 
     def __init__(
         self,
@@ -122,16 +109,10 @@ class Closure(OneLineRepr):
         if keep_revolutions:
             revolutions = np.round((initial_guess - self.structure.home) / (2 * np.pi))
             revolutions[coordinates.is_translation] = 0.0
-            home = self.structure.home + 2 * np.pi * revolutions
-            self.structure = dataclasses.replace(self.structure, home=home)
+            self.structure = dataclasses.replace(
+                self.structure, home=self.structure.home + 2 * np.pi * revolutions
+            )
         self._start_solver()
-
-    def _start_solver(self, with_machine_code: bool = True) -> None:
-        """Close home, from which the branch is followed."""
-        parts = self.equations, self.structure, self.active, self.passive
-        self._solver = BranchSolver(*parts, with_machine_code)
-        self.home = self._solver.continuation.home.q.copy()
-        self.home.flags.writeable = False
 
     @property
     def characteristic_length(self) -> float:
@@ -176,7 +157,7 @@ class Closure(OneLineRepr):
         if not _has_same_geometry(LoopEquations(model, loops, couplings), self.equations):
             return None
         other = copy.copy(self)
-        other._solver = self._solver.with_new_cursors()
+        other.__dict__.pop("_cursors", None)
         return other
 
     def with_perturbed_model(
@@ -240,22 +221,6 @@ class Closure(OneLineRepr):
         return (ExactConstraints if is_exact else RoundedConstraints)(self.equations)
 
     @property
-    def is_compiled(self) -> bool:
-        """Whether the loops are solved by machine code."""
-        return self._solver.compiled_closure is not None
-
-    @property
-    def compiled_closure(self) -> CompiledClosure:
-        """Machine code of the loops, compiled on first use.
-
-        Raises:
-            FormulaTooLongError: The machine is too large for it.
-        """
-        if self._solver.compiled_closure is None:
-            raise FormulaTooLongError
-        return self._solver.compiled_closure
-
-    @property
     def degrees_of_freedom(self) -> int:
         """Number n of active joints."""
         return len(self.active)
@@ -292,7 +257,7 @@ class Closure(OneLineRepr):
             if guess.ndim != 1:
                 raise InputError(f"guess has the shape {guess.shape}, give one ({self.model.nv},)")
         out = np.empty((*targets.shape[:-1], self.model.nv))
-        self._solver.solve(np.atleast_2d(targets), guess, targets.ndim == 2, np.atleast_2d(out))
+        self._solve_stack(np.atleast_2d(targets), guess, targets.ndim == 2, np.atleast_2d(out))
         return out
 
     def follow_motion(self, q_a: ArrayLike, initial_guess: ArrayLike | None = None) -> Array:
@@ -315,31 +280,13 @@ class Closure(OneLineRepr):
         targets = as_samples(q_a, len(self.active), "q_a", self.active_names)
         if targets.ndim != 2 or not len(targets):
             raise InputError("q_a is no motion, give (N, n) samples")
-        first = self.solve(targets[0], initial_guess)
         return follow_motion(
-            self.equations, self.active, self.equations.motion_scales, targets, first
+            self.equations,
+            self.active,
+            self.equations.motion_scales,
+            targets,
+            self.solve(targets[0], initial_guess),
         )
-
-    def is_on_branch(self, q: Array) -> bool:
-        """Whether a closed configuration (nq,) lies on the branch of home."""
-        return self._solver.is_on_branch(q)
-
-    def continue_from_home(
-        self, cursor: ContinuationCursor, target: Array, sample: str = ""
-    ) -> Array:
-        """Close the loops at a target that is too far for one step, and move the cursor there.
-
-        In several steps from home, or else by `NewtonContinuation`.
-
-        Args:
-            cursor: Cursor to move.
-            target: (n,).
-            sample: Name of the target in errors.
-
-        Returns:
-            q (nq,).
-        """
-        return self._solver.continue_from_home(self.compiled_closure, cursor, target, sample)
 
     def gamma(self, q: ArrayLike) -> Array:
         """Derivative of f, equation (4) of the reduced-scale forwarder paper.
@@ -357,9 +304,7 @@ class Closure(OneLineRepr):
         q = as_samples(q, self.model.nv, "q", self._names)
         if q.size == 0:
             raise InputError("q is an empty stack, give at least one sample")
-        rows = np.atleast_2d(np.ascontiguousarray(q))
-        out = np.empty((len(rows), self.model.nv, len(self.active)))
-        self._solver.gamma(rows, q.ndim == 2, out)
+        out = self._gamma_stack(np.atleast_2d(np.ascontiguousarray(q)), q.ndim == 2)
         return out if q.ndim == 2 else out[0]
 
     def drift(self, q: ArrayLike, v: ArrayLike) -> Array:
@@ -378,7 +323,7 @@ class Closure(OneLineRepr):
         """
         q = as_samples(q, self.model.nv, "q", self._names)
         v = as_samples(v, self.model.nv, "v", self._names)
-        return apply_per_sample(self._solver.continuation.drift, q, v)
+        return apply_per_sample(self.continuation.drift, q, v)
 
     def residual(self, q: ArrayLike) -> Array:
         """Largest absolute residual of all loop equations, redundant ones included.
@@ -411,10 +356,9 @@ class Closure(OneLineRepr):
     @cached_property
     def proposed_active_joints(self) -> list[ActiveJointSelection]:
         """Possible selections of active joints at home, see `active_joint_selection`."""
-        coupled = np.flatnonzero((self.equations.coupling_factors != 0).any(axis=0)).tolist()
         rows = self.structure.independent_rows  # the others contradict these by the file precision
         jacobian = self.equations.evaluate(self.home)[1] / self.equations.residual_units[:, None]
-        return propose_active_joints(self.model, jacobian[rows], coupled)
+        return propose_active_joints(self.equations, jacobian[rows])
 
     def gamma_velocity_drift(self, q: Array, v_a: Array) -> tuple[Array, Array, Array]:
         """gamma, v = gamma v_A and drift of one sample in one evaluation.
@@ -426,7 +370,7 @@ class Closure(OneLineRepr):
         Returns:
             (nv, n), (nv,), (nv,).
         """
-        return self._solver.continuation.gamma_velocity_drift(q, v_a)
+        return self.continuation.gamma_velocity_drift(q, v_a)
 
 
 def _has_same_geometry(first: LoopEquations, second: LoopEquations) -> bool:

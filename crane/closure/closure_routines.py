@@ -84,8 +84,7 @@ def _add_follow(program: Program, nq: int, n: int) -> None:
             with r.if_then(~(correction["all"] <= move * 0.5 + 0.02)):
                 r.return_value(i)
             r.copy(r.cursor, guess, nq)
-            gamma = result.element_pointer("gamma")
-            r.copy(r.cursor.element_pointer("gamma"), gamma, entries)
+            r.copy(r.cursor.element_pointer("gamma"), result.element_pointer("gamma"), entries)
             r.copy(r.out.row_pointer(i, nq), guess, nq)
         r.return_value(r.count)
 
@@ -97,8 +96,7 @@ def _add_loops_over_configurations(program: Program, nq: int, n: int) -> None:
     with program.add_routine("close_each", counts=("count",), arrays=arrays) as r:
         result = r.local_array("result", newton)
         with r.loop(r.count) as i:
-            q = r.q.row_pointer(i, nq)
-            closed = r.call("close", r.constants, q, result, r.tolerances)
+            closed = r.call("close", r.constants, r.q.row_pointer(i, nq), result, r.tolerances)
             with r.if_then(closed < 1):
                 r.return_value(i)
         r.return_value(r.count)

@@ -8,8 +8,8 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from crane.closure.closure_routines import add_closure_routines
-from crane.closure.clusters import Cluster, find_clusters
-from crane.closure.constraint_structure import ConstraintStructure, Indices
+from crane.closure.constraint_structure import ConstraintStructure
+from crane.closure.coordinates import Indices
 from crane.closure.kinematics_formulas import (
     FormulaConstants,
     PositionKinematics,
@@ -17,7 +17,7 @@ from crane.closure.kinematics_formulas import (
     largest_scaled_value,
     tree_geometry,
 )
-from crane.closure.loop_equations import LoopEquations
+from crane.closure.loop_equations import Cluster, LoopEquations, find_clusters
 from crane.closure.loop_formulas import LoopFormulas
 from crane.closure.newton_continuation import ClosedConfiguration
 from crane.codegen import Layout, LayoutView, Program, Scalar, Tape, max_abs, maximum
@@ -100,6 +100,8 @@ class CompiledClosure:
         self._active_columns, self._passive_columns = active, passive
         self._nq, self._n = equations.model.nv, len(active)
         self._gamma_entries = self._find_gamma_entries()
+        rows, columns = self._gamma_entries
+        self._gamma_entry_pairs = list(zip(rows.tolist(), columns.tolist(), strict=True))
         signs = self._determinant_signs(home)
         key = self._cache_key(signs)
         shared = _SHARED_CODE.get(key)
@@ -130,12 +132,6 @@ class CompiledClosure:
     def clusters(self) -> list[Cluster]:
         """Clusters of the joints, each after the one that carries it."""
         return find_clusters(self._equations)
-
-    @property
-    def _gamma_entry_pairs(self) -> list[tuple[int, int]]:
-        """The entries of gamma as pairs (row, column)."""
-        rows, columns = self._gamma_entries
-        return list(zip(rows.tolist(), columns.tolist(), strict=True))
 
     def _cache_key(self, signs: Array) -> tuple:
         """Everything that the formulas depend on."""
@@ -174,7 +170,7 @@ class CompiledClosure:
         add_closure_routines(program, self._nq, self._n)
 
     def cached_program(self, key: tuple, build: Callable[[Program], None]) -> Program:
-        """A further program of this machine, see `Program.from_cache`.
+        """A further program of this machine, kept in `programs`; see `Program.from_cache`.
 
         Args:
             key: What it depends on besides the loops.
@@ -183,7 +179,9 @@ class CompiledClosure:
         Raises:
             FormulaTooLongError: It would take too long to compile.
         """
-        return Program.from_cache((self._formula_key, key), build)
+        if key not in self.programs:
+            self.programs[key] = Program.from_cache((self._formula_key, key), build)
+        return self.programs[key]
 
     def formula_outputs(self, formula: str) -> Layout:
         """Layout of the outputs of a formula of the closure program."""
@@ -270,11 +268,15 @@ class CompiledClosure:
         """
         coordinates = tape.load_vector(q_argument, 0, self._nq)
         numbers = self.geometry.constants if folded_constants is None else folded_constants
-        constants = FormulaConstants(tape, geometry_argument, numbers)
-        kinematics = PositionKinematics(self.geometry, constants, coordinates)
+        kinematics = PositionKinematics(
+            self.geometry, FormulaConstants(tape, geometry_argument, numbers), coordinates
+        )
         columns = self._active_columns, self._passive_columns
-        loops = LoopFormulas(self._equations, self._structure, *columns, kinematics)
-        return coordinates, kinematics, loops
+        return (
+            coordinates,
+            kinematics,
+            LoopFormulas(self._equations, self._structure, *columns, kinematics),
+        )
 
     def add_newton_formula(self, program: Program, signs: Array) -> None:
         """Add `newton`: one Newton step with residual, gamma and singularity checks.
@@ -292,7 +294,7 @@ class CompiledClosure:
         largest_gamma = self._largest_gamma_entry(rows, kinematics.inverse_characteristic_length)
         worst = maximum(
             largest_gamma - _LARGE_GAMMA,
-            loops.largest_redundant_residual - self._structure.redundancy.tolerance,
+            loops.largest_residual(redundant=True) - self._structure.redundancy.tolerance,
         )
         least_determinant: Scalar = 1.0
         for sign, determinant in zip(signs, loops.determinants, strict=True):
@@ -304,7 +306,7 @@ class CompiledClosure:
             "newton",
             2,
             {
-                "residual": [loops.largest_residual],
+                "residual": [loops.largest_residual()],
                 "step": [
                     largest_scaled_value(
                         list(steps.values()),

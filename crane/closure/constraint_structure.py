@@ -12,17 +12,16 @@ from numpy.typing import NDArray
 
 from crane.closure.active_joint_selection import (
     ActiveJointSelection,
-    format_selections,
     propose_active_joints,
 )
 from crane.closure.constraint_tolerances import ExactConstraints, RedundancyGap
+from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
 from crane.closure.multi_start_search import periodic_coordinates, remove_revolutions
 from crane.common.errors import MechanismError
 from crane.common.one_line_repr import format_count
 from crane.common.samples import Array
 
-Indices = NDArray[np.intp]
 Block = tuple[Indices, Indices]  # rows and columns
 
 _RANK_TOLERANCE = 1e-8  # relative singular value that still counts
@@ -129,8 +128,7 @@ def analyse_constraints(
         MechanismError: The loops do not close from the guess, or close only there; the number of
             active joints is wrong; or the active joints do not determine the others.
     """
-    analysis = _ConstraintAnalysis(equations, active, passive, initial_guess, constraints)
-    return analysis.run() if equations.names else analysis.run_without_loops()
+    return _ConstraintAnalysis(equations, active, passive, initial_guess, constraints).run()
 
 
 class _ConstraintAnalysis:
@@ -151,7 +149,7 @@ class _ConstraintAnalysis:
         values = self._coordinates.format_values(active, initial_guess[active])
         self._active_text = f" ({values})" if values else ""
 
-    def run_without_loops(self) -> ConstraintStructure:
+    def _run_without_loops(self) -> ConstraintStructure:
         """The structure of a machine without loops, whose joints are all active."""
         nv, none = self._equations.model.nv, np.zeros(0, dtype=np.intp)
         jacobian = np.zeros((0, nv))
@@ -164,12 +162,20 @@ class _ConstraintAnalysis:
         return ConstraintStructure(self._guess.copy(), none, none, ())
 
     def run(self) -> ConstraintStructure:
-        """The structure of a machine with loops."""
+        """The structure of a machine."""
+        if not self._equations.names:
+            return self._run_without_loops()
         first = self._constraints.close_loops(self._guess, np.arange(self._equations.model.nv))
-        place = f"from the home guess{self._active_text}"
-        self._check_closed(first, place, "correct the frames or the guess")
+        self._check_closed(
+            first, f"from the home guess{self._active_text}", "correct the frames or the guess"
+        )
         jacobians = [self._constraints.intended_jacobian(q) for q in self._neighbours(first)]
-        self._check_that_loops_lock(jacobians)
+        for index, name in enumerate(self._equations.names):
+            loop_rows = self._equations.loop_of_row == index
+            derivatives = [jacobian[loop_rows] * self._units for jacobian in jacobians]
+            if np.abs(derivatives).max() < _ZERO_TOLERANCE:
+                text = "locks nothing that the joints do not lock already: remove it"
+                raise MechanismError(f"loop '{name}' {text}", f"loop {name}")
         rank = max(_numerical_rank(jacobian * self._units) for jacobian in jacobians)
         self._check_active_joints(first, jacobians, rank)
         home = self._close_home()
@@ -185,21 +191,12 @@ class _ConstraintAnalysis:
         """A closed configuration and others near it."""
         found, nv = [first], self._equations.model.nv
         for _ in range(4):
-            perturbed = first + self._random.uniform(-0.02, 0.02, nv) * self._units
-            closed = self._constraints.close_loops(perturbed, np.arange(nv))
+            closed = self._constraints.close_loops(
+                first + self._random.uniform(-0.02, 0.02, nv) * self._units, np.arange(nv)
+            )
             if self._constraints.is_closed(closed):
                 found.append(closed)
         return found
-
-    def _check_that_loops_lock(self, jacobians: Sequence[Array]) -> None:
-        for index, name in enumerate(self._equations.names):
-            rows = self._equations.loop_of_row == index
-            sizes = (np.abs(jacobian[rows] * self._units).max() for jacobian in jacobians)
-            if max(sizes) < _ZERO_TOLERANCE:
-                raise MechanismError(
-                    f"loop '{name}' locks nothing that the joints do not lock already: remove it",
-                    f"loop {name}",
-                )
 
     def _check_active_joints(self, q: Array, jacobians: Sequence[Array], rank: int) -> None:
         """Raise unless the active joints are as many as the mobility, and drive the others."""
@@ -207,16 +204,21 @@ class _ConstraintAnalysis:
         lock = self._constraints.find_locked_equation(q, mobility, _SINGULAR_TOLERANCE)
         if lock is not None:
             raise self._overconstrained_error(*lock)
-        rank_here = _numerical_rank(jacobians[0] * self._units, _SINGULAR_TOLERANCE)
-        if mobility != len(active) and rank_here < rank:
+        if (
+            mobility != len(active)
+            and _numerical_rank(jacobians[0] * self._units, _SINGULAR_TOLERANCE) < rank
+        ):
             raise HomeError(
                 f"the home configuration{self._active_text} is singular, where the linkage may "
                 "continue in several ways: choose another under 'home'",
                 "home",
                 "the configuration is singular",
             )
-        passive_ranks = (_numerical_rank((x * self._units)[:, self._passive]) for x in jacobians)
-        if mobility == len(active) and max(passive_ranks) == rank:
+        if (
+            mobility == len(active)
+            and max(_numerical_rank((x * self._units)[:, self._passive]) for x in jacobians)
+            == rank
+        ):
             return
         undetermined, found = self._undetermined_joints(jacobians), self._propose(jacobians[0])
         if mobility == len(active):
@@ -240,9 +242,15 @@ class _ConstraintAnalysis:
     def _close_home(self) -> Array:
         """Home with the active joints as in the guess."""
         home = self._constraints.close_loops(self._guess, self._passive)
-        home = self._remove_revolutions(home)
-        hint = "choose other values or guess more passive joints"
-        self._check_closed(home, f"at home{self._active_text}", hint)
+        # full revolutions of passive joints are removed, within limits or half a revolution
+        lower, upper = self._coordinates.lower, self._coordinates.upper
+        periodic = periodic_coordinates(self._equations)
+        periodic[np.setdiff1d(np.arange(len(home)), self._passive)] = False
+        nearby = np.where(np.isinf(lower) | np.isinf(upper), 0.0, home)
+        home = remove_revolutions(home, nearby, periodic, lower, upper)
+        self._check_closed(
+            home, f"at home{self._active_text}", "choose other values or guess more passive joints"
+        )
         opposed_loop = self._equations.find_opposed_loop(home)
         if opposed_loop is not None:
             raise HomeError(
@@ -284,17 +292,8 @@ class _ConstraintAnalysis:
             incidence |= part > 1e-10 * part.max(initial=1.0)
         return incidence
 
-    def _remove_revolutions(self, home: Array) -> Array:
-        """Home without full revolutions of passive joints, within limits or half a revolution."""
-        lower, upper = self._coordinates.lower, self._coordinates.upper
-        periodic = periodic_coordinates(self._equations)
-        periodic[np.setdiff1d(np.arange(len(home)), self._passive)] = False
-        nearby = np.where(np.isinf(lower) | np.isinf(upper), 0.0, home)
-        return remove_revolutions(home, nearby, periodic, lower, upper)
-
     def _propose(self, jacobian: Array, **choice: Sequence[int]) -> list[ActiveJointSelection]:
-        coupled = np.flatnonzero((self._equations.coupling_factors != 0).any(axis=0)).tolist()
-        return propose_active_joints(self._equations.model, jacobian, coupled, **choice)
+        return propose_active_joints(self._equations, jacobian, **choice)
 
     def _undetermined_joints(self, jacobians: Sequence[Array]) -> Indices:
         """Columns of the passive joints that can move while the active joints are held."""
@@ -355,7 +354,7 @@ def _numerical_rank(jacobian: Array, tolerance: float = _RANK_TOLERANCE) -> int:
 
 
 def _format_proposals(prefix: str, selections: Sequence[ActiveJointSelection]) -> str:
-    return f"{prefix}{format_selections(selections)}" if selections else ""
+    return prefix + ", or ".join(map(str, selections)) if selections else ""
 
 
 def _missing_active_joints_text(mobility: int) -> str:
@@ -381,8 +380,7 @@ def block_triangular_form(incidence: NDArray[np.bool_]) -> list[Block] | None:
         Blocks (rows, columns) in the order of solution; None if the equations are structurally
         singular.
     """
-    size = len(incidence)
-    if size == 0:
+    if len(incidence) == 0:
         return []
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components, maximum_bipartite_matching

@@ -19,16 +19,13 @@ exist: a small step h along them, closed with the independent rows, leaves the r
 by c h^2. Such a machine is locked.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from crane.closure.active_joint_selection import (
-    Indices,
-    null_space_basis,
-    select_columns,
-)
+from crane.closure.active_joint_selection import null_space_basis, select_columns
+from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
 from crane.closure.multi_start_search import damped_step
 from crane.common.samples import Array, solve_linear
@@ -39,79 +36,6 @@ _OPEN_TOLERANCE = 1e-9  # scaled residual that counts as open
 _CLOSINGS_PER_DIRECTION = 2  # repetitions of a step
 _RANDOM_DIRECTIONS = 3  # besides those of single joints
 _STEPS_TO_LIMIT = 16  # steps to the limit of a joint
-
-
-def find_locked_equation(
-    equations: LoopEquations,
-    q: Array,
-    mobility: int,
-    tolerance: float,
-    close_loops: Callable[[Array], Array],
-) -> tuple[int, float] | None:
-    """Find the equation that locks a machine although its Jacobian allows motion.
-
-    Steps in random directions of the null space N are closed with all equations, and repeated in
-    the direction that remains: this finds finite motions far from the first one, and reduces
-    motions that do not exist to rounding. Groups of joints that no equation connects step at once,
-    each as far as it would alone, so that the number of steps is that of the group with the most
-    directions. Joints that N moves and that stay fixed in all remaining motions are locked. At a
-    bifurcation N has more columns than the mobility, too, but all its joints move.
-
-    Args:
-        equations: All loop equations.
-        q: (nq,) closed configuration.
-        mobility: Mobility at other closed configurations.
-        tolerance: Relative singular values of J below it count as zero.
-        close_loops: Closes all loops from a configuration nearby.
-
-    Returns:
-        The row with the largest gap, and its scaled gap; None if nothing is locked.
-    """
-    from scipy.linalg import qr  # slow to import, only needed with loops
-
-    scale = equations.motion_scales
-    jacobian = equations.evaluate(q)[1] / equations.residual_units[:, None]
-    basis = null_space_basis(jacobian, scale, tolerance)
-    if basis.shape[1] <= mobility:
-        return None
-    group, group_of_row = equations.coupled_groups(np.arange(len(q)))
-    first_order_motion = np.linalg.norm(basis, axis=1)
-    directions = np.bincount(
-        group, first_order_motion**2
-    )  # number per group: the trace of a projector
-    random = np.random.default_rng(1)
-    finite_motion = np.zeros(len(q))  # as fractions of the step
-    for _ in range(2 * round(directions.max())):
-        direction = basis @ random.normal(size=basis.shape[1])
-        for _ in range(_CLOSINGS_PER_DIRECTION):
-            length = np.sqrt(np.bincount(group, direction**2))[group]
-            closed = close_loops(
-                q + _STEP_SIZE * scale * direction / np.where(length > 0, length, 1.0)
-            )
-            gap = np.zeros(len(directions))
-            np.maximum.at(gap, group_of_row, np.abs(equations.evaluate_scaled(closed)[0]))
-            direction = np.where(gap[group] < _OPEN_TOLERANCE, (closed - q) / scale, 0.0)
-            finite_motion = np.maximum(finite_motion, np.abs(direction) / _STEP_SIZE)
-            if not direction.any():
-                break
-    if not (
-        (first_order_motion > 1e-3)
-        & (finite_motion < _MIN_FINITE_MOTION_RATIO * first_order_motion)
-    ).any():
-        return None
-    rank = equations.model.nv - basis.shape[1]
-    rows = qr((jacobian * scale).T, mode="r", pivoting=True)[1][:rank].astype(np.intp)
-    worst, largest_gap = 0, 0.0
-    for direction in basis.T:
-        closed_neighbour = _close_independent_rows(
-            equations, q + _STEP_SIZE * scale * direction, rows, basis / scale[:, None]
-        )
-        if closed_neighbour is None:
-            continue
-        phi = np.abs(equations.evaluate_scaled(closed_neighbour)[0])
-        if phi.max() > largest_gap:
-            worst, largest_gap = int(phi.argmax()), float(phi.max())
-    return worst, largest_gap
 
 
 def largest_redundant_gap(
@@ -285,14 +209,17 @@ class ExactConstraints:
 
     def close_loops(self, q: Array, movable: Indices) -> Array:
         """Close all loops with some columns; check the residual for success."""
+        return self._reduce_residual(q, movable, 1e-13)
+
+    def _reduce_residual(self, q: Array, movable: Indices, tolerance: float) -> Array:
+        """Damped Gauss-Newton steps towards a scaled residual."""
         q = q.copy()
         for _ in range(200):
             phi, jacobian = self._equations.evaluate_scaled(q)
-            if np.abs(phi).max(initial=0.0) < 1e-13:
+            if np.abs(phi).max(initial=0.0) < tolerance:
                 break
-            q[movable] += (
-                least_squares_step(jacobian[:, movable], phi) * self._coordinate_units[movable]
-            )
+            step = least_squares_step(jacobian[:, movable], phi)
+            q[movable] += step * self._coordinate_units[movable]
         return q
 
     def intended_jacobian(self, q: Array) -> Array:
@@ -300,15 +227,69 @@ class ExactConstraints:
         return self._equations.evaluate(q)[1] / self._residual_units[:, None]
 
     def find_locked_equation(self, q: Array, mobility: int, tolerance: float) -> LockedEquation:
-        """See `crane.closure.constraint_tolerances.find_locked_equation`."""
-        all_columns = np.arange(self._equations.model.nv)
-        return find_locked_equation(
-            self._equations,
-            q,
-            mobility,
-            tolerance,
-            lambda near: self.close_loops(near, all_columns),
-        )
+        """Find the equation that locks a machine although its Jacobian allows motion.
+
+        Steps in random directions of the null space N are closed with all equations, and repeated
+        in the direction that remains: this finds finite motions far from the first one, and
+        reduces motions that do not exist to rounding. Groups of joints that no equation connects
+        step at once, each as far as it would alone, so that the number of steps is that of the
+        group with the most directions. Joints that N moves and that stay fixed in all remaining
+        motions are locked. At a bifurcation N has more columns than the mobility, too, but all its
+        joints move.
+
+        Args:
+            q: (nq,) closed configuration.
+            mobility: Mobility at other closed configurations.
+            tolerance: Relative singular values of J below it count as zero.
+
+        Returns:
+            The row with the largest gap, and its scaled gap; None if nothing is locked.
+        """
+        from scipy.linalg import qr  # slow to import, only needed with loops
+
+        equations, scale = self._equations, self._equations.motion_scales
+        all_columns = np.arange(len(q))
+        jacobian = equations.evaluate(q)[1] / equations.residual_units[:, None]
+        basis = null_space_basis(jacobian, scale, tolerance)
+        if basis.shape[1] <= mobility:
+            return None
+        group, group_of_row = equations.coupled_groups(all_columns)
+        first_order_motion = np.linalg.norm(basis, axis=1)
+        directions = np.bincount(
+            group, first_order_motion**2
+        )  # number per group: the trace of a projector
+        random = np.random.default_rng(1)
+        finite_motion = np.zeros(len(q))  # as fractions of the step
+        for _ in range(2 * round(directions.max())):
+            direction = basis @ random.normal(size=basis.shape[1])
+            for _ in range(_CLOSINGS_PER_DIRECTION):
+                length = np.sqrt(np.bincount(group, direction**2))[group]
+                step = _STEP_SIZE * scale * direction / np.where(length > 0, length, 1.0)
+                closed = self.close_loops(q + step, all_columns)
+                gap = np.zeros(len(directions))
+                np.maximum.at(gap, group_of_row, np.abs(equations.evaluate_scaled(closed)[0]))
+                direction = np.where(gap[group] < _OPEN_TOLERANCE, (closed - q) / scale, 0.0)
+                finite_motion = np.maximum(finite_motion, np.abs(direction) / _STEP_SIZE)
+                if not direction.any():
+                    break
+        if not (
+            (first_order_motion > 1e-3)
+            & (finite_motion < _MIN_FINITE_MOTION_RATIO * first_order_motion)
+        ).any():
+            return None
+        rank = equations.model.nv - basis.shape[1]
+        rows = qr((jacobian * scale).T, mode="r", pivoting=True)[1][:rank].astype(np.intp)
+        worst, largest_gap = 0, 0.0
+        for direction in basis.T:
+            closed_neighbour = _close_independent_rows(
+                equations, q + _STEP_SIZE * scale * direction, rows, basis / scale[:, None]
+            )
+            if closed_neighbour is None:
+                continue
+            phi = np.abs(equations.evaluate_scaled(closed_neighbour)[0])
+            if phi.max() > largest_gap:
+                worst, largest_gap = int(phi.argmax()), float(phi.max())
+        return worst, largest_gap
 
     def select_independent_rows(
         self, home: Array, passive: Indices, rank: int, tolerance: float
@@ -374,14 +355,7 @@ class RoundedConstraints(ExactConstraints):
 
     def close_loops(self, q: Array, movable: Indices) -> Array:
         """Close by least squares; contradictions within the file precision stay open."""
-        q = q.copy()
-        for _ in range(200):
-            phi, jacobian = self._equations.evaluate_scaled(q)
-            if (np.abs(phi) < 10 * FILE_PRECISION).all():
-                break
-            q[movable] += (
-                least_squares_step(jacobian[:, movable], phi) * self._coordinate_units[movable]
-            )
+        q = self._reduce_residual(q, movable, 10 * FILE_PRECISION)
         for _ in range(20):
             phi, jacobian = self._equations.evaluate_scaled(q)
             if not np.isfinite(jacobian).all():  # diverged: not closed
@@ -394,8 +368,9 @@ class RoundedConstraints(ExactConstraints):
 
     def intended_jacobian(self, q: Array) -> Array:
         """(m, nv) Jacobian without the singular values that are due to the file precision."""
-        jacobian = self._equations.evaluate_scaled(q)[1]
-        left, values, right = np.linalg.svd(jacobian, full_matrices=False)
+        left, values, right = np.linalg.svd(
+            self._equations.evaluate_scaled(q)[1], full_matrices=False
+        )
         values[values < _MIN_SINGULAR_VALUE_RATIO * values[0]] = 0.0
         return np.asarray((left * values @ right) / self._coordinate_units)
 

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array
 
+Indices = NDArray[np.intp]
+
 FREE_FLYER = "JointModelFreeFlyer"
 
 
@@ -88,10 +90,41 @@ class Coordinates:
                 found[joint.idx_v] = joint.shortname().startswith("JointModelP")
         return found
 
-    def format_values(self, columns: NDArray[np.intp], values: Array) -> str:
+    @cached_property
+    def characteristic_length(self) -> float:
+        """Characteristic length of a machine [m]: the largest distance between adjacent joints.
+
+        Where all joints coincide: the largest distance of a link from its joint, else the largest
+        limit of a prismatic joint, else 1 m.
+        """
+        joints = (place.translation for place in list(self.model.jointPlacements)[1:])
+        links = (frame.placement.translation for frame in self.model.frames)
+        for places in (joints, links):
+            if distance := float(np.abs(list(places)).max(initial=0.0)):
+                return distance
+        limits = np.abs(np.stack([self.lower, self.upper]))[:, self.is_translation]
+        return float(limits[np.isfinite(limits)].max(initial=0.0)) or 1.0
+
+    @cached_property
+    def units(self) -> Array:
+        """(nv,) units that make coordinates comparable: 1 rad, and the characteristic length."""
+        return np.where(self.is_translation, self.characteristic_length, 1.0)
+
+    @cached_property
+    def motion_scales(self) -> Array:
+        """(nv,) comparable displacements of the joints.
+
+        The range of a joint, at most 1 rad or the characteristic length; that bound for joints
+        without limits.
+        """
+        ranges = self.upper - self.lower
+        return np.where(ranges > 0, np.minimum(ranges, self.units), self.units)
+
+    def format_values(self, columns: Indices, values: Array) -> str:
         """Values of some coordinates as text, "lift = 0.5, tilt = 0.1"."""
-        pairs = zip(columns, values, strict=True)
-        return ", ".join(f"{self.names[int(i)]} = {value:.6g}" for i, value in pairs)
+        return ", ".join(
+            f"{self.names[int(i)]} = {value:.6g}" for i, value in zip(columns, values, strict=True)
+        )
 
     def configuration(self, q: Array) -> Array:
         """Pinocchio's configuration (nq,) or (N, nq) from coordinates (nv,) or (N, nv)."""
@@ -102,17 +135,6 @@ class Coordinates:
         for column in self.floating_base_columns:
             at = self._configuration_indices[column]
             out[..., at + 3 : at + 7] = _quaternion(q[..., column + 3 : column + 6])
-        return out
-
-    def from_configuration(self, configuration: Array) -> Array:
-        """Coordinates (nv,) or (N, nv) from Pinocchio's configuration."""
-        if not self.floating_base_columns:
-            return configuration
-        out: Array = configuration[..., self._configuration_indices]
-        for column in self.floating_base_columns:
-            at = self._configuration_indices[column]
-            quaternion = configuration[..., at + 3 : at + 7]
-            out[..., column + 3 : column + 6] = _rotation_vector(quaternion)
         return out
 
     def coordinate_derivatives(self, q: Array, v: Array) -> Array:
@@ -160,15 +182,3 @@ def _quaternion(r: Array) -> Array:
     """Quaternions (x, y, z, w) of rotation vectors (..., 3)."""
     half = 0.5 * np.linalg.norm(r, axis=-1, keepdims=True)
     return np.concatenate([0.5 * np.sinc(half / np.pi) * r, np.cos(half)], axis=-1)
-
-
-def _rotation_vector(quaternion: Array) -> Array:
-    """Rotation vectors (..., 3), at most pi long, from quaternions (x, y, z, w) of any length."""
-    sign = np.where(quaternion[..., 3:] < 0, -1.0, 1.0)
-    x, w = sign * quaternion[..., :3], sign * quaternion[..., 3:]
-    length = np.linalg.norm(x, axis=-1, keepdims=True)
-    angle = 2 * np.arctan2(length, w)
-    small = length < 1e-150 * w
-    return np.asarray(
-        x * np.where(small, 2 / np.where(w > 0, w, 1.0), angle / np.where(small, 1, length))
-    )

@@ -7,18 +7,16 @@ the two bodies that it joins. Differentiated along q_k, and twice along the moti
     w'' . dJ_j + 2 w' . dJ_j' + w . dJ_j'' = 0,    dJ_j = J_2,j - J_1,j.
 
 These are equations for d_k gamma_j and gamma_j'', each with the same matrix as gamma. Coordinates
-move joints of their own cluster only (`crane.closure.clusters`), so that motions are taken
+move joints of their own cluster only (`crane.closure.loop_equations`), so that motions are taken
 relative to the body that carries the cluster.
 """
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 
-from crane.closure.clusters import Cluster
-from crane.closure.kinematics_formulas import PositionKinematics
-from crane.closure.loop_formulas import LoopEquationFormula, LoopFormulas
-from crane.closure.spatial_vectors import (
+from crane.closure.kinematics_formulas import (
     ZERO_VECTOR,
+    PositionKinematics,
     SpatialVector,
     Vector,
     add_spatial,
@@ -27,6 +25,8 @@ from crane.closure.spatial_vectors import (
     spatial_dot,
     subtract_spatial,
 )
+from crane.closure.loop_equations import Cluster
+from crane.closure.loop_formulas import LoopEquationFormula, LoopFormulas
 from crane.codegen.symbolic import Scalar, add_vectors, cross, dot, scale_vector
 
 BodyMotions = dict[int, SpatialVector]  # by body
@@ -129,8 +129,9 @@ class GammaDerivatives:
                         + 2.0 * _power_between_bodies(once, rate, loops.rows[r])
                         + _power_between_bodies(loops.rows[r].wrench, known, loops.rows[r])
                     )
-        known_rows: dict[int, Vector] = {joint: [0.0] * n for joint in loops.active_joints}
-        solution, _ = loops.solve_passive(known_rows, right_sides)
+        solution, _ = loops.solve_passive(
+            {joint: [0.0] * n for joint in loops.active_joints}, right_sides
+        )
         return {
             j: {i: solution[i][j] for i in cluster.joints}
             for cluster, own in zip(self.clusters, self.own, strict=True)
@@ -165,11 +166,13 @@ class GammaDerivatives:
         out = {}
         for i in cluster.joints:
             once = cross_motion(velocities[i], self._joint_axes[i])
-            twice = add_spatial(
-                cross_motion(accelerations[i], self._joint_axes[i]),
-                cross_motion(velocities[i], once),
+            out[i] = (
+                once,
+                add_spatial(
+                    cross_motion(accelerations[i], self._joint_axes[i]),
+                    cross_motion(velocities[i], once),
+                ),
             )
-            out[i] = once, twice
         return out
 
     def twist_derivatives(
@@ -243,8 +246,9 @@ class GammaDerivatives:
                 row.wrench, twist_changes, row
             ) + _power_between_bodies(rate, self.twists[j], row)
             right_sides[r] = [-1.0 * relative_power]
-        known_rows: dict[int, Vector] = {joint: [0.0] for joint in self._loops.active_joints}
-        solution, _ = self._loops.solve_passive(known_rows, right_sides)
+        solution, _ = self._loops.solve_passive(
+            {joint: [0.0] for joint in self._loops.active_joints}, right_sides
+        )
         return {i: solution[i][0] for i in cluster.joints}
 
 

@@ -33,7 +33,6 @@ from crane.closure.constraint_structure import (
     ActiveJointError,
     ConstraintStructure,
     HomeError,
-    Indices,
     analyse_constraints,
 )
 from crane.closure.constraint_tolerances import (
@@ -43,6 +42,7 @@ from crane.closure.constraint_tolerances import (
     RedundancyGap,
     RoundedConstraints,
 )
+from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
 from crane.closure.multi_start_search import MultiStartSearch
 from crane.codegen import cached_result
@@ -133,11 +133,19 @@ def find_home(
                 search.coordinate_differences(q, first.home).max() > _SAME_CONFIGURATION_TOLERANCE
                 for q in found
             )
-            found = _configurations_nearer_than_home(search, equations, passive, found, first.home)
+        if first is not None and within_limits(equations, first.home)[passive].all():
+            distance = search.distance_from_guess(first.home)[:2]
+            found = [q for q in found if search.distance_from_guess(q)[:2] < distance]
         usable = _first_usable(equations, active, passive, found[:_MAX_CANDIDATES])
         if isinstance(usable, ConstraintStructure):
-            count = len(found) if first is None else alternative_count + 1
-            return usable, _search_result(search, equations, reason, count, passive, usable)
+            return usable, _search_result(
+                search,
+                equations,
+                reason,
+                len(found) if first is None else alternative_count + 1,
+                passive,
+                usable,
+            )
         if usable is not None and first is None:
             raise rejection if isinstance(rejection, ActiveJointError) else usable
     if first is None:
@@ -167,8 +175,9 @@ def find_cached_home(
         return find_home(equations, active, passive, initial_guess, specified, movable)
     columns = None if specified is None else tuple(specified), tuple(movable)
     dependencies = ("home", (equations.cache_key, active, initial_guess, *columns))
-    classes = ConstraintStructure, RedundancyGap, HomeSearchResult
-    return cached_result(dependencies, find, "scipy.linalg", classes)
+    return cached_result(
+        dependencies, find, "scipy.linalg", (ConstraintStructure, RedundancyGap, HomeSearchResult)
+    )
 
 
 def within_limits(equations: LoopEquations, q: Array) -> NDArray[np.bool_]:
@@ -188,23 +197,6 @@ def _home_problem(
         return f"{names[int(columns[0])]} closes outside of its limits"
     joint, deviation = search.largest_specified_deviation(home)
     return f"{names[joint]} closes far off" if deviation > FAR else ""
-
-
-def _configurations_nearer_than_home(
-    search: MultiStartSearch,
-    equations: LoopEquations,
-    passive: Indices,
-    found: list[Array],
-    home: Array,
-) -> list[Array]:
-    """Those of some configurations that are nearer to the guess than a home within limits."""
-    if not within_limits(equations, home)[passive].all():
-        return found
-    return [
-        q
-        for q in found
-        if search.distance_from_guess(q)[:2] < search.distance_from_guess(home)[:2]
-    ]
 
 
 def _search_result(

@@ -1,15 +1,14 @@
-"""The loop equations phi(q) = 0, their Jacobian and its time derivative."""
+"""The loop equations phi(q) = 0, their Jacobian and its rate, and clusters of joints."""
 
 import threading
 from collections.abc import Collection, Sequence
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from crane.closure.active_joint_selection import Indices, characteristic_length, motion_scales
-from crane.closure.coordinates import Coordinates
+from crane.closure.coordinates import Coordinates, Indices
 from crane.common.errors import MechanismError
 from crane.common.samples import Array
 from crane.description.specification import LOOP_TYPES, Coupling, LoopSpec
@@ -31,11 +30,6 @@ def rotation_with_z_axis(axis: Sequence[float]) -> Array:
     return np.column_stack([x_axis[0], _cross(z_axis, x_axis)[0], z_axis[0]])
 
 
-def _as_jacobian(jacobian: Array) -> Array:
-    """(6, nv), also for a single joint, where Pinocchio returns (6,)."""
-    return jacobian.reshape(6, -1)
-
-
 def _cross(a: Array, b: Array) -> Array:
     """Row-wise cross product; several times faster than numpy's for few rows."""
     out = np.empty_like(a)
@@ -43,12 +37,6 @@ def _cross(a: Array, b: Array) -> Array:
     out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
     out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
     return out
-
-
-def _supporting_columns(model: pin.Model, joint: int) -> list[int]:
-    """Columns of the joints that move the body of a joint."""
-    supports = [model.joints[i] for i in model.supports[joint] if i > 0]
-    return [column for x in supports for column in range(x.idx_v, x.idx_v + x.nv)]
 
 
 def aligned_axes(loop_type: str) -> list[int]:
@@ -83,9 +71,9 @@ class LoopEquations:
         names: Names of loops, then couplings.
         loop_of_row: (m,) index in `names` of every equation.
         is_translation: (m,) whether the equation is a length.
-        characteristic_length: Characteristic length [m], see
-            `crane.closure.active_joint_selection.characteristic_length`.
-        coordinate_units: (nv,) units of the coordinates: 1 rad, and the characteristic length [m].
+        characteristic_length: See `Coordinates.characteristic_length` [m].
+        coordinate_units: See `Coordinates.units`.
+        motion_scales: See `Coordinates.motion_scales`.
         residual_units: (m,) units of the residuals: 1 rad, and the characteristic length [m].
     """
 
@@ -104,7 +92,9 @@ class LoopEquations:
             for side, name in ((-1.0, loop.predecessor), (1.0, loop.successor)):
                 frame = model.frames[frame_id(model, name)]
                 self.frames.append((frame.parentJoint, frame.placement * rotation))
-                joint_signs[index, _supporting_columns(model, frame.parentJoint)] += side
+                supports = [model.joints[i] for i in model.supports[frame.parentJoint] if i > 0]
+                columns = [i for x in supports for i in range(x.idx_v, x.idx_v + x.nv)]
+                joint_signs[index, columns] += side
             locked = LOOP_TYPES[loop.type]
             rows += [(index, True, i, 0) for i in range(3) if locked[i]]
             free = [k for k in range(3) if not locked[3 + k]]
@@ -112,10 +102,9 @@ class LoopEquations:
                 rows += [(index, False, 0, 1), (index, False, 1, 2), (index, False, 2, 0)]
             elif len(free) == 1:
                 rows += [(index, False, i, free[0]) for i in range(3) if i != free[0]]
-        self._loop_index = np.array([row[0] for row in rows], dtype=np.intp)
-        self._is_loop_translation = np.array([row[1] for row in rows], dtype=bool)
-        self.axis_of_frame1 = np.array([row[2] for row in rows], dtype=np.intp)
-        self.axis_of_frame2 = np.array([row[3] for row in rows], dtype=np.intp)
+        table = np.ascontiguousarray(np.array(rows, dtype=np.intp).reshape(-1, 4).T)
+        self._loop_index, is_loop_translation, self.axis_of_frame1, self.axis_of_frame2 = table
+        self._is_loop_translation = is_loop_translation.astype(bool)
         self.sign = joint_signs
         self._row_joint_signs = joint_signs[self._loop_index]
         self.couplings = tuple(couplings)
@@ -128,15 +117,15 @@ class LoopEquations:
                 row[column] = factor
             is_length.append(bool(self.coordinates.is_translation[column]))
         self.names = (*(loop.name for loop in loops), *(item.name for item in couplings))
-        coupling_indices = len(self.loops) + np.arange(len(self.couplings), dtype=np.intp)
-        self.loop_of_row = np.concatenate([self._loop_index, coupling_indices])
+        self.loop_of_row = np.concatenate(
+            [self._loop_index, len(self.loops) + np.arange(len(self.couplings), dtype=np.intp)]
+        )
         self.is_translation = np.concatenate(
             [self._is_loop_translation, np.array(is_length, dtype=bool)]
         )
-        self.characteristic_length = characteristic_length(model)
-        self.coordinate_units = np.where(
-            self.coordinates.is_translation, self.characteristic_length, 1.0
-        )
+        self.characteristic_length = self.coordinates.characteristic_length
+        self.coordinate_units = self.coordinates.units
+        self.motion_scales = self.coordinates.motion_scales
         self.residual_units = np.where(self.is_translation, self.characteristic_length, 1.0)
 
     def coupled_groups(self, columns: Indices) -> tuple[Indices, Indices]:
@@ -154,8 +143,9 @@ class LoopEquations:
             connected = np.isin(group, group[row])
             group[connected] = group[connected].min(initial=len(group))
         group = np.unique(group, return_inverse=True)[1]
-        of_name = [int(group[tie][0]) if tie.any() else -1 for tie in involved]
-        return group, np.array(of_name, dtype=np.intp)[self.loop_of_row]
+        return group, np.array(
+            [int(group[tie][0]) if tie.any() else -1 for tie in involved], dtype=np.intp
+        )[self.loop_of_row]
 
     def subset(self, names: Collection[str]) -> "LoopEquations":
         """The equations of some loops and couplings only, in the same coordinates."""
@@ -167,19 +157,17 @@ class LoopEquations:
         found._thread_local.data = self.data  # creating data is expensive
         return found
 
-    @cached_property
-    def motion_scales(self) -> Array:
-        """(nv,) comparable displacements of the joints, see `motion_scales`."""
-        return motion_scales(self.model)
-
     @property
     def cache_key(self) -> tuple[Any, ...]:
         """Everything that the equations depend on, see `crane.codegen.cached_result`."""
         loops = tuple(
             (x.name, x.type, x.predecessor, x.successor, *map(float, x.axis)) for x in self.loops
         )
-        couplings = tuple((x.name, tuple(x.factors.items()), x.offset) for x in self.couplings)
-        return self.model.saveToString(), loops, couplings
+        return (
+            self.model.saveToString(),
+            loops,
+            tuple((x.name, tuple(x.factors.items()), x.offset) for x in self.couplings),
+        )
 
     @property
     def data(self) -> pin.Data:
@@ -190,16 +178,11 @@ class LoopEquations:
             self._thread_local.data = self.model.createData()
             return self._thread_local.data
 
-    def _frame_geometry(self) -> tuple[Array, Array, Array, Array]:
-        """For every row: axis of frame 1, axis of frame 2, origins of both frames, each (m, 3)."""
-        bodies = self.data.oMi
-        placements = [bodies[joint] * local for joint, local in self.frames]
-        rotations = np.array([placement.rotation for placement in placements])
-        origins = np.array([placement.translation for placement in placements])
-        return self._row_geometry(rotations, origins)
-
     def _row_geometry(self, rotations: Array, origins: Array) -> tuple[Array, Array, Array, Array]:
-        """The same (..., m, 3) from rotations (..., 2 l, 3, 3) and origins (..., 2 l, 3)."""
+        """For every row: axis of frame 1, axis of frame 2, origins of both, each (..., m, 3).
+
+        From rotations (..., 2 l, 3, 3) and origins (..., 2 l, 3) of `frames`.
+        """
         axes, one = np.swapaxes(rotations, -1, -2), 2 * self._loop_index
         return (
             axes[..., one, self.axis_of_frame1, :],
@@ -240,9 +223,13 @@ class LoopEquations:
         coupling_residuals = self.coupling_factors @ q - self.coupling_offsets
         if not self.loops:
             return coupling_residuals, self.coupling_factors.copy()
-        configuration = self.coordinates.configuration(q)
-        jacobian = _as_jacobian(pin.computeJointJacobians(self.model, self.data, configuration))
-        self._thread_local.last = a, b, p1, p2 = self._frame_geometry()
+        data, configuration = self.data, self.coordinates.configuration(q)
+        # a vector for a single joint
+        jacobian = pin.computeJointJacobians(self.model, data, configuration).reshape(6, -1)
+        placements = [data.oMi[joint] * local for joint, local in self.frames]
+        rotations = np.array([placement.rotation for placement in placements])
+        origins = np.array([placement.translation for placement in placements])
+        self._thread_local.last = a, b, p1, p2 = self._row_geometry(rotations, origins)
         phi = np.einsum("ij,ij->i", a, np.where(self._is_loop_translation[:, None], p2 - p1, b))
         loop_jacobian = self._row_joint_signs * (self._assemble_wrenches(a, b, p2) @ jacobian)
         if not self.couplings:
@@ -304,11 +291,9 @@ class LoopEquations:
         if not self.loops:
             return np.zeros(len(self.couplings))
         a, b, _, p2 = self._thread_local.last
-        configuration = self.coordinates.configuration(q)
-        rate = _as_jacobian(
-            pin.computeJointJacobiansTimeVariation(self.model, self.data, configuration, v)
-        )
-        velocity = np.array([self.data.ov[joint].vector for joint, _ in self.frames])
+        data, configuration = self.data, self.coordinates.configuration(q)
+        rate = pin.computeJointJacobiansTimeVariation(self.model, data, configuration, v)
+        velocity = np.array([data.ov[joint].vector for joint, _ in self.frames])
         one = 2 * self._loop_index
         v2, w1, w2 = velocity[one + 1, :3], velocity[one, 3:], velocity[one + 1, 3:]
         is_translation = self._is_loop_translation[:, None]
@@ -319,8 +304,66 @@ class LoopEquations:
         wrench_rate[self._is_loop_translation, :3] = a_rate[self._is_loop_translation]
         wrench_rate[:, 3:] = _cross(arm_rate, a) + _cross(arm, a_rate)
         split = self._row_joint_signs * v  # (m, nv): v of frame 2 minus v of frame 1
-        relative, bias = split @ _as_jacobian(self.data.J).T, split @ rate.T
+        relative, bias = split @ data.J.reshape(6, -1).T, split @ rate.reshape(6, -1).T
         loop_bias = np.einsum("ij,ij->i", wrench_rate, relative) + np.einsum(
             "ij,ij->i", self._assemble_wrenches(a, b, p2), bias
         )
         return np.concatenate([loop_bias, np.zeros(len(self.couplings))])
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Joints that only move together, or a single joint.
+
+    The joints form a connected part of the tree. No joint is in two clusters, so that the clusters
+    form a tree as well.
+
+    Attributes:
+        base: The body that carries the cluster.
+        joints: Indices of the joints, parents first; joint i moves body i.
+    """
+
+    base: int
+    joints: tuple[int, ...]
+
+    def own_coordinates(self, active_joints: Sequence[int]) -> list[int]:
+        """Indices k of the active joints that belong to the cluster."""
+        return [k for k, joint in enumerate(active_joints) if joint in self.joints]
+
+
+def find_clusters(equations: LoopEquations) -> list[Cluster]:
+    """The clusters of a machine, each after the one that carries it.
+
+    Joints on the path between joints that one equation ties together belong to the cluster, too.
+    """
+    parents = equations.coordinates.parents
+    representative = list(range(len(parents)))
+
+    def root_of(i: int) -> int:
+        while representative[i] != i:
+            i = representative[i]
+        return i
+
+    for row in (*equations.sign, *equations.coupling_factors):
+        tied = (np.flatnonzero(row) + 1).tolist()
+        if not tied:
+            continue
+        paths = [_path_to_world(parents, parents[joint]) for joint in tied]
+        common = paths[0].intersection(*paths[1:])
+        first, *rest = sorted({*tied, *set().union(*paths)} - common)
+        for joint in rest:
+            one, two = sorted((root_of(first), root_of(joint)))
+            representative[two] = one
+    members: dict[int, list[int]] = {}
+    for i in range(1, len(parents)):
+        members.setdefault(root_of(i), []).append(i)
+    return [Cluster(parents[joints[0]], tuple(joints)) for joints in members.values()]
+
+
+def _path_to_world(parents: Sequence[int], body: int) -> set[int]:
+    """A body and all bodies that carry it, and the world."""
+    path = {0}
+    while body:
+        path.add(body)
+        body = parents[body]
+    return path

@@ -4,16 +4,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from crane.closure.constraint_structure import ConstraintStructure, Indices
+from crane.closure.constraint_structure import ConstraintStructure
 from crane.closure.constraint_tolerances import CLOSED_TOLERANCE
-from crane.closure.kinematics_formulas import PositionKinematics, largest_scaled_value
-from crane.closure.loop_equations import LoopEquations, aligned_axes
-from crane.closure.spatial_vectors import (
+from crane.closure.coordinates import Indices
+from crane.closure.kinematics_formulas import (
+    PositionKinematics,
     SpatialVector,
     Vector,
+    largest_scaled_value,
     spatial_dot,
     subtract_spatial,
 )
+from crane.closure.loop_equations import LoopEquations, aligned_axes
 from crane.codegen.symbolic import (
     Scalar,
     add_vectors,
@@ -23,7 +25,6 @@ from crane.codegen.symbolic import (
     solve_linear_system,
     subtract_vectors,
 )  # fmt: skip
-from crane.common.samples import Array
 from crane.description.specification import LOOP_TYPES
 
 
@@ -64,16 +65,9 @@ class LoopEquationFormula:
     ) -> SpatialVector:
         """Time derivative of the wrench."""
         axis, arm = self.axis_and_arm_rates(first_motion, second_motion)
-        moment = add_vectors(cross(arm, self.axis), cross(self.arm, axis))
-        return (axis if self.is_translation else [0.0] * 3), moment
-
-
-def _coupling_formula(factors: Array, offset: float, q: Sequence[Scalar]) -> LoopEquationFormula:
-    """The equation of a coupling, whose Jacobian is constant."""
-    zero: Vector = [0.0] * 3
-    jacobian: dict[int, Scalar] = {i + 1: float(x) for i, x in enumerate(factors) if x}
-    phi = dot([float(x) for x in factors], q) - float(offset)
-    return LoopEquationFormula((0, 0), False, False, zero, zero, (zero, zero), phi, jacobian)
+        return (axis if self.is_translation else [0.0] * 3), add_vectors(
+            cross(arm, self.axis), cross(self.arm, axis)
+        )
 
 
 class LoopFormulas:
@@ -125,10 +119,12 @@ class LoopFormulas:
     ) -> LoopEquationFormula:
         coupling = int(equations.loop_of_row[row]) - len(equations.loops)
         if coupling >= 0:
-            return _coupling_formula(
-                equations.coupling_factors[coupling],
-                equations.coupling_offsets[coupling],
-                kinematics.q,
+            factors = [float(x) for x in equations.coupling_factors[coupling]]
+            derivatives: dict[int, Scalar] = {i: x for i, x in enumerate(factors, start=1) if x}
+            phi = dot(factors, kinematics.q) - float(equations.coupling_offsets[coupling])
+            zero: Vector = [0.0] * 3
+            return LoopEquationFormula(
+                (0, 0), False, False, zero, zero, (zero, zero), phi, derivatives
             )
         one = 2 * int(equations.loop_of_row[row])
         (axes1, origin1), (axes2, origin2) = self._frames[one], self._frames[one + 1]
@@ -144,8 +140,9 @@ class LoopFormulas:
         for column, sign in enumerate(equations.sign[one // 2]):
             if sign:
                 linear, angular = kinematics.joint_axes[column + 1]
-                derivative = dot(wrench[0], linear) + dot(wrench[1], angular)
-                jacobian[column + 1] = float(sign) * derivative
+                jacobian[column + 1] = float(sign) * (
+                    dot(wrench[0], linear) + dot(wrench[1], angular)
+                )
         bodies = kinematics.geometry.frame_bodies
         locks_all_translations = all(LOOP_TYPES[equations.loops[one // 2].type][:3])
         has_fixed_axis = (
@@ -177,8 +174,9 @@ class LoopFormulas:
             matrix = [[self.rows[r].jacobian.get(joint, 0.0) for joint in joints] for r in rows]
             # the block order accounts for derivatives that vanish everywhere
             before = {joint: row for joint, row in x.items() if joint not in joints}
-            sides = [self._right_side(r, before, right_sides[r]) for r in rows]
-            found, determinant = solve_linear_system(matrix, sides)
+            found, determinant = solve_linear_system(
+                matrix, [self._right_side(r, before, right_sides[r]) for r in rows]
+            )
             determinants.append(determinant)
             x |= dict(zip(joints, found, strict=True))
         return x, determinants
@@ -193,10 +191,13 @@ class LoopFormulas:
     @cached_property
     def _gamma_and_determinants(self) -> tuple[dict[int, Vector], list[Scalar]]:
         n = len(self.active_joints)
-        known: dict[int, Vector] = {
-            joint: [float(i == k) for k in range(n)] for i, joint in enumerate(self.active_joints)
-        }
-        return self.solve_passive(known, [[0.0] * n for _ in self.rows])
+        return self.solve_passive(
+            {
+                joint: [float(i == k) for k in range(n)]
+                for i, joint in enumerate(self.active_joints)
+            },
+            [[0.0] * n for _ in self.rows],
+        )
 
     @property
     def gamma(self) -> dict[int, Vector]:
@@ -211,26 +212,20 @@ class LoopFormulas:
     @cached_property
     def newton_step(self) -> dict[int, Scalar]:
         """Newton step of the passive joints, by joint."""
-        held: dict[int, Vector] = {joint: [0.0] for joint in self.active_joints}
-        x, _ = self.solve_passive(held, [[-row.phi] for row in self.rows])
+        x, _ = self.solve_passive(
+            {joint: [0.0] for joint in self.active_joints}, [[-row.phi] for row in self.rows]
+        )
         return {joint: x[joint][0] for joint in self.passive_joints}
 
-    @property
-    def largest_residual(self) -> Scalar:
-        """The largest absolute scaled residual of the independent equations."""
-        return self._largest_scaled_residual(self.rows, self._structure.independent_rows)
-
-    @property
-    def largest_redundant_residual(self) -> Scalar:
-        """The largest absolute scaled residual of the redundant equations."""
-        return self._largest_scaled_residual(self._redundant_rows, self._structure.redundant_rows)
-
-    def _largest_scaled_residual(
-        self, rows: Sequence[LoopEquationFormula], indices: Indices
-    ) -> Scalar:
-        long = self._is_translation[indices].tolist()
+    def largest_residual(self, redundant: bool = False) -> Scalar:
+        """The largest absolute scaled residual of the independent or redundant equations."""
+        rows, indices = self.rows, self._structure.independent_rows
+        if redundant:
+            rows, indices = self._redundant_rows, self._structure.redundant_rows
         return largest_scaled_value(
-            [row.phi for row in rows], long, self._kinematics.inverse_characteristic_length
+            [row.phi for row in rows],
+            self._is_translation[indices].tolist(),
+            self._kinematics.inverse_characteristic_length,
         )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from crane.closure.active_joint_selection import Indices
+from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
 from crane.common.samples import Array
 from crane.description.specification import LOOP_TYPES
@@ -84,15 +84,17 @@ class ClosureResidual:
         self._locked_components = [
             np.flatnonzero(LOOP_TYPES[loop.type]) for loop in equations.loops
         ]
-        is_coupling = equations.loop_of_row >= len(equations.loops)
-        self._coupling_units = equations.residual_units[is_coupling]
+        self._coupling_units = equations.residual_units[
+            equations.loop_of_row >= len(equations.loops)
+        ]
 
     def evaluate(self, q: Array) -> tuple[Array, Array]:
         """Residuals (m,) and their Jacobian (m, nv)."""
         equations = self._equations
         model, data = equations.model, equations.data
-        configuration = equations.coordinates.configuration(q)
-        joint_jacobians = pin.computeJointJacobians(model, data, configuration).reshape(6, -1)
+        joint_jacobians = pin.computeJointJacobians(
+            model, data, equations.coordinates.configuration(q)
+        ).reshape(6, -1)
         residuals = [
             (equations.coupling_factors @ q - equations.coupling_offsets) / self._coupling_units
         ]
@@ -273,8 +275,9 @@ class MultiStartSearch:
         if not len(joints):
             return 0, 0.0
         off = (q - self.initial_guess) / self._coordinate_units
-        turned = np.remainder(off + np.pi, 2 * np.pi) - np.pi
-        differences = np.abs(np.where(self._turns, turned, off))[joints]
+        differences = np.abs(
+            np.where(self._turns, np.remainder(off + np.pi, 2 * np.pi) - np.pi, off)
+        )[joints]
         return int(joints[differences.argmax()]), float(differences.max())
 
     def largest_deviation(self, q: Array) -> tuple[int, float]:

@@ -3,8 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from crane.closure.constraint_structure import ConstraintStructure, Indices
+from crane.closure.constraint_structure import ConstraintStructure
+from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
 from crane.common.errors import (
     MechanismError,
@@ -78,10 +80,11 @@ class NewtonContinuation:
 
     def rounding_scale(self, q: Array) -> float:
         """Factor on rounding errors at a configuration (nq,): its largest scaled dimension."""
-        largest_stroke = float(
-            np.abs(q[self._is_translation]).max(initial=self._largest_dimension)
+        return max(
+            1.0,
+            float(np.abs(q[self._is_translation]).max(initial=self._largest_dimension))
+            / self._equations.characteristic_length,
         )
-        return max(1.0, largest_stroke / self._equations.characteristic_length)
 
     def solve_newton(
         self, q: Array, q_a: Array, max_iterations: int
@@ -121,18 +124,6 @@ class NewtonContinuation:
             q[self._passive_columns] += step * self._coordinate_units[self._passive_columns]
         return None
 
-    def take_newton_step(self, q: Array, target: Array) -> ClosedConfiguration | None:
-        """The configuration at a target very close to q (nq,), None if the branch is uncertain."""
-        if not (np.abs(target - q[self._active_columns]) < 0.01 * self._active_ranges).all():
-            return None
-        solution = self.solve_newton(q, target, 5)
-        if solution is None or not self._is_continuation(
-            q, solution, np.zeros(len(self._passive_columns))
-        ):
-            return None
-        self._check_solution(solution, "")
-        return solution
-
     def continue_to(
         self, target: Array, known: ClosedConfiguration, sample: str = ""
     ) -> ClosedConfiguration:
@@ -168,9 +159,9 @@ class NewtonContinuation:
         solution = self.solve_newton(q, q[self._active_columns], 10)
         if solution is None:
             return self.home
-        changed_signs = np.flatnonzero(self._determinant_signs(solution) * self._home_signs < 0)
-        if len(changed_signs):
-            rows = [block for group, _ in self._blocks for block in group][int(changed_signs[0])]
+        changed_signs = self._changed_signs(solution)
+        if changed_signs.any():
+            rows = [block for group, _ in self._blocks for block in group][changed_signs.argmax()]
             raise self._wrong_branch_error(self._format_loop_names(np.ravel(rows)), solution)
         opposed_loop = self._equations.find_opposed_loop(solution.q)
         if opposed_loop is not None:
@@ -277,6 +268,10 @@ class NewtonContinuation:
         ]
         return np.concatenate(signs) if signs else np.zeros(0)
 
+    def _changed_signs(self, solution: ClosedConfiguration) -> NDArray[np.bool_]:
+        """Which blocks have a determinant of another sign than at home."""
+        return np.asarray(self._determinant_signs(solution) * self._home_signs < 0)
+
     def _follow_line(
         self, start: ClosedConfiguration, target: Array
     ) -> tuple[ClosedConfiguration | None, ClosedConfiguration]:
@@ -309,32 +304,18 @@ class NewtonContinuation:
         self, current: ClosedConfiguration, q_a: Array, passive_step: Array, max_iterations: int
     ) -> ClosedConfiguration | None:
         """The configuration at q_A next to the current one, None if the branch changes."""
-        if (
-            not np.abs(passive_step / self._coordinate_units[self._passive_columns]).max(
-                initial=0.0
-            )
-            < 1.0
-        ):
+        passive = self._passive_columns
+        units = self._coordinate_units[passive]
+        predicted_step = np.abs(passive_step / units).max(initial=0.0)
+        if not predicted_step < 1.0:
             return None
         predicted = current.q.copy()
-        predicted[self._passive_columns] += passive_step
+        predicted[passive] += passive_step
         corrected = self.solve_newton(predicted, q_a, max_iterations)
-        if corrected is None or not self._is_continuation(predicted, corrected, passive_step):
+        if corrected is None or self._changed_signs(corrected).any():
             return None
-        return corrected
-
-    def _is_continuation(
-        self, predicted: Array, solution: ClosedConfiguration, passive_step: Array
-    ) -> bool:
-        """Whether a configuration continues the branch on which it was predicted."""
-        if (self._determinant_signs(solution) * self._home_signs < 0).any():
-            return False
-        units = self._coordinate_units[self._passive_columns]
-        correction = np.abs((solution.q - predicted)[self._passive_columns] / units).max(
-            initial=0.0
-        )
-        predicted_step = np.abs(passive_step / units).max(initial=0.0)
-        return bool(correction <= 0.02 + 0.5 * predicted_step)
+        correction = np.abs((corrected.q - predicted)[passive] / units).max(initial=0.0)
+        return corrected if correction <= 0.02 + 0.5 * predicted_step else None
 
     def _check_solution(self, solution: ClosedConfiguration, sample: str) -> None:
         """Raise unless every equation holds and the passive joints are determined."""

@@ -1,17 +1,16 @@
 """Symbolic formulas, routines that call them, and their translation to machine code."""
 
-from crane.codegen.intermediate_representation import (
-    ArrayPointer,
-    Layout,
-    LayoutView,
-    Routine,
-    RoutineValue,
-    select,
+from crane.codegen.llvm.routine_builder import ArrayPointer, Routine, RoutineValue, select
+from crane.codegen.program import (
+    BoundFunction,
+    FormulaTooLongError,
+    Program,
+    PythonCallback,
+    run_with_fallback,
 )
-from crane.codegen.program import BoundFunction, FormulaTooLongError, Program
 from crane.codegen.program_cache import cached_result
-from crane.codegen.python_interface import PythonCallback, run_with_fallback
 from crane.codegen.symbolic import Scalar, SymbolicExpression, Tape, max_abs, maximum
+from crane.codegen.vector_layout import Layout, LayoutView
 
 __all__ = [
     "ArrayPointer",

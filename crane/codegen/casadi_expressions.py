@@ -40,8 +40,9 @@ def casadi_expressions(outputs: Sequence[Scalar], arguments: Sequence[Any]) -> l
             value = arguments[array][place]
             found[index] = value if isinstance(value, ca.SX) else ca.SX(float(value))
         else:
-            values = [found[x] if type(x) is int else ca.SX(x) for x in operands]
-            found[index] = _casadi_operation(ca, kind)(*values)
+            found[index] = _casadi_operation(ca, kind)(
+                *[found[x] if type(x) is int else ca.SX(x) for x in operands]
+            )
     return [
         found[x.index] if isinstance(x, SymbolicExpression) else ca.SX(float(x)) for x in outputs
     ]

@@ -106,8 +106,9 @@ def weighted_gradient(
     for index in sorted(dependent - variable_indices, reverse=True):
         if index in gradient:
             kind, *operands = tape.operations[index]
-            adjoints = _reverse_rule(tape, index, kind, operands, gradient[index])
-            for operand, change in zip(operands, adjoints, strict=True):
+            for operand, change in zip(
+                operands, _reverse_rule(tape, index, kind, operands, gradient[index]), strict=True
+            ):
                 accumulate(operand, change)
     return [gradient.get(variable.index, 0.0) for variable in variables]
 
@@ -140,8 +141,9 @@ def _forward_rule(
         case "negate":
             return -da
         case "dot":
-            first = dot(operand_tangents[:half], value[half:])
-            return first + dot(value[:half], operand_tangents[half:])
+            return dot(operand_tangents[:half], value[half:]) + dot(
+                value[:half], operand_tangents[half:]
+            )
         case "add":
             return da + db
         case "subtract":

@@ -1,8 +1,8 @@
 """Programs: straight-line formulas, and routines that call them in loops.
 
 A formula reads arrays and writes one, without branches; its operations come from a `Tape`. A
-routine adds sequences, loops over samples, conditions and local arrays. Programs do not depend on
-the target language: an emitter (`crane.codegen.llvm`) translates them.
+routine adds sequences, loops over samples, conditions and local arrays. `crane.codegen.llvm`
+translates both.
 
     with program.add_routine("each", counts=("count",), arrays=("inputs", "out")) as r:
         with r.loop(r.count) as i:
@@ -10,6 +10,7 @@ the target language: an emitter (`crane.codegen.llvm`) translates them.
         r.return_value(r.count)
 """
 
+import ctypes
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from ctypes import addressof, c_char
@@ -19,10 +20,12 @@ from typing import Any
 
 import numpy as np
 
-from crane.codegen.intermediate_representation import Formula, Layout, Routine, layout_of
 from crane.codegen.llvm.machine_code import MachineCode
+from crane.codegen.llvm.routine_builder import Routine
 from crane.codegen.program_cache import FunctionSignature, ProgramRecord, cache_entry_name
 from crane.codegen.symbolic import Scalar, required_operations
+from crane.codegen.vector_layout import Formula, Layout
+from crane.common.samples import Array
 
 MAX_OPERATIONS = 200_000  # operations of a formula; longer ones take minutes to compile
 
@@ -70,9 +73,11 @@ class Program:
         if record is not None and record.max_formula_length > MAX_OPERATIONS:
             raise FormulaTooLongError(record.max_formula_length)
         code = None if record is None else MachineCode.from_cache(record.code_name)
-        if record is not None and code is not None:
-            return cls._from_record(record, code)
         program = cls()
+        if record is not None and code is not None:
+            program.max_formula_length, program._machine_code = record.max_formula_length, code
+            program._signatures = dict(record.signatures)
+            return program
         try:
             build(program)
         except FormulaTooLongError as error:
@@ -82,13 +87,6 @@ class Program:
         ProgramRecord(
             program._machine_code.cache_name, program.max_formula_length, program._signatures
         ).write_to_cache(entry_name)
-        return program
-
-    @classmethod
-    def _from_record(cls, record: ProgramRecord, code: MachineCode) -> "Program":
-        program = cls()
-        program.max_formula_length, program._machine_code = record.max_formula_length, code
-        program._signatures = dict(record.signatures)
         return program
 
     def add_formula(
@@ -116,9 +114,10 @@ class Program:
         if operations > MAX_OPERATIONS:
             raise FormulaTooLongError(operations)
         self.max_formula_length = max(self.max_formula_length, operations)
-        formula = self.functions[name] = Formula(name, input_count, flat, layout_of(parts))
-        self._signatures[name] = FunctionSignature(formula.argument_kinds, formula.layout)
-        return formula.layout
+        layout = Layout(**{part: len(values) for part, values in parts.items()})
+        formula = self.functions[name] = Formula(name, input_count, flat, layout)
+        self._signatures[name] = FunctionSignature(formula.argument_kinds, layout)
+        return layout
 
     @contextmanager
     def add_routine(
@@ -210,3 +209,83 @@ def _argument_address(argument: "int | np.ndarray") -> int:
         if not argument.flags.c_contiguous:
             raise TypeError("an array is not contiguous, machine code would read others") from None
         return int(argument.ctypes.data)
+
+
+class PythonCallback:
+    """A Python function that machine code calls; it reads one array and writes another.
+
+    Exceptions cannot pass through machine code: the output array is then NaN, and `raise_pending`
+    raises the exception.
+
+    Args:
+        function: Takes its inputs (n,) and outputs (m,).
+        input_size: n.
+        output_size: m.
+
+    Attributes:
+        address: Address of the function for machine code, valid for the lifetime of this object.
+    """
+
+    def __init__(
+        self, function: Callable[[Array, Array], None], input_size: int, output_size: int
+    ):
+        self._function, self._sizes, self._exception = function, (input_size, output_size), None
+        self._c_function = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_void_p)(
+            self._call_from_machine_code
+        )
+        self.address = int(ctypes.cast(self._c_function, ctypes.c_void_p).value or 0)
+
+    _exception: BaseException | None
+
+    def raise_pending(self) -> None:
+        """Raise the exception of the function since the last call of this method, if any."""
+        raised, self._exception = self._exception, None
+        if raised is not None:
+            raise raised
+
+    def _call_from_machine_code(self, input_address: int, output_address: int) -> int:
+        inputs, outputs = (
+            np.ctypeslib.as_array((ctypes.c_double * count).from_address(address))
+            for address, count in zip((input_address, output_address), self._sizes, strict=True)
+        )
+        if self._exception is not None:
+            outputs[:] = np.nan
+            return 0
+        try:
+            self._function(inputs, outputs)
+        except BaseException as error:  # an interrupt, too
+            self._exception = error
+            outputs[:] = np.nan
+        return 0
+
+
+def run_with_fallback(
+    count: int,
+    run_compiled: Callable[[int, int], int] | None,
+    run_fallback: Callable[[int], None],
+    max_chunk: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> None:
+    """Process items one after another by machine code, with a fallback where that stops.
+
+    Machine code only completes items that succeed at once; the fallback completes the others or
+    raises an error with the reason.
+
+    Args:
+        count: Number of items.
+        run_compiled: (first, end) -> number of completed items from the first on; None if there is
+            no machine code.
+        run_fallback: Processes one item.
+        max_chunk: Largest number of items per call of `run_compiled`.
+        progress: Called with the number of completed items.
+    """
+    done = 0
+    while done < count:
+        chunk_end = min(done + (max_chunk or count), count)
+        if run_compiled is not None:
+            done += run_compiled(done, chunk_end)
+        if done < chunk_end:
+            run_fallback(done)
+            done += 1
+        if progress is not None:
+            progress(done)

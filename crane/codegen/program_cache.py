@@ -19,8 +19,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 import crane
-from crane.codegen.intermediate_representation import ArgumentKind, Layout
-from crane.codegen.llvm import compiler_settings
+from crane.codegen.llvm.machine_code import compiler_settings
+from crane.codegen.vector_layout import ArgumentKind, Layout
 from crane.common import file_cache
 from crane.common.serialization import deserialize, serialize
 
@@ -69,11 +69,7 @@ def is_patched() -> bool:
             and not _is_unchanged(name, module)
         ):
             tables = _module_tables(name, module)
-            if any(
-                _is_foreign(_underlying_function(x))
-                for table in tables
-                for x in list(table.values())
-            ):
+            if any(_is_foreign(x) for table in tables for x in list(table.values())):
                 return True
             _unpatched_tables[name] = [(table, list(table.values())) for table in tables]
     return False
@@ -107,16 +103,14 @@ def _module_tables(name: str, module: ModuleType) -> list[Mapping[str, Any]]:
     return found
 
 
-def _underlying_function(value: Any) -> Any:
-    """The function of a property or method."""
-    if isinstance(value, property):
-        return value.fget
-    if isinstance(value, functools.cached_property):
-        return value.func
-    return value.__func__ if isinstance(value, _METHOD_TYPES) else value
-
-
 def _is_foreign(value: Any) -> bool:
+    """Whether a value, or the function of a property or method, is code of another package."""
+    if isinstance(value, property):
+        value = value.fget
+    elif isinstance(value, functools.cached_property):
+        value = value.func
+    elif isinstance(value, _METHOD_TYPES):
+        value = value.__func__
     return isinstance(value, _CODE_TYPES) and not _is_trusted(value.__module__)
 
 
@@ -180,8 +174,9 @@ def cache_entry_name(dependencies: Any, kind: str = "note") -> str | None:
     package = package_digest()
     if package is None:
         return None
-    tracing = sys.version, np.__version__
-    return file_cache.entry_name(repr((package, tracing, compiler_settings(), content)), kind)
+    return file_cache.entry_name(
+        repr((package, (sys.version, np.__version__), compiler_settings(), content)), kind
+    )
 
 
 @dataclass(frozen=True)

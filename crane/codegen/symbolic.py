@@ -2,9 +2,11 @@
 
 Python code that computes with `SymbolicExpression`s instead of floats records a tape of
 operations. Values that are known while tracing are folded: 0 and 1 disappear, equal operations are
-recorded once. General algorithms, traced for one machine, become the formulas of that machine.
+recorded once. General algorithms, traced for one machine, become the formulas of that machine; in
+those of vectors and matrices structural zeros cause no operations.
 """
 
+import itertools
 import math
 from collections.abc import Iterable, Sequence
 from typing import Union
@@ -101,6 +103,10 @@ class SymbolicExpression:
         return self.tape.record(name, *sorted((self.index, other.index)))
 
 
+def _operand(value: Scalar) -> int | float:
+    return value.index if isinstance(value, SymbolicExpression) else float(value)
+
+
 def required_operations(outputs: Sequence[Scalar]) -> list[int]:
     """Indices of the operations that the outputs depend on, in order."""
     found: set[int] = set()
@@ -128,28 +134,24 @@ def apply_function(function: str, x: Scalar) -> Scalar:
 def maximum(a: Scalar, b: Scalar) -> Scalar:
     """The larger of two; NaN if one is NaN."""
     if isinstance(a, SymbolicExpression):
-        return a.tape.record(
-            "maximum", a.index, b.index if isinstance(b, SymbolicExpression) else float(b)
-        )
+        return a.tape.record("maximum", a.index, _operand(b))
     if isinstance(b, SymbolicExpression):
         return maximum(b, a)
     return math.nan if a != a or b != b else max(a, b)
 
 
-def minimum(a: Scalar, b: Scalar) -> Scalar:
-    """The smaller of two; NaN if one is NaN."""
-    return -maximum(-a, -b)
+def minimum(first: Scalar, *others: Scalar) -> Scalar:
+    """The smallest value; NaN if one is NaN."""
+    for other in others:
+        first = -maximum(-first, -other)
+    return first
 
 
 def where_positive(x: Scalar, if_positive: Scalar, otherwise: Scalar) -> Scalar:
     """`if_positive` where x > 0, else `otherwise`."""
     if not isinstance(x, SymbolicExpression):
         return if_positive if x > 0 else otherwise
-    words = (
-        y.index if isinstance(y, SymbolicExpression) else float(y)
-        for y in (if_positive, otherwise)
-    )
-    return x.tape.record("positive", x.index, *words)
+    return x.tape.record("positive", x.index, _operand(if_positive), _operand(otherwise))
 
 
 def max_abs(values: Iterable[Scalar]) -> Scalar:
@@ -164,8 +166,15 @@ def copysign(magnitude: Scalar, sign: Scalar) -> Scalar:
     """|magnitude| with the sign of `sign`."""
     if not isinstance(sign, SymbolicExpression):
         return math.copysign(1.0, sign) * apply_function("abs", magnitude)
-    first = magnitude.index if isinstance(magnitude, SymbolicExpression) else float(magnitude)
-    return sign.tape.record("copysign", first, sign.index)
+    return sign.tape.record("copysign", _operand(magnitude), sign.index)
+
+
+def sum_scalars(values: Iterable[Scalar]) -> Scalar:
+    """Sum of values."""
+    total: Scalar = 0.0
+    for value in values:
+        total = total + value
+    return total
 
 
 def dot(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
@@ -233,10 +242,7 @@ def dot_products(vector: Sequence[Scalar], others: Sequence[Sequence[Scalar]]) -
         if not found or all(not isinstance(x, SymbolicExpression) and x == 0 for x in second):
             out.append(dot(first, second))
             continue
-        words = (
-            x.index if isinstance(x, SymbolicExpression) else float(x) for x in (*first, *second)
-        )
-        out.append(found[0].tape.record("dot", *words))
+        out.append(found[0].tape.record("dot", *map(_operand, (*first, *second))))
     return out
 
 
@@ -263,8 +269,7 @@ def solve_linear_system(
         determinant = a * d - b * c
         inverse = 1.0 / determinant
         top = [(d * x - b * y) * inverse for x, y in zip(*right, strict=True)]
-        bottom = [(a * y - c * x) * inverse for x, y in zip(*right, strict=True)]
-        return [top, bottom], determinant
+        return [top, [(a * y - c * x) * inverse for x, y in zip(*right, strict=True)]], determinant
     rows = [[*row, *more] for row, more in zip(matrix, right, strict=True)]
     determinant = 1.0
     diagonal: list[Scalar] = []
@@ -303,3 +308,116 @@ def solve_linear_system(
                 total = total - rows[k][i] * out[i][j]
             out[k][j] = total * inverse
     return out, determinant
+
+
+Matrix = list[list[Scalar]]
+
+
+class LdltFactorization:
+    """Factorization L D L^T of a symmetric positive definite matrix, with unit diagonal of L.
+
+    Args:
+        matrix: (k, k), of which the lower half is read.
+
+    Attributes:
+        inverse_diagonal: (k,) inverse of D.
+    """
+
+    def __init__(self, matrix: Sequence[Sequence[Scalar]]):
+        size = len(matrix)
+        self._unit_lower: Matrix = [[0.0] * size for _ in range(size)]
+        self.inverse_diagonal: list[Scalar] = []
+        for j in range(size):
+            scaled: list[Scalar] = []
+            for k in range(j):
+                scaled.append(matrix[j][k] - dot(scaled, self._unit_lower[k][:k]))
+            self._unit_lower[j][:j] = [
+                x * d for x, d in zip(scaled, self.inverse_diagonal, strict=True)
+            ]
+            self.inverse_diagonal.append(
+                1.0 / (matrix[j][j] - dot(scaled, self._unit_lower[j][:j]))
+            )
+
+    def forward_substitute(self, right: Sequence[Scalar]) -> list[Scalar]:
+        """L^-1 b."""
+        x: list[Scalar] = []
+        for row, value in zip(self._unit_lower, right, strict=True):
+            x.append(value - dot(row[: len(x)], x))
+        return x
+
+    @property
+    def inverse_matrix(self) -> Matrix:
+        """A^-1 = L^-T D^-1 L^-1."""
+        size = len(self._unit_lower)
+        columns = [
+            self.forward_substitute([float(i == k) for i in range(size)]) for k in range(size)
+        ]
+        out: Matrix = [[0.0] * size for _ in range(size)]
+        for k, column in enumerate(columns):
+            weighed = [x * d for x, d in zip(column, self.inverse_diagonal, strict=True)]
+            for j in range(k + 1):
+                out[j][k] = out[k][j] = dot(weighed[k:], columns[j][k:])
+        return out
+
+    def solve(self, right: Sequence[Scalar]) -> list[Scalar]:
+        """A^-1 b."""
+        x = [
+            value * d
+            for value, d in zip(self.forward_substitute(right), self.inverse_diagonal, strict=True)
+        ]
+        for j in range(len(x) - 1, -1, -1):
+            x[j] = x[j] - dot([row[j] for row in self._unit_lower[j + 1 :]], x[j + 1 :])
+        return x
+
+
+def lu_factorize(matrix: Sequence[Sequence[Scalar]]) -> Matrix:
+    """LU factorization without pivoting, L and U in one matrix.
+
+    The diagonal holds the inverse of U's; L has a unit diagonal. The caller must order the rows so
+    that pivots stay away from zero.
+
+    Args:
+        matrix: (k, k).
+    """
+    rows = [list(row) for row in matrix]
+    for k in range(len(rows)):
+        inverse = 1.0 / rows[k][k]
+        rows[k][k] = inverse
+        for row in rows[k + 1 :]:
+            if not isinstance(row[k], SymbolicExpression) and row[k] == 0:
+                continue
+            row[k] = factor = row[k] * inverse
+            row[k + 1 :] = [
+                entry - factor * pivot
+                for entry, pivot in zip(row[k + 1 :], rows[k][k + 1 :], strict=True)
+            ]
+    return rows
+
+
+def lu_solve(factors: Sequence[Sequence[Scalar]], right: Sequence[Scalar]) -> list[Scalar]:
+    """Solution x of A x = b, from `lu_factorize` of A."""
+    x = list(right)
+    size = len(x)
+    for i in range(size):
+        for j in range(i):
+            x[i] = x[i] - factors[i][j] * x[j]
+    for i in range(size - 1, -1, -1):
+        for j in range(i + 1, size):
+            x[i] = x[i] - factors[i][j] * x[j]
+        x[i] = x[i] * factors[i][i]
+    return x
+
+
+def symbolic_entries(matrix: Sequence[Sequence[Scalar]]) -> list[Scalar]:
+    """The entries that are not constant, row by row."""
+    return [entry for row in matrix for entry in row if isinstance(entry, SymbolicExpression)]
+
+
+def load_matrix(matrix: Sequence[Sequence[Scalar]], tape: Tape, array: int, start: int) -> Matrix:
+    """The same matrix, with `symbolic_entries` loaded from an argument of a function."""
+    indices = itertools.count(start)
+
+    def read(entry: Scalar) -> Scalar:
+        return tape.load(array, next(indices)) if isinstance(entry, SymbolicExpression) else entry
+
+    return [[read(entry) for entry in row] for row in matrix]

@@ -227,7 +227,6 @@ def _can_be_moved(target: Path) -> bool:
 
 
 def _check_free(target: Path, folder: str | Path) -> None:
-    """Raise if a folder contains other files than temporary ones."""
     if any(not temporary_files.is_temporary(name, target) for name in os.listdir(target)):
         raise OutputError(
             f"{folder}: is there now, another program has filled it meanwhile, choose another "
@@ -236,7 +235,6 @@ def _check_free(target: Path, folder: str | Path) -> None:
 
 
 def _match_patterns(target: Path, patterns: Iterable[str]) -> set[Path]:
-    """Files in a folder that match patterns."""
     return {x for pattern in patterns for x in target.glob(pattern) if not x.is_dir()}
 
 

@@ -1,13 +1,12 @@
-"""Exceptions and warnings of the package, and the grouping of similar messages.
+"""Exceptions and warnings of the package, and the summary of similar warnings.
 
 A message is one line that says what is wrong, where, and what to do about it.
 """
 
 import re
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from difflib import SequenceMatcher, get_close_matches
 from typing import Any
 
@@ -157,6 +156,24 @@ def suggest_names(names: Iterable[str], unknown_name: str | None = None) -> str:
     return f"the nearest of {len(names)} known ones are {', '.join(listed)}"
 
 
+def check_name(
+    name: str, names: Collection[str], problem: str, error: type[CraneError] = InputError
+) -> None:
+    """Check that a name is among those that are known.
+
+    Args:
+        name: The name.
+        names: Those that are known.
+        problem: What is wrong if it is not; the names that are meant are appended.
+        error: Class of the error.
+
+    Raises:
+        CraneError: The name is not known.
+    """
+    if name not in names:
+        raise error(f"{problem}, {suggest_names(names, name)}")
+
+
 def _likeness(name: str, wanted: str) -> float:
     """Similarity of two names, 0 to 1, ignoring case; at least 0.7 if one contains the other."""
     name, wanted = name.lower(), wanted.lower()
@@ -175,52 +192,23 @@ def message_kind(message: str) -> str:
     return _NUMBER_PATTERN.sub("#", _QUOTED_PATTERN.sub("''", _LOCATION_PATTERN.sub("", message)))
 
 
-@dataclass
-class MessageGroup:
-    """Messages of one kind.
-
-    Attributes:
-        first_message: The first message.
-        count: Number of messages.
-    """
-
-    first_message: str
-    count: int = 1
-
-    def __str__(self) -> str:
-        return (
-            self.first_message if self.count == 1 else f"{self.first_message} ({self.count} such)"
-        )
-
-
-def group_messages(messages: Iterable[str]) -> list[MessageGroup]:
-    """Messages by kind, in the order of their first occurrence."""
-    found: dict[str, MessageGroup] = {}
-    for message in messages:
-        group = found.get(message_kind(message))
-        if group is None:
-            found[message_kind(message)] = MessageGroup(message)
-        else:
-            group.count += 1
-    return list(found.values())
-
-
 @contextmanager
 def summarize_warnings() -> Iterator[None]:
     """Context that delays warnings to its end: one per kind, and at most `MAX_WARNINGS`."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CraneWarning)
         yield
-    package_messages = [
-        str(one.message) for one in caught if issubclass(one.category, CraneWarning)
-    ]
+    by_kind: dict[str, dict[str, None]] = {}  # different messages, in order
     for one in caught:
-        if not issubclass(one.category, CraneWarning):
+        if issubclass(one.category, CraneWarning):
+            text = str(one.message)
+            by_kind.setdefault(message_kind(text), {})[text] = None
+        else:
             warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
-    groups = group_messages(dict.fromkeys(package_messages))
-    texts = [str(group) for group in groups]
+    groups = [list(messages) for messages in by_kind.values()]
+    texts = [x[0] if len(x) == 1 else f"{x[0]} ({len(x)} such)" for x in groups]
     if len(texts) > MAX_WARNINGS:
-        rest = sum(group.count for group in groups[MAX_WARNINGS - 1 :])
+        rest = sum(map(len, groups[MAX_WARNINGS - 1 :]))
         texts[MAX_WARNINGS - 1 :] = [f"{rest} more warnings: crane check lists them"]
     for text in texts:
         warnings.warn(text, CraneWarning, stacklevel=4)

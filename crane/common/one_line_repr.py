@@ -6,13 +6,9 @@ from typing import Any
 MAX_LINE_LENGTH = 200  # characters
 
 
-def _no_html(_: Any) -> str | None:
-    return None
-
-
 # Converts an object to HTML, or returns None. `crane.view.notebook` sets it, because this room may
 # not import that one (see CONTRIBUTING.md).
-to_html: Callable[[Any], str | None] = _no_html
+to_html: Callable[[Any], str | None]
 
 
 class OneLineRepr:
@@ -23,7 +19,7 @@ class OneLineRepr:
         return shorten_to_line(self._one_line())
 
     def _repr_html_(self) -> str | None:
-        return to_html(self)
+        return to_html(self)  # noqa: F821 - set by the package
 
     def _one_line(self) -> str:
         """Class name and public fields: values, shapes of arrays, lengths of sequences."""

@@ -83,7 +83,10 @@ def use_load_options(
         trust_xacro: Whether xacro files may run Python; by default as in the context around.
     """
     around = load_options()
-    values = {str(name): _format_argument(value) for name, value in (arguments or {}).items()}
+    values = {
+        str(name): str(value).lower() if isinstance(value, bool) else str(value)
+        for name, value in (arguments or {}).items()
+    }
     trust = around.trust_xacro if trust_xacro is None else trust_xacro
     options = LoadOptions(tuple(packages), values, floating, strict or around.strict, trust)
     token = _load_options.set(options)
@@ -103,10 +106,6 @@ def asked(name: str) -> bool:
     if value not in ("true", "false"):
         raise InputError(f"the argument {name} is '{value}', give true or false")
     return value == "true"
-
-
-def _format_argument(value: object) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def check_package_folders(packages: object) -> list[str]:
@@ -168,7 +167,7 @@ def _search_upwards(path: Path, parts: list[str], folder: Path, in_package: bool
     if in_package:
         ends = [Path(*parts[1:]), Path(*parts)] if len(parts) > 1 else [Path(*parts)]
     places = (above / end for end in ends for above in (folder, *folder.absolute().parents))
-    return next((place for place in places if place.is_file()), None)
+    return next(filter(Path.is_file, places), None)
 
 
 def find_package(name: str, folder: Path) -> Path | None:
@@ -210,7 +209,6 @@ def enclosing_package(folder: Path) -> Path | None:
 
 
 def _is_package(folder: Path, name: str) -> bool:
-    """Whether a folder is the package with a name."""
     name_in_manifest = _package_name(folder)
     return name_in_manifest == name or (
         folder.name == name and folder.is_dir() and not name_in_manifest
@@ -245,7 +243,6 @@ def _subfolders(folder: str) -> list[str]:
 
 
 def _package_name(folder: Path) -> str:
-    """The name in a folder's package.xml or model.config, empty without one."""
     for manifest in _MANIFESTS:
         file = folder / manifest
         try:

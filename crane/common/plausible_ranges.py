@@ -50,6 +50,7 @@ _FLOW_COEFFICIENT_UNITS: tuple[UnitSizes, ...] = (
     (("l/min per root of MPa", 1e-3 * _LITRE_PER_MINUTE), ("m3/s per root of bar", 10**-2.5)),
 )
 _FORCE_PER_PRESSURE_UNITS: tuple[UnitSizes, ...] = ((("N per bar", 1e-5), ("N per MPa", 1e-6)),)
+_PERCENT_UNITS: tuple[UnitSizes, ...] = ((("percent", 0.01),),)
 
 _PORT_PRESSURE = PlausibleRange("Pa", 1e5, 7e7, 2e7, _PRESSURE_UNITS)
 _AREA = PlausibleRange("m2", 1e-6, 0.2, 3e-3, ((("cm2", 1e-4), ("mm2", 1e-6)),))
@@ -115,6 +116,10 @@ PLAUSIBLE_RANGES = {
     "displacement": PlausibleRange(
         "m3/rad", 1e-9, 1e-2, 1e-5, ((("cm3/rad", 1e-6), ("cm3 per turn", 1e-6 / (2 * math.pi))),)
     ),
+    "friction": PlausibleRange("", 0.0, 0.5, 0.05, _PERCENT_UNITS),
+    "least": PlausibleRange("", 0.0, 0.9, 0.05, _PERCENT_UNITS),
+    "demand": PlausibleRange("", 0.01, 2.0, 1.0, _PERCENT_UNITS),
+    "gear": PlausibleRange("", 0.02, 1e4, 20.0),
     **dict.fromkeys(
         (
             "c1",
@@ -132,13 +137,6 @@ PLAUSIBLE_RANGES = {
         ),
         _FLOW_COEFFICIENT,
     ),
-}
-_PERCENT_UNIT = (("percent", 0.01),)
-PLAUSIBLE_RANGES |= {
-    "friction": PlausibleRange("", 0.0, 0.5, 0.05, (_PERCENT_UNIT,)),
-    "least": PlausibleRange("", 0.0, 0.9, 0.05, (_PERCENT_UNIT,)),
-    "demand": PlausibleRange("", 0.01, 2.0, 1.0, (_PERCENT_UNIT,)),
-    "gear": PlausibleRange("", 0.02, 1e4, 20.0),
 }
 _ROTARY_DISPLACEMENT = PlausibleRange(
     "m3/rad", 1e-9, 0.1, 1e-3, ((("cm3/rad", 1e-6), ("l/rad", 1e-3)),)
@@ -192,51 +190,35 @@ def implausible_value_text(
     if plausible is None or value == 0 or plausible.lower <= value <= plausible.upper:
         return ""
     unit = f" {plausible.unit}" if plausible.unit else ""
-    text = f"is {value:g}{unit}, usual are {plausible.lower:g} to {plausible.upper:g}"
-    suggestions = [
-        f"{name}, write {_format_in_si(value, size)}"
-        for name, size in _suggest_units(value, plausible)
-    ]
     return (
-        f"{text}: looks like {' or '.join(suggestions)}"
-        if suggestions
-        else f"{text}, look at its unit"
+        f"is {value:g}{unit}, usual are {plausible.lower:g} to {plausible.upper:g}"
+        f"{_suggestion_text(value, plausible) or ', look at its unit'}"
     )
 
 
 def suggested_units_text(name: str, value: float) -> str:
     """Suggested unit of an invalid value, to append to an error; may be empty."""
-    found = [
-        f"{unit}, write {_format_in_si(value, size)}"
-        for unit, size in _suggest_units(value, PLAUSIBLE_RANGES[name])
-    ]
-    return f": looks like {' or '.join(found)}" if found else ""
+    return _suggestion_text(value, PLAUSIBLE_RANGES[name])
 
 
-def _suggest_units(value: float, plausible: PlausibleRange) -> list[tuple[str, float]]:
-    """At most two units in which a value is plausible, with their sizes."""
+def _suggestion_text(value: float, plausible: PlausibleRange) -> str:
+    """Text about at most two units in which a value is plausible; empty if there is none."""
     for units in plausible.other_units:
-        able = [
-            (x, size)
-            for x, size in units
+        distances = {
+            (unit, size): abs(math.log(abs(value) * size / plausible.typical))
+            for unit, size in units
             if plausible.lower <= abs(value) * size <= plausible.upper
-        ]
-        if able:
-            distances = {
-                size: abs(math.log(abs(value) * size / plausible.typical)) for _, size in able
-            }
-            nearest = min(distances.values())
-            able = [
-                item
-                for item in able
-                if distances[item[1]] <= nearest + math.log(_SECOND_UNIT_RATIO)
-            ]
-            return sorted(able, key=lambda item: distances[item[1]])[:2]
-    return []
+        }
+        if distances:
+            farthest = min(distances.values()) + math.log(_SECOND_UNIT_RATIO)
+            able = [x for x in distances if distances[x] <= farthest]
+            able.sort(key=lambda x: distances[x])
+            texts = [f"{unit}, write {_format_in_si(value, size)}" for unit, size in able[:2]]
+            return f": looks like {' or '.join(texts)}"
+    return ""
 
 
 def _format_in_si(value: float, size: float) -> str:
-    """A value in another unit, written in the SI unit."""
     power = math.log10(size)
     shown = f"{value:g}"
     if abs(power - round(power)) < 1e-9 and "e" not in shown and float(shown) == value:

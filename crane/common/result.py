@@ -6,14 +6,9 @@ from typing import Any
 
 from crane.common.one_line_repr import OneLineRepr
 
-
-def _write_nothing(result: Any, folder: str | Path, overwrite: bool, **options: Any) -> str:
-    raise NotImplementedError("the package sets write_result")
-
-
 # Writes a result into a folder: `crane.view.result_files.write_result`. The package sets it,
 # because results are defined in rooms that may not import `view` (see CONTRIBUTING.md).
-write_result: Callable[..., str] = _write_nothing
+write_result: Callable[..., str]
 
 
 class Result(OneLineRepr):
@@ -38,4 +33,4 @@ class Result(OneLineRepr):
         Raises:
             OutputError: The folder cannot be written, or holds files and `overwrite` is False.
         """
-        return write_result(self, folder, overwrite, **options)
+        return write_result(self, folder, overwrite, **options)  # noqa: F821 - set by the package

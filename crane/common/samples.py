@@ -127,14 +127,6 @@ def solve_linear(matrix: Array, right_side: Array) -> Array:
     return np.asarray(np.linalg.solve(matrix, right_side), dtype=np.float64)
 
 
-def _call_with_sample_number(sample: int, function: Callable[..., Array], *arrays: Array) -> Array:
-    """Call a function and name the sample in errors of the closure."""
-    try:
-        return function(*arrays)
-    except ClosureError as error:
-        raise type(error)(f"{error} (sample {sample})") from None
-
-
 def read_only_copy(array: Array) -> Array:
     """A read-only copy of an array."""
     out = array.copy()
@@ -165,17 +157,15 @@ def apply_per_sample(function: Callable[..., Array], *arrays: Array) -> Array:
     count = stack_length(arrays)
     if count is None:
         return function(*arrays)
-    rows: Iterable[Array] = (
-        _call_with_sample_number(
-            i, function, *(array[i] if array.ndim == 2 else array for array in arrays)
-        )
-        for i in range(count)
-    )
-    first = next(iter(rows), None)
-    if first is None:
+    if not count:
         raise InputError("the stack is empty, give at least one sample")
-    out = np.empty((count, *np.shape(first)))
-    out[0] = first
-    for i, row in enumerate(rows, start=1):
+    out = np.empty(0)
+    for i in range(count):
+        try:
+            row = function(*(array[i] if array.ndim == 2 else array for array in arrays))
+        except ClosureError as error:
+            raise type(error)(f"{error} (sample {i})") from None
+        if i == 0:
+            out = np.empty((count, *np.shape(row)))
         out[i] = row
     return out

@@ -38,7 +38,6 @@ def empty_array(count: int, columns: int) -> Array:
 
 
 def _map_temporary_file(size: int) -> mmap.mmap:
-    """Memory map of a new file of `size` bytes with allocated disk space."""
     with tempfile.TemporaryFile(prefix="crane-") as file:
         if hasattr(os, "posix_fallocate"):  # a full disk would later kill the process
             os.posix_fallocate(file.fileno(), 0, size)

@@ -10,6 +10,7 @@ import errno
 import os
 import re
 import shutil
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -76,11 +77,6 @@ def is_temporary(name: str, target: Path) -> bool:
     if not name.startswith(f".{target.name}."):  # fast path
         return False
     return bool(_TEMPORARY_PATTERN.fullmatch(name[len(target.name) + 1 :]))
-
-
-def wait_for_lock(path: Path) -> int | None:
-    """Wait for the lock of an existing folder or file; None on systems without locks."""
-    return _acquire_lock(path, wait=True)
 
 
 def _create_temporary(target: Path, is_folder: bool) -> tuple[Path, int | None]:
@@ -164,7 +160,7 @@ def exchange_folders(source: Path, target: Path) -> None:
     """
     if _exchange_atomically(source, target):
         return
-    lock, aside = wait_for_lock(target), temporary_name(target, REPLACED_SUFFIX)
+    lock, aside = _acquire_lock(target, wait=True), temporary_name(target, REPLACED_SUFFIX)
     try:
         os.rename(target, aside)
         try:
@@ -181,7 +177,8 @@ def exchange_folders(source: Path, target: Path) -> None:
 def _exchange_atomically(source: Path, target: Path) -> bool:
     import ctypes
 
-    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None) if _is_linux() else None
+    library = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
+    rename = getattr(library, "renameat2", None)
     if rename is None:
         return False
     if not rename(
@@ -192,7 +189,3 @@ def _exchange_atomically(source: Path, target: Path) -> bool:
     if number in _UNSUPPORTED_ERRORS:
         return False
     raise OSError(number, os.strerror(number), str(target))
-
-
-def _is_linux() -> bool:
-    return os.uname().sysname == "Linux" if hasattr(os, "uname") else False

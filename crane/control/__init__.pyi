@@ -8,8 +8,8 @@ from .controller_registry import CONTROLLERS as CONTROLLERS
 from .controller_registry import default_controller_name as default_controller_name
 from .controller_registry import make_controller as make_controller
 from .levers import LeverPhases as LeverPhases
+from .levers import TipVelocity as TipVelocity
 from .levers import joystick as joystick
-from .tip_velocity import TipVelocity as TipVelocity
 from .valve_commands import SampledCommand as SampledCommand
 from .valve_commands import ValveCommand as ValveCommand
 from .valve_commands import ValvePD as ValvePD

@@ -4,20 +4,19 @@ import itertools
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.codegen import Scalar
-from crane.codegen.symbolic import subtract_vectors
+from crane.codegen.symbolic import Scalar, subtract_vectors
 from crane.common.errors import ClosureError, CraneWarning, InputError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, as_number, as_sample
 from crane.description.specification import PIGains
 from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.external_forces import static_active_forces
-from crane.dynamics.hybrid_dynamics import hybrid_dynamics
+from crane.dynamics.inertial_force_formulas import hybrid_dynamics
 from crane.machine.machine import Machine
 from crane.motion.task_trajectories import add_free_joints
 from crane.motion.trajectory import Trajectory
@@ -36,20 +35,6 @@ class Controller(Protocol):
         """Active forces (n,) [N], [N m], and rates (k,) of the controller states."""
 
 
-class InverseDynamicsFunction(Protocol):
-    """Inverse dynamics at an instant."""
-
-    def __call__(self, a_a: Sequence[Scalar], friction: bool) -> list[Scalar]:
-        """Active forces (n,) [N], [N m] of accelerations (n,), see `Dynamics.inverse`."""
-
-
-class GravityFunction(Protocol):
-    """Gravity force at an instant."""
-
-    def __call__(self) -> list[Scalar]:
-        """Active forces (n,) [N], [N m] that balance gravity, see `Dynamics.gravity`."""
-
-
 class ControllerInputs(NamedTuple):
     """Inputs of a control law at an instant: floats, or formulas while it is traced.
 
@@ -59,8 +44,9 @@ class ControllerInputs(NamedTuple):
         state: (k,) states of the controller.
         settings: (s,) its `settings`.
         reference: (c,) its `references` at the instant.
-        inverse: Inverse dynamics of the machine.
-        gravity: Gravity force of the machine.
+        inverse: Function (a_a, friction) of accelerations (n,) that gives the active forces (n,)
+            [N], [N m], see `Dynamics.inverse`.
+        gravity: Function that gives the active forces (n,) [N], [N m] which balance gravity.
     """
 
     q_a: list[Scalar]
@@ -68,25 +54,8 @@ class ControllerInputs(NamedTuple):
     state: list[Scalar]
     settings: list[Scalar]
     reference: list[Scalar]
-    inverse: InverseDynamicsFunction
-    gravity: GravityFunction
-
-
-@runtime_checkable
-class TracedController(Controller, Protocol):
-    """A controller that can be compiled with the simulation; see `ControlLaw` for a base class.
-
-    Attributes:
-        settings: (s,) its parameters.
-    """
-
-    settings: Array
-
-    def references(self, times: Array) -> Array:
-        """Inputs that depend on time alone, (N, c) at times (N,) [s]."""
-
-    def trace(self, inputs: ControllerInputs) -> tuple[Sequence[Scalar], Sequence[Scalar]]:
-        """The outputs of `__call__` as formulas."""
+    inverse: Callable[..., list[Scalar]]
+    gravity: Callable[..., list[Scalar]]
 
 
 class ControlLaw(OneLineRepr):
@@ -146,8 +115,9 @@ class ControlLaw(OneLineRepr):
     def start(self, q_a: Array) -> Array:
         """See `Controller`."""
         # compiling does not pay for a single configuration
-        dynamics = Dynamics(self.machine, backend="pinocchio")
-        return self.start_closed(dynamics, self.machine.closure.solve(q_a))
+        return self.start_closed(
+            Dynamics(self.machine, backend="pinocchio"), self.machine.closure.solve(q_a)
+        )
 
     def start_closed(self, dynamics: Dynamics, q: Array) -> Array:
         """`start` at a closed configuration (nq,), with exact dynamics."""
@@ -160,10 +130,9 @@ class ControlLaw(OneLineRepr):
             quantity = "inverse with friction" if friction else "inverse"
             return (evaluate(quantity, q, zeros, np.array(a_a)) - static_forces).tolist()
 
-        def gravity() -> list[Scalar]:
-            return evaluate("gravity", q, zeros, zeros).tolist()
-
-        inputs = self._numeric_inputs(0.0, q_a, zeros, np.zeros(0), inverse, gravity)
+        inputs = self.inputs_at(0.0, q_a, zeros, np.zeros(0))._replace(
+            inverse=inverse, gravity=lambda: evaluate("gravity", q, zeros, zeros).tolist()
+        )
         return np.array(self.initial_state(inputs), dtype=np.float64)
 
     def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
@@ -171,35 +140,18 @@ class ControlLaw(OneLineRepr):
         tau, rate = self.law(self.inputs_at(time, q_a, v_a, state))
         return np.array(tau, dtype=np.float64), np.array(rate, dtype=np.float64)
 
-    def trace(self, inputs: ControllerInputs) -> tuple[Sequence[Scalar], Sequence[Scalar]]:
-        """The outputs of `law` as formulas."""
-        return self.law(inputs)
-
     def inputs_at(self, time: float, q_a: Array, v_a: Array, state: Array) -> ControllerInputs:
         """Inputs at a time [s] as floats, from q_a (n,), v_a (n,) and states (k,)."""
 
         def inverse(a_a: Sequence[Scalar], friction: bool) -> list[Scalar]:
-            accelerations = np.array(a_a, dtype=np.float64)
-            return self._dynamics.inverse(q_a, v_a, accelerations, friction).tolist()
+            return self._dynamics.inverse(
+                q_a, v_a, np.array(a_a, dtype=np.float64), friction
+            ).tolist()
 
-        def gravity() -> list[Scalar]:
-            return self._dynamics.gravity(q_a).tolist()
-
-        return self._numeric_inputs(time, q_a, v_a, state, inverse, gravity)
-
-    def _numeric_inputs(
-        self,
-        time: float,
-        q_a: Array,
-        v_a: Array,
-        state: Array,
-        inverse: InverseDynamicsFunction,
-        gravity: GravityFunction,
-    ) -> ControllerInputs:
         references = self.references(np.array([time]))[0].tolist()
         return ControllerInputs(
             q_a.tolist(), v_a.tolist(), state.tolist(), self.settings.tolist(), references,
-            inverse, gravity,
+            inverse, lambda: self._dynamics.gravity(q_a).tolist(),
         )  # fmt: skip
 
     @cached_property
@@ -306,11 +258,8 @@ class PI(ControlLaw):
             self.select_driven(inputs.inverse([0.0] * len(inputs.q_a), friction=True))
         )
         kp, ki = np.array(self._gains(inputs))
-        has_integral_gain = ki > 0
-        integral_forces = np.where(
-            has_integral_gain, holding_forces - kp * np.array(self._error(inputs)), 0.0
-        )
-        return list(integral_forces / np.where(has_integral_gain, ki, 1.0))
+        integral_forces = holding_forces - kp * np.array(self._error(inputs))
+        return list(np.where(ki > 0, integral_forces, 0.0) / np.where(ki > 0, ki, 1.0))
 
     def references(self, times: Array) -> Array:
         """See `ControlLaw`."""
@@ -320,8 +269,9 @@ class PI(ControlLaw):
         """See `ControlLaw`; the states are the integrals of the errors."""
         error = self._error(inputs)
         kp, ki = self._gains(inputs)
-        forces = [p * e + i * z for p, i, e, z in zip(kp, ki, error, inputs.state, strict=True)]
-        return self.expand_driven(forces), error
+        return self.expand_driven(
+            [p * e + i * z for p, i, e, z in zip(kp, ki, error, inputs.state, strict=True)]
+        ), error
 
     def _error(self, inputs: ControllerInputs) -> list[Scalar]:
         return subtract_vectors(inputs.reference, self.select_driven(inputs.q_a))

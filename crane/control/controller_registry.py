@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 
 from crane.common.errors import InputError, suggest_names
 from crane.control.control_law import PI, ComputedTorque, Controller
-from crane.control.tip_velocity import TipVelocity
+from crane.control.levers import TipVelocity
 from crane.control.valve_commands import ValveCommand, ValvePD
 from crane.control.valve_feedforward import ValveFeedforward
 from crane.machine.machine import Machine

@@ -1,20 +1,28 @@
-"""Valve signals by levers: over time, of a task, or held until joints reach positions."""
+"""Valve signals of an operator: by levers, or by the velocity of the tip."""
 
 import threading
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from crane.codegen import Scalar
 from crane.common.errors import ClosureError, InputError, SimulationError, suggest_names
 from crane.common.one_line_repr import OneLineRepr
-from crane.common.samples import Array, as_number
+from crane.common.samples import Array, as_number, as_sample
 from crane.control.control_law import ControllerInputs
-from crane.control.valve_commands import ValveCommand, ValveSignals, lever_signals, require_circuit
-from crane.description.specification import DEFAULT_RAMP_TIME
-from crane.description.task_phases import Phase
+from crane.control.valve_commands import (
+    SampledCommand,
+    ValveCommand,
+    ValveSignals,
+    lever_signals,
+    require_circuit,
+)
+from crane.description.specification import DEFAULT_RAMP_TIME, Phase
 from crane.machine.machine import Machine
+from crane.motion.kinematics import Kinematics
+from crane.motion.trajectory import Trajectory
 
 _SAMPLING_PERIOD = 0.01  # sampling period of the joints [s]
 
@@ -66,8 +74,13 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
         self.initial_coordinates = start
         q = machine.home[machine.closure.active] if start is None else start
         start_positions: dict[str, float] = dict(zip(machine.active, q.tolist(), strict=True))
-        joint_limits = zip(machine.lower.tolist(), machine.upper.tolist(), strict=True)
-        limits = dict(zip(machine.active, joint_limits, strict=True))
+        limits = dict(
+            zip(
+                machine.active,
+                zip(machine.lower.tolist(), machine.upper.tolist(), strict=True),
+                strict=True,
+            )
+        )
         for phase in phases:
             for _, _, problem in phase.find_problems(circuit.joints, limits, start_positions):
                 raise InputError(problem)
@@ -96,9 +109,11 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
         self._phase_start: dict[str, float] = {}  # positions at the begin of the phase
         self._pending_joints: set[str] = set()
         self._levers = np.zeros(len(self._joints))
-        neutral = np.append([spool.neutral for spool in self._spools], 0.0)
         # signals and clock at each sample, and at last at the next one
-        self._sample_times, self._sample_rows = [0.0], [neutral]
+        self._sample_times, self._sample_rows = (
+            [0.0],
+            [np.append([spool.neutral for spool in self._spools], 0.0)],
+        )
         self.is_finished = False
 
     def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
@@ -120,7 +135,10 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
         if self._phase_index < 0:
             self._begin_phase(0, time, positions)
         self._check_arrivals(time, positions)
-        targets = self._lever_targets()
+        targets = np.zeros(len(self._joints))
+        if self._phase_index < len(self._phases):
+            levers, pending = self._phases[self._phase_index].levers, self._pending_joints
+            targets = np.array([levers[x] if x in pending else 0.0 for x in self._joints])
         max_change = _SAMPLING_PERIOD / self._ramp if self._ramp else np.inf
         self.is_finished = self._phase_index == len(self._phases) and not self._levers.any()
         self._levers = self._levers + np.clip(targets - self._levers, -max_change, max_change)
@@ -128,13 +146,17 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
         signals = [float(lever_signals(spool, np.asarray(lever))) for spool, lever in pairs]
         self._last_time = time
         self._sample_times.append(time + _SAMPLING_PERIOD)
-        self._sample_rows.append(np.append(signals, self._phase_clock(positions)))
+        shares = (self._completed_share(x, positions) for x in self._pending_joints)
+        # the clock never decreases
+        clock = max(self._phase_index + min(shares, default=0.0), float(self._sample_rows[-1][-1]))
+        self._sample_rows.append(np.append(signals, clock))
 
     def _begin_phase(self, index: int, time: float, positions: Mapping[str, float]) -> None:
         """Start a phase."""
         self._phase_index, self._phase_start_time, self._phase_start = index, time, dict(positions)
-        is_done = index == len(self._phases)
-        self._pending_joints = set() if is_done else set(self._phases[index].until)
+        self._pending_joints = (
+            set() if (index == len(self._phases)) else set(self._phases[index].until)
+        )
 
     def _check_arrivals(self, time: float, positions: Mapping[str, float]) -> None:
         """Find the joints that have reached their positions; start the next phase if all have."""
@@ -145,20 +167,19 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
                 for joint in self._pending_joints
                 if phase.levers[joint] * (phase.until[joint] - positions[joint]) > 0
             }
+            if self._pending_joints and time - self._phase_start_time > phase.within:
+                shares = {x: self._completed_share(x, positions) for x in self._pending_joints}
+                joint = min(shares, key=lambda x: shares[x])
+                at, unit = positions[joint], self._units[joint]
+                raise SimulationError(
+                    f"at t = {time:.6g} s: phase '{phase.name}' has not ended within "
+                    f"{phase.within:g} s, '{joint}' is at {at:.4g} {unit} on its way from "
+                    f"{self._phase_start[joint]:.4g} to {phase.until[joint]:.4g} {unit}: "
+                    + self._remedy_text(phase, positions)
+                )
             if self._pending_joints:
                 break
             self._begin_phase(self._phase_index + 1, time, positions)
-        else:
-            return
-        if time - self._phase_start_time > phase.within:
-            joint = min(self._pending_joints, key=lambda x: self._completed_share(x, positions))
-            unit = self._units[joint]
-            raise SimulationError(
-                f"at t = {time:.6g} s: phase '{phase.name}' has not ended within "
-                f"{phase.within:g} s, '{joint}' is at {positions[joint]:.4g} {unit} on its way "
-                f"from {self._phase_start[joint]:.4g} to {phase.until[joint]:.4g} {unit}: "
-                + self._remedy_text(phase, positions)
-            )
 
     def _remedy_text(self, phase: Phase, positions: Mapping[str, float]) -> str:
         """Remedy for a phase that does not end; names a dead centre before the positions."""
@@ -172,24 +193,10 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
             return f"a dead centre is in between ({error}), give a position before it"
         return "give it more time or lever, or a position that it reaches"
 
-    def _lever_targets(self) -> Array:
-        """Target positions of the levers (m,)."""
-        if self._phase_index == len(self._phases):
-            return np.zeros(len(self._joints))
-        levers = self._phases[self._phase_index].levers
-        return np.array([levers[x] if x in self._pending_joints else 0.0 for x in self._joints])
-
     def _completed_share(self, joint: str, positions: Mapping[str, float]) -> float:
         """Share of its way in the phase that a joint has moved."""
         start, end = self._phase_start[joint], self._phases[self._phase_index].until[joint]
         return max((positions[joint] - start) / (end - start), 0.0)
-
-    def _phase_clock(self, positions: Mapping[str, float]) -> float:
-        """The clock, which never decreases."""
-        share = min(
-            (self._completed_share(x, positions) for x in self._pending_joints), default=0.0
-        )
-        return max(self._phase_index + share, float(self._sample_rows[-1][-1]))
 
     def references(self, times: Array) -> Array:
         """See `ValveCommand`: the signals, then the clock."""
@@ -275,3 +282,108 @@ def joystick(
     command = ValveSignals(machine, times_fine, signals)
     command.title, command.initial_coordinates = "joystick", start
     return command
+
+
+_DEAD_BAND_SMOOTHING = 1e-3  # opening over which the signal crosses the dead band
+_LIMIT_MARGIN = 1e-3  # share of the stroke within which a joint is at its limit
+_MIN_PRESSURE_DROP = 1e5  # least pressure drop that an edge is assumed to have [Pa]
+
+
+class TipVelocity(SampledCommand):
+    """Valve command that opens the valves for a velocity of the tip.
+
+    Once per period, with J the reduced Jacobian of the tip and W the squares of the strokes, the
+    joint velocities are the least-norm solution
+
+        v_A = W J^T (J W J^T)^+ x',    Q = A |v_A|,    y = Q / (c sqrt(dp)).
+
+    At the inlet, dp is the margin of the compensator, or what the supply leaves of it. At the
+    outlet, which sets the speed where the load drives the cylinder, it is the pressure of the
+    load. The signals jump over the dead band. The position of the tip is not fed back: the
+    operator closes that loop. Joints at their limits are not used, and all velocities are reduced
+    where a valve would have to open more than fully.
+
+    Args:
+        machine: A machine with a tip.
+        velocity: (t) -> (3,) velocity of the tip in the world [m/s], or a trajectory of the tip.
+        period: Sampling period [s].
+
+    Raises:
+        InputError: No tip, no valves, or a trajectory of joints.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        velocity: Callable[[float], ArrayLike] | Trajectory,
+        period: float = 0.01,
+    ):
+        super().__init__(self._valve_signals, machine, period)
+        if isinstance(velocity, Trajectory):
+            if velocity.tip is None:
+                raise InputError("the trajectory is not one of the tip, give one in x, y, z")
+            self.reference = velocity
+            curve = velocity.tip
+            self._tip_velocity: Callable[[float], ArrayLike] = lambda time: curve(time)[1]
+        else:
+            self._tip_velocity = velocity
+        self._machine, self._kinematics = machine, Kinematics(machine)
+        self._circuit = require_circuit(machine)
+        self._active_indices = [machine.active.index(joint) for joint in self._circuit.joints]
+        self._joint_ranges = machine.upper - machine.lower
+
+    def joint_velocities(self, q_a: Array, tip_velocity: Array) -> Array:
+        """Active velocities (n,) for a velocity of the tip, by the joints within their limits.
+
+        Args:
+            q_a: (n,) active coordinates [m], [rad].
+            tip_velocity: (3,) velocity of the tip [m/s].
+        """
+        jacobian = self._kinematics.jacobian(q_a)
+        is_usable = np.zeros(len(q_a), dtype=bool)
+        is_usable[self._active_indices] = True
+        lower, upper = self._machine.lower, self._machine.upper
+        while True:
+            weight = np.where(is_usable, self._joint_ranges, 0.0)
+            v = weight * (np.linalg.pinv(jacobian * weight, rcond=1e-3) @ tip_velocity)
+            margin = _LIMIT_MARGIN * self._joint_ranges
+            is_at_limit = is_usable & (
+                ((v < 0) & (q_a <= lower + margin)) | ((v > 0) & (q_a >= upper - margin))
+            )
+            if not is_at_limit.any():
+                return v
+            is_usable &= ~is_at_limit
+
+    def _valve_signals(self, time: float, q_a: Array, v_a: Array, pressures: Array) -> Array:
+        tip_velocity = as_sample(
+            self._tip_velocity(time), 3, f"the tip's velocity at t = {time:g} s"
+        )
+        v = self.joint_velocities(q_a, tip_velocity)[self._active_indices]
+        supply = self._circuit.supply
+        opening = np.zeros(len(v))
+        for i, joint in enumerate(self._circuit.joints):
+            valve, cylinder = self._circuit.valves[joint], self._circuit.cylinders[joint]
+            a, b = pressures[i]
+            force = cylinder.area_a * a - cylinder.area_b * b
+            areas, pressure = (cylinder.area_a, cylinder.area_b), a
+            inlet, outlet = valve.c1, valve.c2
+            if v[i] <= 0:
+                areas, pressure, inlet, outlet = areas[::-1], b, valve.c4, valve.c3
+            drop = min(supply.pressure - pressure, valve.margin or np.inf)
+            size = areas[0] * abs(v[i]) / (inlet * np.sqrt(max(drop, _MIN_PRESSURE_DROP)))
+            if force * v[i] < 0:
+                size = min(
+                    size,
+                    areas[1]
+                    * abs(v[i])
+                    / (outlet * np.sqrt(max(abs(force) / areas[1], _MIN_PRESSURE_DROP))),
+                )
+            opening[i] = np.copysign(size, v[i]) if v[i] else 0.0
+        opening /= max(1.0, np.abs(opening).max())
+        openings = dict(zip(self._circuit.joints, opening, strict=True))
+        signals = []
+        for spool in self._circuit.spools.values():
+            y = openings[spool.joint]
+            u = y * (1.0 - spool.dead_band) + spool.dead_band * np.tanh(y / _DEAD_BAND_SMOOTHING)
+            signals.append(spool.neutral + (spool.full - spool.neutral) * u)
+        return np.array(signals)

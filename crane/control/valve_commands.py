@@ -8,8 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.codegen import Scalar
-from crane.codegen.symbolic import apply_function
+from crane.codegen.symbolic import Scalar, apply_function
 from crane.common.errors import InputError, suggest_names
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.plausible_ranges import suggested_units_text
@@ -197,8 +196,10 @@ class ValveSignals(ValveCommand, OneLineRepr):
         if len(time) < 2:
             return time
         slopes = np.concatenate([[0.0], np.diff(values) / np.diff(time), [0.0]])
-        slope_tolerance = _SLOPE_TOLERANCE * np.abs(values).max() / np.diff(time).min()
-        return time[np.abs(np.diff(slopes)) > slope_tolerance]
+        return time[
+            np.abs(np.diff(slopes))
+            > (_SLOPE_TOLERANCE * np.abs(values).max() / np.diff(time).min())
+        ]
 
     def references(self, times: Array) -> Array:
         """See `ValveCommand`."""
@@ -309,8 +310,9 @@ class SampledCommand(ValveCommand, OneLineRepr):
         self._spool_names = tuple(circuit.spools)
         self._active_columns = machine.closure.active
         self.period = as_number(period, "the period", "s", greater_than=0)
-        neutral = np.array([spool.neutral for spool in circuit.spools.values()])
-        self._held_signals = _SampledSignals(neutral)  # a run is in one thread
+        self._held_signals = _SampledSignals(
+            np.array([spool.neutral for spool in circuit.spools.values()])
+        )  # a run is in one thread
 
     def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
         """See `ValveCommand`."""

@@ -1,6 +1,7 @@
 """A hydraulic circuit with its valve commands as a controller of the active forces."""
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -41,7 +42,6 @@ class ValveDrive(ControlLaw):
     Attributes:
         delays: (s,) dead times of the spools [s].
         circuit: The equations of the circuit.
-        channels: Names and units of the recorded channels.
         scales: Required accuracy of the states.
 
     Raises:
@@ -93,7 +93,6 @@ class ValveDrive(ControlLaw):
             [self.circuit.constants, self._lower_limits, self._signal_source.settings]
         )
         self.scales = self.circuit.scales
-        self.channels = self._channel_units()
 
     def for_machine(self, machine: Machine) -> "ValveDrive":
         """The same command and initial pressures for another machine.
@@ -129,7 +128,12 @@ class ValveDrive(ControlLaw):
         # a sampled command has no signal yet, except perhaps those of an earlier run
         signals: Sequence[Scalar] = [spool.neutral for spool in hydraulics.spools.values()]
         if not self.command.period:
-            signals = self.command.signals(self._command_inputs(inputs))
+            reference = inputs.reference
+            if self._signal_source is not self.command:
+                reference = self.command.references(np.zeros(1))[0].tolist()
+            signals = self.command.signals(
+                inputs._replace(settings=self.command.settings.tolist(), reference=reference)
+            )
         tank = hydraulics.supply.tank
         if self.command.has_measured_pressures:
             tank = float(np.array(inputs.reference[-1], dtype=np.float64))
@@ -139,13 +143,6 @@ class ValveDrive(ControlLaw):
                 holding_forces, self._initial_pressures, initial_signals, tank
             )
         )
-
-    def _command_inputs(self, inputs: ControllerInputs) -> ControllerInputs:
-        """Inputs of the command at the start."""
-        reference = inputs.reference
-        if self._signal_source is not self.command:
-            reference = self.command.references(np.zeros(1))[0].tolist()
-        return inputs._replace(settings=self.command.settings.tolist(), reference=reference)
 
     def _sample_signals(self, time: float, q_a: Array, v_a: Array, pressures: Array) -> Array:
         """Signals (s,) of a sampled law."""
@@ -167,8 +164,9 @@ class ValveDrive(ControlLaw):
         """Signals (N, s) [V] of an open-loop command at times (N,), before the dead times."""
         if not self.period:
             return self._signal_source.references(times)[:, : len(self.delays)]
-        rows = [self._signal_source.references(times[i : i + 1]) for i in range(len(times))]
-        return np.vstack(rows)[:, : len(self.delays)]
+        return np.vstack(
+            [self._signal_source.references(times[i : i + 1]) for i in range(len(times))]
+        )[:, : len(self.delays)]
 
     def breaks(self) -> Array:
         """Times (k,) [s] at which slopes of signals change, before and after the dead times."""
@@ -185,15 +183,17 @@ class ValveDrive(ControlLaw):
         """Next instant after a time [s] at which a sampled signal jumps after its dead time."""
         earliest = np.inf
         for delay in np.unique(self.delays[self.delays > 0]) if self.period else ():
-            count = max(np.floor((time - delay) / self.period) + 1.0, 1.0)
-            jump = count * self.period + delay
+            jump = max(np.floor((time - delay) / self.period) + 1.0, 1.0) * self.period + delay
             earliest = min(earliest, jump if jump > time else jump + self.period)
         return earliest
 
     def law(self, inputs: ControllerInputs) -> tuple[Sequence[Scalar], Sequence[Scalar]]:
         """See `ControlLaw`."""
         circuit_values, _ = self._evaluate_circuit(inputs)
-        return self._active_forces(circuit_values), circuit_values.state_rates
+        forces: list[Scalar] = [0.0] * len(self.machine.active)
+        for i, force in zip(self._active_indices, circuit_values.forces, strict=True):
+            forces[i] = force
+        return forces, circuit_values.state_rates
 
     def circuit_friction(self, inputs: ControllerInputs) -> list[Scalar]:
         """Circuit friction of the joints `Hydraulics.circuit_friction_joints` [N], [N m]."""
@@ -209,8 +209,9 @@ class ValveDrive(ControlLaw):
         circuit_values, signals = self._evaluate_circuit(inputs)
         out: list[Scalar] = []
         signals_and_positions = iter(zip(signals, circuit_values.spool_positions, strict=True))
-        valves = self.circuit.hydraulics.valves.values()
-        for valve, sides in zip(valves, circuit_values.chambers, strict=True):
+        for valve, sides in zip(
+            self.circuit.hydraulics.valves.values(), circuit_values.chambers, strict=True
+        ):
             out += [*next(signals_and_positions), *(side.pressure for side in sides)]
             out += [side.hose_flow for side in sides]
             if valve.spool_b:
@@ -248,13 +249,9 @@ class ValveDrive(ControlLaw):
         )
         return circuit_values, signals
 
-    def _active_forces(self, circuit_values: CircuitValues) -> list[Scalar]:
-        out: list[Scalar] = [0.0] * len(self.machine.active)
-        for i, force in zip(self._active_indices, circuit_values.forces, strict=True):
-            out[i] = force
-        return out
-
-    def _channel_units(self) -> tuple[tuple[str, str], ...]:
+    @cached_property
+    def channels(self) -> tuple[tuple[str, str], ...]:
+        """Names and units of the recorded channels."""
         channels: list[tuple[str, str]] = []
         for joint in self.circuit.joints:
             channels += [(f"voltage_{joint}", "V"), (f"spool_{joint}", "")]

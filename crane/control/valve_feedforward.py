@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from crane.codegen import Scalar
-from crane.codegen.symbolic import add_vectors, apply_function
+from crane.codegen.symbolic import Scalar, add_vectors, apply_function
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_number
 from crane.control.control_law import ControllerInputs
@@ -16,10 +15,9 @@ from crane.hydraulics.components import Cylinder, Valve
 from crane.hydraulics.flow_equations import LAMINAR_PRESSURE_DROP
 from crane.hydraulics.hydraulic_circuit import Hydraulics, PDGains
 from crane.machine.machine import Machine
-from crane.motion.sway import Sway
-from crane.motion.sway_suppression import retime, suppress_sway
+from crane.motion.sway import Sway, suppress_sway
 from crane.motion.task_trajectories import add_free_joints
-from crane.motion.trajectory import Trajectory
+from crane.motion.trajectory import Trajectory, retime
 
 _MIN_PRESSURE_DROP = 1e5  # least pressure drop that an edge is assumed to have [Pa]
 _PRESSURE_DIFFERENCE = 1e3  # pressure step of difference quotients [Pa]
@@ -52,8 +50,11 @@ def openings_per_velocity(
         drop = np.minimum(supply - np.maximum(force, 0.0) / inlet_area, valve.margin or np.inf)
         by_inlet = inlet_area / (inlet * np.sqrt(np.maximum(drop, _MIN_PRESSURE_DROP)))
         load_pressure = np.maximum(np.maximum(-force, 0.0) / outlet_area, _MIN_PRESSURE_DROP)
-        by_outlet = outlet_area / (outlet * np.sqrt(load_pressure))
-        return np.where(force < 0, np.minimum(by_inlet, by_outlet), by_inlet)
+        return np.where(
+            force < 0,
+            np.minimum(by_inlet, outlet_area / (outlet * np.sqrt(load_pressure))),
+            by_inlet,
+        )
 
     return (
         opening(force, valve.c1, cylinder.area_a, valve.c2, cylinder.area_b),
@@ -145,8 +146,7 @@ def required_openings(
         return y, (area_b * w - q_b * y) / cb
 
     openings = np.empty_like(v)
-    holding_force = force[0] - tank * (area_a - area_b)
-    p_b = tank + np.maximum(-holding_force, 0.0) / area_b
+    p_b = tank + np.maximum(-(force[0] - tank * (area_a - area_b)), 0.0) / area_b
     steps = np.diff(time, append=2.0 * time[-1] - time[-2])
     for i in range(len(time)):
         p_b = np.maximum(
@@ -182,8 +182,9 @@ def largest_flow_share(machine: Machine, reference: Trajectory) -> float:
         drop = valve.margin or 0.5 * (circuit.supply.pressure - circuit.supply.tank)
         out = np.maximum(rate, 0.0) * cylinder.area_a
         back = np.maximum(-rate, 0.0) * cylinder.area_b
-        shares = out / valve.c1 + back / valve.c4
-        largest_share = max(largest_share, float(shares.max()) / np.sqrt(drop))
+        largest_share = max(
+            largest_share, float((out / valve.c1 + back / valve.c4).max()) / np.sqrt(drop)
+        )
         total_flow = total_flow + out + back
     pump = circuit.supply.flow
     return max(largest_share, float(total_flow.max()) / pump) if pump else largest_share
@@ -269,6 +270,8 @@ class ValveFeedforward(ValvePD):
         gains: Mapping[str, PDGains] | None = None,
         sway: float = 0.0,
     ):
+        from scipy.interpolate import make_interp_spline  # slow to import
+
         damping = as_number(sway, "the damping ratio of sway", "", max_magnitude=1.0)
         if damping < 0:
             raise InputError(f"the damping ratio of sway is {damping:g}, give 0 to 1")
@@ -287,8 +290,21 @@ class ValveFeedforward(ValvePD):
         self._knot_times = np.linspace(0.0, reference.duration, count)
         q_a, v_a, a_a = reference(self._knot_times)
         forces = Dynamics(machine).inverse(q_a, v_a, a_a)[:, self._active_indices]
-        forces += self._friction(machine, circuit, v_a[:, self._active_indices])
-        self._opening_times, opening = self._feedforward_openings(machine, reference, forces)
+        for i, joint in enumerate(circuit.joints):
+            if (law := machine.friction.get(joint)) is not None:  # reversals are smoothed
+                valve, v = circuit.valves[joint], v_a[:, self._active_indices[i]]
+                max_flow = valve.c1 * np.sqrt(valve.margin or circuit.supply.pressure)
+                flow = v * circuit.cylinders[joint].area_a
+                direction = np.tanh(flow / (_REVERSAL_SMOOTHING * max_flow))
+                forces[:, i] += law.viscous * v + law.coulomb * direction + law.coulomb_offset
+        count = int(np.ceil(reference.duration * _STEPS_PER_SECOND)) + 1
+        self._opening_times = np.linspace(0.0, reference.duration, count)
+        q, v, _ = (x[:, self._active_indices] for x in reference(self._opening_times))
+        lower, upper = machine.lower[self._active_indices], machine.upper[self._active_indices]
+        force = make_interp_spline(self._knot_times, forces)(self._opening_times)
+        opening = required_openings(
+            circuit, self._opening_times, q - lower, v, force, upper - lower
+        )
         self._opening_table = opening + np.array(lags) * np.gradient(
             opening, self._opening_times, axis=0
         )
@@ -304,36 +320,6 @@ class ValveFeedforward(ValvePD):
                 columns + self._sway_feedback_gains(machine, q_a, damping)
             )
 
-    def _friction(self, machine: Machine, circuit: Hydraulics, v: Array) -> Array:
-        """Friction (N, m) of the joints of cylinders, with smoothed Coulomb friction."""
-        friction = np.zeros_like(v)
-        for i, joint in enumerate(circuit.joints):
-            if (law := machine.friction.get(joint)) is not None:
-                valve, cylinder = circuit.valves[joint], circuit.cylinders[joint]
-                max_flow = valve.c1 * np.sqrt(valve.margin or circuit.supply.pressure)
-                direction = np.tanh(v[:, i] * cylinder.area_a / (_REVERSAL_SMOOTHING * max_flow))
-                friction[:, i] = (
-                    law.viscous * v[:, i] + law.coulomb * direction + law.coulomb_offset
-                )
-        return friction
-
-    def _feedforward_openings(
-        self, machine: Machine, reference: Trajectory, force: Array
-    ) -> tuple[Array, Array]:
-        """Times (N,), and openings (N, m) that the trajectory requires."""
-        from scipy.interpolate import make_interp_spline  # slow to import
-
-        count = int(np.ceil(reference.duration * _STEPS_PER_SECOND)) + 1
-        time = np.linspace(0.0, reference.duration, count)
-        q_a, v_a, _ = reference(time)
-        lower, upper = machine.lower[self._active_indices], machine.upper[self._active_indices]
-        forces = make_interp_spline(self._knot_times, force)(time)
-        x = q_a[:, self._active_indices] - lower
-        circuit = require_circuit(machine)
-        return time, required_openings(
-            circuit, time, x, v_a[:, self._active_indices], forces, upper - lower
-        )
-
     def _sway_feedback_gains(self, machine: Machine, q_a: Array, damping: float) -> list[Array]:
         """Elements of K (m, f), then of E (f, m), as columns (N,)."""
         sway, free = Sway(machine), self._free_indices
@@ -341,8 +327,9 @@ class ValveFeedforward(ValvePD):
         shifts = sway.pivoting_motions(configurations)
         roots = np.array([sway.frequency_matrix(q) for q in configurations])
         driven = np.flatnonzero(machine.is_driven).tolist()
-        driven_indices = [driven.index(i) for i in self._active_indices]
-        gains = -2.0 * damping * (shifts @ roots)[:, driven_indices]
+        gains = (
+            -2.0 * damping * (shifts @ roots)[:, [driven.index(i) for i in self._active_indices]]
+        )
         stiffness = sway.stiffness(configurations)
         coupling = -np.linalg.solve(stiffness[:, :, free], stiffness[:, :, self._active_indices])
         return [*gains.reshape(len(q_a), -1).T, *coupling.reshape(len(q_a), -1).T]
@@ -398,9 +385,10 @@ class ValveFeedforward(ValvePD):
         for i in range(m):
             speed = sum(gains[i * f + k] * theta[k] for k in range(f))
             mean = 0.5 * (positive_openings[i] + negative_openings[i])
-            half = 0.5 * (positive_openings[i] - negative_openings[i])
             direction = apply_function("tanh", speed * mean * (1.0 / _REVERSAL_SMOOTHING))
-            openings.append((mean + half * direction) * speed)
+            openings.append(
+                (mean + (0.5 * (positive_openings[i] - negative_openings[i])) * direction) * speed
+            )
         return openings
 
 

@@ -17,6 +17,6 @@ from .soil_cutting import SOILS as SOILS
 from .soil_cutting import Soil as Soil
 from .soil_cutting import SoilCutting as SoilCutting
 from .specification import MachineSpec as MachineSpec
+from .specification import Phase as Phase
 from .specification import PIGains as PIGains
 from .specification import Task as Task
-from .task_phases import Phase as Phase

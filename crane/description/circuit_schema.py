@@ -50,8 +50,10 @@ CURVE = section_schema(
 
 def _edge(text: str) -> VariantKey:
     """A flow coefficient, or a curve of it over the share of the stroke."""
-    number = NumberKey("", _COEFFICIENT, minimum=0.0)
-    return VariantKey(text, (number, RowListKey(size=2), SectionKey(section=CURVE)))
+    return VariantKey(
+        text,
+        (NumberKey("", _COEFFICIENT, minimum=0.0), RowListKey(size=2), SectionKey(section=CURVE)),
+    )
 
 
 _PUMP_KEYS: dict[str, Key] = {

@@ -144,8 +144,7 @@ class Wrench(ExternalForce):
 
     def references(self, times: Array) -> Array:
         """See `ExternalForce`."""
-        columns = [np.interp(times, self.times, column) for column in self.values.T]
-        return np.stack(columns, axis=1)
+        return np.stack([np.interp(times, self.times, column) for column in self.values.T], axis=1)
 
     def breaks(self) -> Array:
         """See `ExternalForce`."""
@@ -241,8 +240,9 @@ class WrenchFunction(ExternalForce):
         if len(motion.reference) > 1:  # the function was called already
             return motion.reference[1:4], motion.reference[4:]
         time = float(motion.reference[0])  # type: ignore[arg-type]
-        inputs = (np.array(part, dtype=np.float64) for part in motion[:4])
-        result = np.asarray(self._function(time, *inputs))
+        result = np.asarray(
+            self._function(time, *(np.array(part, dtype=np.float64) for part in motion[:4]))
+        )
         if result.shape != (6,) or result.dtype.kind not in "fiu" or not np.isfinite(result).all():
             raise InputError(
                 f"the load '{self.name}' gives {np.array2string(result, separator=', ')} at "

@@ -8,7 +8,6 @@ end even that.
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from types import TracebackType
 from typing import Any
 
 from crane.common.errors import CraneError
@@ -89,7 +88,8 @@ def collect_findings() -> Iterator[Findings]:
         _current_findings.reset(token)
 
 
-class error_recovery:  # noqa: N801  used as `with error_recovery():`
+@contextmanager
+def error_recovery(harmless: bool = False) -> Iterator[None]:
     """Context of a part of a description; while findings are collected, errors end only this part.
 
     An error after other errors of the same part follows from them and is not recorded.
@@ -97,37 +97,23 @@ class error_recovery:  # noqa: N801  used as `with error_recovery():`
     Args:
         harmless: Whether the machine can be assembled without this part.
     """
-
-    def __init__(self, harmless: bool = False):
-        self._is_harmless = harmless
-        self._findings: Findings | None = None
-        self._initial_error_count = 0
-
-    def __enter__(self) -> None:
-        self._findings = _current_findings.get()
-        if self._findings is not None:
-            self._initial_error_count = len(self._findings.errors)
-            self._findings.harmless_depth += self._is_harmless
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> bool:
-        findings = self._findings
-        if findings is None:
-            return False
-        try:
-            if not isinstance(error, CraneError) or isinstance(error, TooManyFindingsError):
-                return False
-            if len(findings.errors) > self._initial_error_count:
-                findings.can_be_assembled &= bool(findings.harmless_depth)
-            else:
-                findings.add(error)
-            return True
-        finally:
-            findings.harmless_depth -= self._is_harmless
+    findings = _current_findings.get()
+    if findings is None:
+        yield
+        return
+    initial_error_count = len(findings.errors)
+    findings.harmless_depth += harmless
+    try:
+        yield
+    except TooManyFindingsError:
+        raise
+    except CraneError as error:
+        if len(findings.errors) > initial_error_count:
+            findings.can_be_assembled &= bool(findings.harmless_depth)
+        else:
+            findings.add(error)
+    finally:
+        findings.harmless_depth -= harmless
 
 
 def report_error(error: CraneError, harmless: bool = False) -> None:
@@ -140,9 +126,6 @@ def report_error(error: CraneError, harmless: bool = False) -> None:
     Raises:
         CraneError: The error, if findings are not collected.
     """
-    findings = _current_findings.get()
-    if findings is None:
-        raise error
     with error_recovery(harmless):
         raise error
 

@@ -1,10 +1,10 @@
 """Floating bases: series of six joints at the root that are one joint without singularity.
 
 A joint with six degrees of freedom is read as a series of three translations and three rotations
-(see `crane.formats.joint_series`), whose Cardan angles are singular at a pitch of 90 degrees. If
-such a series connects a body to the ground, and no loop, coupling, spring or drive acts on it, its
-coordinates need not be solved for: then the series is one free-flyer joint with its own
-coordinates and velocities.
+(see `crane.description.kinematic_tree`), whose Cardan angles are singular at a pitch of 90
+degrees. If such a series connects a body to the ground, and no loop, coupling, spring or drive
+acts on it, its coordinates need not be solved for: then the series is one free-flyer joint with
+its own coordinates and velocities.
 
 Its coordinates are the position p [m] and the rotation vector r [rad] of the body, R = exp(r x),
 of length at most pi; its velocity is the body's twist in the body's axes, V = (linear, angular):
@@ -18,7 +18,14 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 from crane.common.errors import InputError
-from crane.description.kinematic_tree import Joint, Link, Tree
+from crane.description.kinematic_tree import (
+    Joint,
+    Link,
+    Tree,
+    body_of,
+    joint_freedoms,
+    joint_series,
+)
 from crane.description.specification import MachineSpec
 
 FLOATING_FREEDOMS = ("x", "y", "z", "rx", "ry", "rz")
@@ -48,12 +55,9 @@ def floating_series(spec: MachineSpec) -> dict[str, tuple[str, ...]]:
 
 def _is_unconstrained(spec: MachineSpec, series: list[Joint]) -> bool:
     """Whether a series connects a body to the ground and nothing else acts on it."""
-    parent_joints = {joint.child: joint for joint in spec.tree.joints.values()}
-    link = series[0].parent
-    while link in parent_joints:
-        if parent_joints[link].is_movable:
-            return False  # another body carries it
-        link = parent_joints[link].parent
+    parent_joints = spec.tree.parent_joints
+    if body_of(parent_joints, series[0].parent) in parent_joints:
+        return False  # another body carries it
     names = {joint.name for joint in series}
     force_element_joints = {part.joint for part in spec.force_elements if part.between is None}
     force_element_joints |= {part.joint for part in spec.end_stops}
@@ -71,9 +75,7 @@ def _is_unconstrained(spec: MachineSpec, series: list[Joint]) -> bool:
 
 def _carries_link(parent_joints: Mapping[str, Joint], link: str, body: str) -> bool:
     """Whether a link is a body or is carried by it."""
-    seen = set()
-    while link != body and link in parent_joints and link not in seen:
-        seen.add(link)
+    while link != body and link in parent_joints:
         link = parent_joints[link].parent
     return link == body
 
@@ -125,8 +127,12 @@ def add_floating_base(spec: MachineSpec, freedoms: bool | Sequence[str] = True) 
     """
     if not freedoms or floating_series(spec):
         return spec
-    base_freedoms = FLOATING_FREEDOMS if freedoms is True else check_freedoms(freedoms)
-    return dataclasses.replace(spec, tree=add_base_joints(spec.tree, base_freedoms))
+    return dataclasses.replace(
+        spec,
+        tree=add_base_joints(
+            spec.tree, FLOATING_FREEDOMS if freedoms is True else check_freedoms(freedoms)
+        ),
+    )
 
 
 def check_freedoms(names: object) -> tuple[str, ...]:
@@ -158,19 +164,16 @@ def add_base_joints(tree: Tree, freedoms: Sequence[str]) -> Tree:
         name += "_"
     ground = f"{name}_ground"
     where = tree.links[root].source_location
-    links = [Link(ground, where)]
-    links += [Link(f"{name}_{i}", where, composite_joint=name) for i in range(1, len(freedoms))]
-    joint_links = [ground, *(link.name for link in links[1:]), root]
-    joints = []
-    for i, freedom in enumerate(freedoms):
-        kind = "revolute" if freedom.startswith("r") else "prismatic"
-        axis = [0.0, 0.0, 0.0]
-        axis["xyz".index(freedom[-1])] = 1.0
-        joints.append(
-            Joint(
-                f"{name}_{freedom}", kind, joint_links[i], joint_links[i + 1], where,
-                axis=(axis[0], axis[1], axis[2]), floating_joint=name,
-            )
-        )  # fmt: skip
+    series = joint_series(
+        name,
+        [freedom for freedom in joint_freedoms("floating", ()) if freedom[0] in freedoms],
+        ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        (ground, root),
+        where,
+    )
+    parts = [
+        dataclasses.replace(part, floating_joint=name) if isinstance(part, Joint) else part
+        for part in series
+    ]
     # the ground first, because it is the new root
-    return Tree({links[0].name: links[0]}, {}).with_parts(*tree, *links[1:], *joints)
+    return Tree({ground: Link(ground, where)}, {}).with_parts(*tree, *parts)

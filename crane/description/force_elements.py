@@ -7,14 +7,25 @@ from crane.common.errors import InputError
 from crane.common.samples import as_number
 
 
-def check_numbers(element: object, label: str, *nonnegative_fields: str) -> None:
-    """Raise for numbers that are not finite, or negative where that has no meaning."""
+def as_nonnegative_number(value: object, label: str, unit: str) -> float:
+    """A number that is not negative, see `crane.common.samples.as_number`."""
+    number = as_number(value, label, unit)
+    if number < 0:
+        shown = " ".join(f"{label} is {number:g} {unit}".split())
+        raise InputError(f"{shown}, it must not be negative")
+    return number
+
+
+def check_numbers(
+    element: object, label: str, *nonnegative_fields: str, nonzero_fields: tuple[str, ...] = ()
+) -> None:
+    """Raise for numbers that are not finite, or negative or zero where that has no meaning."""
     for name, value in vars(element).items():
         if name in ("joint", "between"):
             continue
-        number = as_number(value, f"{name} of {label}", "")
-        if name in nonnegative_fields and number < 0:
-            raise InputError(f"{name} of {label} is {number:g}, it must not be negative")
+        check = as_nonnegative_number if name in nonnegative_fields else as_number
+        if check(value, f"{name} of {label}", "") == 0 and name in nonzero_fields:
+            raise InputError(f"{name} of {label} is 0, give one")
 
 
 def element_name(element: "AnyForceElement") -> str:
@@ -155,10 +166,8 @@ class GasSpring:
     def __post_init__(self) -> None:
         _check_frames(self)
         label = element_name(self)
-        check_numbers(self, label, "pressure", "volume", "exponent")
-        for name in ("area", "volume", "exponent"):
-            if getattr(self, name) == 0:
-                raise InputError(f"{name} of {label} is 0, give one")
+        nonzero_fields = "area", "volume", "exponent"
+        check_numbers(self, label, "pressure", *nonzero_fields[1:], nonzero_fields=nonzero_fields)
 
     @property
     def requires_direction(self) -> bool:
@@ -191,11 +200,10 @@ class Rope:
 
     def __post_init__(self) -> None:
         _check_frames(self)
-        label = element_name(self)
-        check_numbers(self, label, "length", "stiffness", "damping")
-        for name in ("length", "stiffness"):
-            if getattr(self, name) == 0:
-                raise InputError(f"{name} of {label} is 0, give one")
+        nonzero_fields = "length", "stiffness"
+        check_numbers(
+            self, element_name(self), "damping", *nonzero_fields, nonzero_fields=nonzero_fields
+        )
 
     @property
     def requires_direction(self) -> bool:

@@ -19,6 +19,7 @@ from crane.codegen.symbolic import (
 from crane.common.errors import InputError
 from crane.common.samples import as_number
 from crane.description.external_forces import ExternalForce, FrameMotion
+from crane.description.force_elements import as_nonnegative_number
 
 DEFAULT_STIFFNESS, DEFAULT_DAMPING, DEFAULT_FRICTION, DEFAULT_SMOOTHING = 1e7, 1.0, 0.6, 1e-2
 _RELAXATION_TIME = 1e-3  # [s]
@@ -126,16 +127,15 @@ class Contact(ExternalForce):
         label = f"of the contact at '{frame}'"
         self.stiffness = as_number(stiffness, f"the stiffness {label}", "N/m", greater_than=0)
         self.smoothing = as_number(smoothing, f"the smoothing {label}", "m/s", greater_than=0)
-        numbers = []
-        for key, unit, value in (
-            ("damping", "s/m", damping), ("friction", "", friction),
-            ("radius", "m", radius), ("area", "m2", area),
-            ("lateral stiffness", "N/m", lateral_stiffness),
-            ("lateral damping", "N s/m", lateral_damping),
-        ):  # fmt: skip
-            numbers.append(as_number(value, f"the {key} {label}", unit))
-            if numbers[-1] < 0:
-                raise InputError(f"the {key} {label} is {value:g}, it must not be negative")
+        numbers = [
+            as_nonnegative_number(value, f"the {key} {label}", unit)
+            for key, unit, value in (
+                ("damping", "s/m", damping), ("friction", "", friction),
+                ("radius", "m", radius), ("area", "m2", area),
+                ("lateral stiffness", "N/m", lateral_stiffness),
+                ("lateral damping", "N s/m", lateral_damping),
+            )
+        ]  # fmt: skip
         self.damping, self.friction, self.radius, self.area = numbers[:4]
         self.lateral_stiffness, self.lateral_damping = numbers[4:]
         if self.lateral_damping and not self.lateral_stiffness:
@@ -148,8 +148,10 @@ class Contact(ExternalForce):
     @property
     def channels(self) -> list[tuple[str, str]]:
         """See `ExternalForce`: N, and N over the area."""
-        pressure = [(f"pressure_{self.name}", "Pa")] if self.area else []
-        return [(f"support_{self.name}", "N"), *pressure]
+        return [
+            (f"support_{self.name}", "N"),
+            *([(f"pressure_{self.name}", "Pa")] if self.area else []),
+        ]
 
     def outputs(self, motion: FrameMotion) -> Sequence[Scalar]:
         """See `ExternalForce`."""

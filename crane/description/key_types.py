@@ -188,11 +188,16 @@ def section_schema(
     fields = {} if content is None else {x.name: x for x in dataclasses.fields(content)}
     if content is not None and content.__module__.startswith("crane.hydraulics"):
         component = component or component_name(content)
-    completed = {
-        name: _completed(key, name, fields.get(key.attribute or name), component)
-        for name, key in keys.items()
-    }
-    return SectionSchema(title, completed, content, component, **more)
+    return SectionSchema(
+        title,
+        {
+            name: _completed(key, name, fields.get(key.attribute or name), component)
+            for name, key in keys.items()
+        },
+        content,
+        component,
+        **more,
+    )
 
 
 def component_name(content: type) -> str:

@@ -1,20 +1,41 @@
-"""The kinematic tree of a machine: links and joints with their values and source locations."""
+"""The kinematic tree of a machine: links and joints with their values and source locations.
+
+A composite joint J is a series of joints J_x, J_y, ... with one degree of freedom each, and with
+massless links J_1, J_2, ... between them, so that all code for revolute and prismatic joints
+applies. The disadvantage is the singularity of Cardan angles: if the second of three rotations is
+at 90 degrees, the first and third have the same axis, and a closure through the joint is singular.
+"""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 Vector = tuple[float, float, float]
 Placement = tuple[Vector, Vector]  # xyz [m], rpy [rad] as URDF has them: R_z(y) R_y(p) R_x(r)
+Freedom = tuple[str, str, Vector]  # of a composite joint: suffix, kind, axis
 
+_X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+_ROTATIONS: tuple[Freedom, ...] = (
+    ("rx", "revolute", _X), ("ry", "revolute", _Y), ("rz", "revolute", _Z),
+)  # fmt: skip
+_TRANSLATIONS: tuple[Freedom, ...] = (
+    ("x", "prismatic", _X), ("y", "prismatic", _Y), ("z", "prismatic", _Z),
+)  # fmt: skip
+MULTI_FREEDOM_TYPES = ("floating", "planar", "spherical")  # types of URDF, and ball joints
 NO_LIMIT = 1e9  # a limit of this magnitude in a file, in any unit, means none
 
 
 def parse_limit(value: float) -> float:
     """Return a limit of a file, infinite if it means none."""
     return math.copysign(math.inf, value) if abs(value) >= NO_LIMIT else value
+
+
+def to_vector(values: np.ndarray) -> Vector:
+    """Return three floats, without negative zeros."""
+    x, y, z = (float(value) + 0.0 for value in values)
+    return x, y, z
 
 
 @dataclass(frozen=True)
@@ -150,13 +171,18 @@ class Tree:
     @property
     def root_link(self) -> str:
         """The link without parent."""
-        children = {joint.child for joint in self.joints.values()}
-        return next(link for link in self.links if link not in children)
+        parent_joints = self.parent_joints
+        return next(link for link in self.links if link not in parent_joints)
 
     @property
     def total_mass(self) -> float:
         """Mass of all links [kg]."""
         return sum(link.inertial.mass for link in self.links.values() if link.inertial)
+
+    @property
+    def parent_joints(self) -> dict[str, Joint]:
+        """By link the joint that carries it."""
+        return {joint.child: joint for joint in self.joints.values()}
 
     def joints_by_parent(self) -> dict[str, list[Joint]]:
         """Return the joints on each link that has child joints."""
@@ -168,14 +194,8 @@ class Tree:
 
     def bodies_by_link(self) -> dict[str, str]:
         """Return by link the first link of its body, to which it is fixed."""
-        parent_joints = {joint.child: joint for joint in self.joints.values()}
-        found: dict[str, str] = {}
-        for link in self.links:
-            body = link
-            while body in parent_joints and not parent_joints[body].is_movable:
-                body = parent_joints[body].parent
-            found[link] = body
-        return found
+        parent_joints = self.parent_joints
+        return {link: body_of(parent_joints, link) for link in self.links}
 
     def with_parts(self, *parts: Link | Joint) -> "Tree":
         """Return the tree with links and joints added, or replaced if the names exist."""
@@ -188,7 +208,75 @@ class Tree:
         return Tree(links, joints)
 
 
+def body_of(parent_joints: Mapping[str, Joint], link: str) -> str:
+    """Return the first link of the body that a link belongs to, see `Tree.parent_joints`."""
+    while link in parent_joints and not parent_joints[link].is_movable:
+        link = parent_joints[link].parent
+    return link
+
+
 def with_rotor_inertias(tree: Tree, rotor_inertias: Mapping[str, float]) -> Tree:
     """Return the tree with rotor inertias [kg m2], [kg] by joint."""
-    joints = (replace(tree.joints[name], rotor_inertia=x) for name, x in rotor_inertias.items())
-    return tree.with_parts(*joints)
+    return tree.with_parts(
+        *(replace(tree.joints[name], rotor_inertia=x) for name, x in rotor_inertias.items())
+    )
+
+
+def joint_freedoms(kind: str, axis: Sequence[float]) -> tuple[Freedom, ...]:
+    """Return the degrees of freedom of a composite joint.
+
+    Args:
+        kind: One of `MULTI_FREEDOM_TYPES`.
+        axis: Normal of the plane of a planar joint.
+    """
+    if kind == "spherical":
+        return _ROTATIONS
+    if kind == "floating":
+        return (*_TRANSLATIONS, *_ROTATIONS)
+    normal = np.asarray(axis, dtype=np.float64)
+    first = np.cross(np.eye(3)[np.argmin(np.abs(normal))], normal)
+    first /= np.linalg.norm(first)
+    return (
+        ("x", "prismatic", to_vector(first)),
+        ("y", "prismatic", to_vector(np.cross(normal, first))),
+        ("rz", "revolute", to_vector(normal)),
+    )
+
+
+def series_joint_names(name: str, freedoms: Sequence[Freedom]) -> list[str]:
+    """Return the names of the joints of a composite joint."""
+    return [f"{name}_{suffix}" for suffix, _, _ in freedoms]
+
+
+def joint_series(
+    name: str,
+    freedoms: Sequence[Freedom],
+    placement: Placement,
+    end_links: tuple[str, str],
+    source_location: str,
+) -> list[Link | Joint]:
+    """Return the joints of a composite joint, and the links between them.
+
+    Args:
+        name: Name of the composite joint.
+        freedoms: Its degrees of freedom, from the parent on.
+        placement: Placement of the first joint in the parent's frame.
+        end_links: Parent and child link.
+        source_location: File and line.
+    """
+    floating_joint = name if tuple(freedoms) == (*_TRANSLATIONS, *_ROTATIONS) else ""
+    links = [end_links[0], *(f"{name}_{i}" for i in range(1, len(freedoms))), end_links[1]]
+    found: list[Link | Joint] = [
+        Link(link, source_location, composite_joint=name) for link in links[1:-1]
+    ]
+    zero = (0.0, 0.0, 0.0)
+    for i, (suffix, kind, axis) in enumerate(freedoms):
+        xyz, rpy = (zero, zero) if i else placement
+        parent, child = links[i : i + 2]
+        found.append(
+            Joint(
+                f"{name}_{suffix}", kind, parent, child, source_location, xyz, rpy, axis,
+                floating_joint=floating_joint,
+            )
+        )  # fmt: skip
+    return found

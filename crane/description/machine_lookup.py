@@ -47,8 +47,7 @@ def example_root() -> Path | None:
         parts = item.parts
         if "robots" in parts:
             file_path = Path(str(item.locate())).resolve()
-            depth = len(parts) - 1 - parts.index("robots")
-            return file_path.parents[depth - 1]
+            return file_path.parents[len(parts) - 2 - parts.index("robots")]
     return None
 
 

@@ -2,11 +2,11 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from difflib import get_close_matches
 from typing import Any
 
-from crane.description.force_elements import AnyForceElement, EndStop, Friction
+from crane.description.force_elements import Friction
 from crane.description.kinematic_tree import Joint, Link, Tree
 from crane.description.machine_lookup import bundled_machines, command_line_arguments
 from crane.description.sensors import (
@@ -68,8 +68,8 @@ def value_at(owner: Any, field_path: FieldPath) -> Any:
     return owner
 
 
-def parameter_paths(spec: MachineSpec) -> dict[str, FieldPath]:
-    """Field paths of all parameters within a description, by name.
+def parameter_paths(spec: Any) -> dict[str, FieldPath]:
+    """Field paths of all parameters within a description or a machine, by name.
 
     Parameters of sensors and the payload mass, which is a function of several values, have none.
     Paths of joints without friction lead to mapping keys that do not exist yet.
@@ -85,16 +85,20 @@ def parameter_paths(spec: MachineSpec) -> dict[str, FieldPath]:
         for joint in joints:
             for field in dataclasses.fields(element_type):
                 paths[f"{section}.{joint}.{field.name}"] = section, joint, field.name
-    for prefix, (section, i, element) in elements_by_prefix(
-        **{section: getattr(spec, section) for section in ELEMENT_FIELDS.values()}
-    ).items():
-        for field in dataclasses.fields(element):
-            if field.name not in ("joint", "between"):
-                paths[f"{prefix}.{field.name}"] = section, i, field.name
+    prefixes: dict[str, int] = {}
+    for prefix, section in ELEMENT_FIELDS.items():
+        for i, element in enumerate(getattr(spec, section)):
+            between = getattr(element, "between", None)
+            label = f"{prefix}.{'-'.join(between) if between else element.joint}"
+            prefixes[label] = prefixes.get(label, 0) + 1
+            if prefixes[label] > 1:
+                label += f"#{prefixes[label]}"
+            for field in dataclasses.fields(element):
+                if field.name not in ("joint", "between"):
+                    paths[f"{label}.{field.name}"] = section, i, field.name
     if spec.hydraulics is not None:
-        components = components_by_prefix(spec.hydraulics)
         for prefix, path in _component_paths(spec.hydraulics).items():
-            for name in parameter_names(type(components[prefix])):
+            for name in parameter_names(type(value_at(spec.hydraulics, path))):
                 if not (prefix.startswith("supply.") and name == "tank"):
                     paths[f"{prefix}.{name}"] = "hydraulics", *path, name
     return paths | {
@@ -131,27 +135,6 @@ def parameters(spec: MachineSpec) -> dict[str, float]:
     return values | payload | pins | sensor_parameters(spec.sensors)
 
 
-def elements_by_prefix(
-    **elements_by_field: Sequence[AnyForceElement | EndStop],
-) -> dict[str, tuple[str, int, AnyForceElement | EndStop]]:
-    """Return force elements and end stops by the prefix of their parameter names.
-
-    Args:
-        elements_by_field: By field of `MachineSpec`: forces, gas_springs, ropes, end_stops.
-
-    Returns:
-        Field, index in the field, and element, by prefix.
-    """
-    found: dict[str, tuple[str, int, AnyForceElement | EndStop]] = {}
-    for prefix, field in ELEMENT_FIELDS.items():
-        for i, element in enumerate(elements_by_field[field]):
-            between = getattr(element, "between", None)
-            name = f"{prefix}.{'-'.join(between) if between else element.joint}"
-            count = sum(other == name or other.startswith(f"{name}#") for other in found)
-            found[f"{name}#{count + 1}" if count else name] = field, i, element
-    return found
-
-
 def _component_paths(hydraulics: Hydraulics) -> dict[str, FieldPath]:
     """Field paths of the components of a circuit by the prefix of their parameter names."""
     paths: dict[str, FieldPath] = {"supply": ("supply",), "oil": ("oil",)}
@@ -166,12 +149,6 @@ def _component_paths(hydraulics: Hydraulics) -> dict[str, FieldPath]:
                 if valve.spool_b
             }
     return paths
-
-
-def components_by_prefix(hydraulics: Hydraulics) -> dict[str, Any]:
-    """Return the components of a circuit by the prefix of their parameter names."""
-    paths = _component_paths(hydraulics)
-    return {prefix: value_at(hydraulics, path) for prefix, path in paths.items()}
 
 
 def unknown_parameter_text(spec: MachineSpec, names: Iterable[str], unknown_name: str) -> str:

@@ -299,9 +299,8 @@ MACHINE = section_schema(
         "source": TextKey("where its parameters come from", default=""),
         "chains": ListKey("open sub-chains", SectionKey(section=CHAIN), default=REQUIRED),
         "floating": NameListKey(
-            "freedoms of the root of the first chain, of "
-            + ", ".join(f"`{x}`" for x in FLOATING_FREEDOMS),
-            default_text="none: fixed to the world",
+            "freedoms of the root of the first chain",
+            choices=FLOATING_FREEDOMS, default_text="none: fixed to the world",
         ),
         "loops": ListKey("joints that close the chains", SectionKey(section=LOOP)),
         "couplings": ListKey("linear constraints of joints", SectionKey(section=COUPLING)),

@@ -13,7 +13,11 @@ from crane.common.plausible_ranges import implausible_value_text
 from crane.common.samples import MAX_COORDINATE, as_number
 from crane.description.external_forces import ExternalForce
 from crane.description.floating_bases import convert_locked_rotations
-from crane.description.force_elements import AnyForceElement, Friction
+from crane.description.force_elements import (
+    AnyForceElement,
+    Friction,
+    as_nonnegative_number,
+)
 from crane.description.kinematic_tree import Joint, Limits, Link, parse_limit
 from crane.description.machine_parameters import (
     PAYLOAD_MASS,
@@ -67,8 +71,9 @@ def apply_parameter_changes(spec: MachineSpec, changes: Mapping[str, float]) -> 
     for name, value in values.items():
         if name not in sensor_changes and paths[name][0] == "hydraulics":
             _warn_about_unit(spec, name, value)
-    sensors = with_sensor_parameters(spec.sensors, sensor_changes)
-    changed = dataclasses.replace(changed, sensors=MappingProxyType(sensors))
+    changed = dataclasses.replace(
+        changed, sensors=MappingProxyType(with_sensor_parameters(spec.sensors, sensor_changes))
+    )
     return _add_payload(changed, payload_mass) if payload_mass else changed
 
 
@@ -83,11 +88,11 @@ def _check_change(
             raise InputError(f"'{name}' is of no quantity of '{spec.name}', {hint}")
     elif name not in names:
         raise InputError(unknown_parameter_text(spec, names, name))
+    if name.endswith((".mass", ".rotor_inertia")):
+        return as_nonnegative_number(
+            new_value, f"parameter '{name}'", "kg" if name.endswith(".mass") else ""
+        )
     value = as_number(new_value, f"parameter '{name}'", "")
-    if name.endswith(".mass") and value < 0:
-        raise InputError(f"parameter '{name}' is {value:g} kg, it must not be negative")
-    if name.endswith(".rotor_inertia") and value < 0:
-        raise InputError(f"parameter '{name}' is {value:g}, it must not be negative")
     if name.startswith(PINS_PREFIX) and value <= 0:
         raise InputError(f"parameter '{name}' is {value:g} N, give a force above 0")
     return value
@@ -131,12 +136,16 @@ def _add_payload(spec: MachineSpec, mass: float) -> MachineSpec:
     tree = spec.tree
     if spec.payload is not None:
         scale = mass / spec.payload.tree.total_mass
-        scaled_parts = (
-            _scale_mass(part, scale) if isinstance(part, Link) else part
-            for part in spec.payload.tree
+        parts: list[Link | Joint] = []
+        for part in spec.payload.tree:
+            if isinstance(part, Link) and (inertial := part.inertial) is not None:
+                tensor = tuple(scale * x for x in inertial.tensor)
+                scaled = dataclasses.replace(inertial, mass=scale * inertial.mass, tensor=tensor)
+                part = dataclasses.replace(part, inertial=scaled)
+            parts.append(part)
+        return dataclasses.replace(
+            spec, tree=tree.with_parts(*parts), chains=((*spec.chains, spec.payload.chain))
         )
-        chains = (*spec.chains, spec.payload.chain)
-        return dataclasses.replace(spec, tree=tree.with_parts(*scaled_parts), chains=chains)
     import pinocchio as pin
 
     from crane.description.pinocchio_conversion import add_rigid_load
@@ -146,17 +155,9 @@ def _add_payload(spec: MachineSpec, mass: float) -> MachineSpec:
         Link("payload", PAYLOAD_MASS),
         Joint("payload_fixed", "fixed", tip, "payload", PAYLOAD_MASS),
     )
-    point_mass = pin.Inertia(mass, np.zeros(3), np.zeros((3, 3)))
-    return dataclasses.replace(spec, tree=add_rigid_load(tree, tip, point_mass))
-
-
-def _scale_mass(link: Link, scale: float) -> Link:
-    """Return a link of another density."""
-    if (inertial := link.inertial) is None:
-        return link
-    tensor = tuple(scale * x for x in inertial.tensor)
-    inertial = dataclasses.replace(inertial, mass=scale * inertial.mass, tensor=tensor)
-    return dataclasses.replace(link, inertial=inertial)
+    return dataclasses.replace(
+        spec, tree=add_rigid_load(tree, tip, pin.Inertia(mass, np.zeros(3), np.zeros((3, 3))))
+    )
 
 
 def lock_joints(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
@@ -176,6 +177,12 @@ def lock_joints(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
     """
     joints = {joint.name: joint for joint in spec.tree.moving_joints}
     spec, lock = convert_locked_rotations(spec, lock)
+    lock = {
+        name: as_number(
+            x, f"the coordinate to lock '{name}' at", "m or rad", max_magnitude=MAX_COORDINATE
+        )
+        for name, x in lock.items()
+    }
     for name in lock.keys() & joints.keys():
         _check_lock_coordinate(joints[name], lock[name])
     lock, couplings = _propagate_locks(spec.couplings, lock)
@@ -313,19 +320,18 @@ def set_active_joints(
     )
 
 
-def _lock_coupled_joints(couplings: list[Coupling], locked: dict[str, float]) -> bool:
-    """Lock joints that a coupling to locked joints determines, and remove such couplings.
-
-    Returns:
-        Whether any joint was locked.
-    """
-    initial_count = len(locked)
-    for coupling in tuple(couplings):
+def _propagate_locks(
+    couplings: tuple[Coupling, ...], lock: Mapping[str, float]
+) -> tuple[dict[str, float], tuple[Coupling, ...]]:
+    """Return the locks with those that couplings imply, and the remaining couplings."""
+    locked, pending, remaining = dict(lock), list(couplings), list(couplings)
+    while pending:
+        coupling = pending.pop(0)
         free = {name: x for name, x in coupling.factors.items() if name not in locked}
         locked_names = coupling.factors.keys() - free.keys()
         if len(free) > 1 or not locked_names:
             continue
-        couplings.remove(coupling)
+        remaining.remove(coupling)
         residual = coupling.offset - sum(
             coupling.factors[name] * locked[name] for name in locked_names
         )
@@ -336,22 +342,7 @@ def _lock_coupled_joints(couplings: list[Coupling], locked: dict[str, float]) ->
                 "them alone"
             )
         locked |= {name: residual / factor for name, factor in free.items()}
-    return len(locked) > initial_count
-
-
-def _propagate_locks(
-    couplings: tuple[Coupling, ...], lock: Mapping[str, float]
-) -> tuple[dict[str, float], tuple[Coupling, ...]]:
-    """Return the locks with those that couplings imply, and the remaining couplings."""
-    locked = {
-        name: as_number(
-            x, f"the coordinate to lock '{name}' at", "m or rad", max_magnitude=MAX_COORDINATE
-        )
-        for name, x in lock.items()
-    }
-    remaining = list(couplings)
-    while _lock_coupled_joints(remaining, locked):
-        pass  # further couplings may determine more joints
+        pending = list(remaining)  # further couplings may determine more joints
     return locked, tuple(
         dataclasses.replace(
             coupling,
@@ -363,14 +354,8 @@ def _propagate_locks(
     )
 
 
-def _check_lock_coordinate(joint: Joint, coordinate: object) -> None:
+def _check_lock_coordinate(joint: Joint, value: float) -> None:
     """Raise if a coordinate [m], [rad] is outside of the limits of a joint."""
-    value = as_number(
-        coordinate,
-        f"the coordinate to lock '{joint.name}' at",
-        "m or rad",
-        max_magnitude=MAX_COORDINATE,
-    )
     lower, upper = joint.limits.lower, joint.limits.upper
     tolerance = _LIMIT_TOLERANCE * max(1.0, abs(value))
     if not lower - tolerance <= value <= upper + tolerance:

@@ -6,13 +6,7 @@ import math
 import numpy as np
 import pinocchio as pin
 
-from crane.description.kinematic_tree import Inertial, Placement, Tree, Vector
-
-
-def to_vector(values: np.ndarray) -> Vector:
-    """Return three floats, without negative zeros."""
-    x, y, z = (float(value) + 0.0 for value in values)
-    return x, y, z
+from crane.description.kinematic_tree import Inertial, Placement, Tree, Vector, to_vector
 
 
 def rotation_from_rpy(rpy: Vector) -> np.ndarray:
@@ -28,8 +22,9 @@ def rotation_from_rpy(rpy: Vector) -> np.ndarray:
         cr * cp * cy + sr * sp * sy,
     )
     length = math.sqrt(x * x + y * y + z * z + w * w)
-    quaternion = pin.Quaternion(w / length, x / length, y / length, z / length)
-    return np.asarray(quaternion.toRotationMatrix())
+    return np.asarray(
+        pin.Quaternion(w / length, x / length, y / length, z / length).toRotationMatrix()
+    )
 
 
 def se3_from_xyz_rpy(xyz: Vector, rpy: Vector) -> pin.SE3:
@@ -61,9 +56,11 @@ def inertial_from_inertia(spatial_inertia: pin.Inertia) -> Inertial | None:
     """Return an inertial along the axes of the link's frame, None without mass."""
     if not spatial_inertia.mass:
         return None
-    tensor = tuple(float(x) + 0.0 for x in spatial_inertia.inertia[np.triu_indices(3)])
     return Inertial(
-        float(spatial_inertia.mass), to_vector(spatial_inertia.lever), (0.0, 0.0, 0.0), tensor
+        float(spatial_inertia.mass),
+        to_vector(spatial_inertia.lever),
+        (0.0, 0.0, 0.0),
+        tuple(float(x) + 0.0 for x in spatial_inertia.inertia[np.triu_indices(3)]),
     )
 
 

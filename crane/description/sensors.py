@@ -17,6 +17,7 @@ import numpy as np
 
 from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array, as_number
+from crane.description.force_elements import as_nonnegative_number
 from crane.description.kinematic_tree import Tree
 
 T = TypeVar("T", float, Array)
@@ -58,9 +59,8 @@ class Sensor:
 
     def __post_init__(self) -> None:
         for name in SENSOR_PARAMETERS:
-            value = as_number(getattr(self, name), f"{name} of a sensor", "")
-            if name in ("delay", "noise") and value < 0:
-                raise InputError(f"{name} of a sensor is {value:g}, it must not be negative")
+            check = as_nonnegative_number if name in ("delay", "noise") else as_number
+            check(getattr(self, name), f"{name} of a sensor", "")
         if self.scale == 0:
             raise InputError("scale of a sensor is 0, which tells nothing, give another")
 
@@ -87,8 +87,9 @@ class Sensor:
             if self.delay:
                 raise signal_delay_error(quantity_name, quantity_name)
             return self.apply(readings)
-        undelayed = np.interp(time + self.delay, time, readings) if self.delay else readings
-        return self.invert(undelayed)
+        return self.invert(
+            np.interp(time + self.delay, time, readings) if self.delay else readings
+        )
 
     def parameters(self) -> dict[str, float]:
         """Return its parameters by the last part of their names."""
@@ -110,17 +111,15 @@ def quantity_unit(tree: Tree, name: str) -> str | None:
         if link_name in tree.links:
             return "rad"
         return "rad/s" if link_name.removesuffix(VELOCITY_SUFFIX) in tree.links else None
-    chambers, spools = ("_a", "_b"), ("", "_b")
     for prefix, unit, suffixes in (
-        (PRESSURE_PREFIX, "Pa", chambers),
-        (VALVE_SIGNAL_PREFIX, "V", spools),
-        ("spool_", "", spools),
+        (PRESSURE_PREFIX, "Pa", ("_a", "_b")),
+        (VALVE_SIGNAL_PREFIX, "V", ("", "_b")),
+        ("spool_", "", ("", "_b")),
     ):
-        for suffix in suffixes:
-            if name.startswith(prefix) and name.endswith(suffix):
-                joint = name[len(prefix) : len(name) - len(suffix)]
-                if joint in joint_units:
-                    return unit
+        if name.startswith(prefix) and any(
+            name == f"{prefix}{joint}{suffix}" for joint in joint_units for suffix in suffixes
+        ):
+            return unit
     return None
 
 

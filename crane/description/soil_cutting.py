@@ -20,6 +20,7 @@ from crane.codegen.symbolic import (
 from crane.common.errors import InputError
 from crane.common.samples import as_number
 from crane.description.external_forces import ExternalForce, FrameMotion
+from crane.description.force_elements import as_nonnegative_number
 from crane.description.ground_contact import DEFAULT_SMOOTHING, Ground
 
 MAX_FRICTION_ANGLE = 1.05  # [rad] of a soil
@@ -53,11 +54,7 @@ class Soil:
     def __post_init__(self) -> None:
         units = ("N/m3", "Pa", "rad", "rad", "Pa", "Pa")
         for field, unit in zip(fields(self), units, strict=True):
-            value = getattr(self, field.name)
-            if as_number(value, f"the {field.name} of the soil", unit) < 0:
-                raise InputError(
-                    f"the {field.name} of the soil is {value:g}, it must not be negative"
-                )
+            as_nonnegative_number(getattr(self, field.name), f"the {field.name} of the soil", unit)
         if self.friction > MAX_FRICTION_ANGLE:
             raise InputError(
                 f"the friction of the soil is {self.friction:g} rad, give at most "
@@ -74,8 +71,7 @@ class Soil:
     @property
     def max_rake(self) -> float:
         """Rake angle that replaces a steeper blade [rad], see `SoilCutting`."""
-        largest_angle = math.pi - self.friction - self.tool_friction - MIN_WEDGE_ANGLE
-        return min(0.5 * math.pi, largest_angle)
+        return min(0.5 * math.pi, math.pi - self.friction - self.tool_friction - MIN_WEDGE_ANGLE)
 
     def cutting_factors(
         self, cosine_rake: Scalar, sine_rake: Scalar
@@ -131,7 +127,7 @@ class Soil:
         """
         slope = math.tan(self.friction)
         logarithm = math.pi * slope + 2.0 * math.asinh(slope)
-        return (math.expm1(logarithm) / slope if slope else math.pi + 2.0), math.exp(logarithm)
+        return math.expm1(logarithm) / slope if slope else math.pi + 2.0, math.exp(logarithm)
 
 
 def _typical_soil(unit_weight: float, cohesion: float, degrees: float, adhesion: float) -> Soil:
@@ -219,9 +215,7 @@ class SoilCutting(ExternalForce):
         self.width = as_number(width, f"the width {label}", "m", greater_than=0)
         self.length = as_number(length, f"the length {label}", "m", greater_than=0)
         self.smoothing = as_number(smoothing, f"the smoothing {label}", "m/s", greater_than=0)
-        self.thickness = as_number(thickness, f"the thickness {label}", "m")
-        if self.thickness < 0:
-            raise InputError(f"the thickness {label} is {thickness:g}, it must not be negative")
+        self.thickness = as_nonnegative_number(thickness, f"the thickness {label}", "m")
         blade_direction = _unit_direction(blade, f"the blade {label}")
         face_normal = _unit_direction(cutting, f"the cutting {label}")
         face_normal = face_normal - (face_normal @ blade_direction) * blade_direction

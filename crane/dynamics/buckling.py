@@ -195,8 +195,7 @@ class Buckling(OneLineRepr):
             raise InputError(
                 f"q_a and tau_a have the shapes {np.shape(q_a)} and {forces.shape}, give the same"
             )
-        active_indices = [active.index(joint) for joint in self.columns]
-        compressive_forces = forces[..., active_indices] * [
+        compressive_forces = forces[..., [active.index(joint) for joint in self.columns]] * [
             column.compression_sign for column in self.columns.values()
         ]
         out = np.full_like(loads, np.inf)
@@ -219,8 +218,7 @@ def _cylinder_column(machine: Machine, cylinder: Cylinder) -> CylinderColumn | s
     if not machine.closure.equations.sign[:, index].any():
         return "it is in no loop, so it has no pin at either end"
     joint = int(machine.coordinates.joints[index])
-    carrier = int(machine.model.parents[joint])
-    for body in (carrier, joint):
+    for body in (int(machine.model.parents[joint]), joint):
         places, turns = (
             zip(*_pins_of_body(machine, body, joint), strict=True) if body else ((), ())
         )

@@ -18,17 +18,15 @@ A cluster is reduced in one of two equivalent ways:
 Accelerations are those of the origin of each body, in the axes of the reference body.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 
-from crane.closure.clusters import Cluster, find_clusters
-from crane.closure.kinematics_formulas import PositionKinematics
-from crane.closure.loop_formulas import LoopFormulas, VelocityKinematics
-from crane.closure.spatial_vectors import (
+from crane.closure.kinematics_formulas import (
     ZERO_VECTOR,
+    PositionKinematics,
     SpatialVector,
     Vector,
     add_spatial,
@@ -37,8 +35,9 @@ from crane.closure.spatial_vectors import (
     shift_wrench,
     spatial_dot,
 )
-from crane.codegen.matrix_factorization import LdltFactorization
-from crane.codegen.symbolic import Scalar, dot
+from crane.closure.loop_equations import Cluster, find_clusters
+from crane.closure.loop_formulas import LoopFormulas, VelocityKinematics
+from crane.codegen.symbolic import LdltFactorization, Scalar, dot, sum_scalars
 from crane.dynamics.spatial_inertia import ClusterMassColumns, SpatialInertia, forward_substitute
 from crane.machine.machine import Machine
 
@@ -88,15 +87,6 @@ class RecursionInput:
         if i not in articulated:
             return inertia, wrench
         return inertia + articulated[i][0], add_spatial(wrench, articulated[i][1])
-
-    def body_acceleration(
-        self, i: int, parent_acceleration: SpatialVector, joint_acceleration: Scalar
-    ) -> SpatialVector:
-        """Acceleration of a body relative to the reference, from that of its parent."""
-        return add_spatial(
-            shift_motion(parent_acceleration, self.kinematics.offsets[i]),
-            scale_spatial(joint_acceleration, self.kinematics.body_motion_axes(i)),
-        )
 
 
 def add_articulated_inertia(
@@ -151,7 +141,7 @@ class ArticulatedCluster:
         self._factorization = LdltFactorization(
             [
                 [
-                    _sum_scalars(
+                    sum_scalars(
                         step.constraint_forces[r] * step.constraint_forces[c] * step.inverse
                         for step in steps
                     )
@@ -162,7 +152,7 @@ class ArticulatedCluster:
         )
         self._constraint_bias = [
             -recursion.velocity_kinematics.acceleration_bias(row)
-            - _sum_scalars(x.constraint_forces[r] * x.net_force * x.inverse for x in steps)
+            - sum_scalars(x.constraint_forces[r] * x.net_force * x.inverse for x in steps)
             for r, row in enumerate(self._loop_rows)
         ]
         columns = self._constraint_wrenches[cluster.base]
@@ -245,13 +235,6 @@ class _ArticulatedJoint:
     inverse: Scalar
     net_force: Scalar
     constraint_forces: Vector
-
-
-def _sum_scalars(numbers: Iterable[Scalar]) -> Scalar:
-    total: Scalar = 0.0
-    for number in numbers:
-        total = total + number
-    return total
 
 
 class ProjectedCluster:
@@ -353,32 +336,23 @@ def plan_recursion(machine: Machine) -> RecursionPlan:
     if len(machine.active) <= _MAX_MOBILITY_WITHOUT_RECURSION:
         return ()
     active = [int(column) + 1 for column in machine.closure.active]
-    light_joints = _light_joints(machine)
+    # joints with next to no articulated inertia of their own, by which their recursion divides
+    data = machine.closure.equations.data  # reused because creating data is expensive
+    mass = pin.crba(machine.model, data, machine.coordinates.configuration(machine.home))
+    pin.cholesky.decompose(machine.model, data)
+    is_light = ~(_LIGHT_INERTIA_RATIO * np.diag(mass) < data.D)
 
     def by_forces(cluster: Cluster) -> bool:
         own, size = len(cluster.own_coordinates(active)), len(cluster.joints)
         if size == 1:
             return True
         # cost grows with the square of the number of equations or coordinates
-        return max(size - own, _MAX_PROJECTED_COORDINATES) < own and not light_joints & set(
-            cluster.joints
-        )
+        is_long = max(size - own, _MAX_PROJECTED_COORDINATES) < own
+        return is_long and not any(is_light[joint - 1] for joint in cluster.joints)
 
     return tuple(
         (cluster, by_forces(cluster)) for cluster in find_clusters(machine.closure.equations)
     )
-
-
-def _light_joints(machine: Machine) -> set[int]:
-    """Joints with next to no articulated inertia of their own.
-
-    Recursion joint by joint divides by this inertia.
-    """
-    model = machine.model
-    data = machine.closure.equations.data  # reused because creating data is expensive
-    mass = pin.crba(model, data, machine.coordinates.configuration(machine.home))
-    pin.cholesky.decompose(model, data)
-    return set((np.flatnonzero(~(_LIGHT_INERTIA_RATIO * np.diag(mass) < data.D)) + 1).tolist())
 
 
 def joint_accelerations(recursion: RecursionInput, plan: RecursionPlan) -> Vector:
@@ -400,8 +374,13 @@ def joint_accelerations(recursion: RecursionInput, plan: RecursionPlan) -> Vecto
         )
     out = list(recursion.reference_accelerations)
     bodies = [ZERO_VECTOR] * len(out)
+    kinematics = recursion.kinematics
     for articulated_cluster in reversed(articulated_clusters):
         for i, rate in articulated_cluster.joint_accelerations(bodies):
-            parent = recursion.kinematics.geometry.parents[i]
-            out[i], bodies[i] = out[i] + rate, recursion.body_acceleration(i, bodies[parent], rate)
+            parent = bodies[kinematics.geometry.parents[i]]
+            out[i] = out[i] + rate
+            bodies[i] = add_spatial(
+                shift_motion(parent, kinematics.offsets[i]),
+                scale_spatial(rate, kinematics.body_motion_axes(i)),
+            )
     return out

@@ -1,7 +1,7 @@
 """Equations of motion and their derivatives as machine code of one machine."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -81,21 +81,8 @@ _ANALYTIC_DERIVATIVES: dict[str, _AnalyticDerivatives] = {
 # before a quantity: its derivatives by q_A, v_A and the second argument
 DERIVATIVES_OF = "derivatives of "
 _FLOAT = np.dtype(np.float64)
-
-
-class _QuantityWorkspace(NamedTuple):
-    """Buffers of one thread that evaluates a quantity.
-
-    Attributes:
-        cursor: Continuation cursor.
-        q: (nq,) last configuration.
-        sample_buffers: For one sample: second argument, v_A and q_A (n,) each, result (size,), and
-            the bound function that evaluates it.
-    """
-
-    cursor: ContinuationCursor
-    q: Array
-    sample_buffers: tuple[Array, Array, Array, Array, BoundFunction]
+# of one sample: second argument, v_A, q_A (n,), result (size,), and what evaluates them
+_SampleBuffers = tuple[Array, Array, Array, Array, BoundFunction]
 
 
 class CompiledQuantity:
@@ -124,41 +111,30 @@ class CompiledQuantity:
         formula_structure: FormulaStructure,
     ):
         fast = self._compiled_closure = machine.closure.compiled_closure
-        self._formula_constants = formula_constants
+        constants = self._constants = fast.geometry.constants, formula_constants
         nq, n = machine.model.nv, len(machine.active)
-        key = (quantity, folding_pattern(constant_pattern), formula_structure)
-        if key not in fast.programs:
-            fast.programs[key] = fast.cached_program(
-                ("quantity", *key),
-                lambda program: _build_quantity(
-                    program, quantity, fast, constant_pattern, n, formula_structure
-                ),
-            )
-        program = self._program = fast.programs[key]
+        program = self._program = fast.cached_program(
+            ("quantity", quantity, folding_pattern(constant_pattern), formula_structure),
+            lambda program: _build_quantity(
+                program, quantity, fast, constant_pattern, n, formula_structure
+            ),
+        )
         result_size = self.size = program.formula_outputs("formula").size
         self._shape = (n,)
 
-        def memory() -> _QuantityWorkspace:
+        def create_workspace() -> tuple[ContinuationCursor, Array, _SampleBuffers]:
             cursor, q, target = fast.new_cursor(), np.zeros(nq), np.zeros(n)
             inputs, out = np.zeros(2 * n), np.zeros(result_size)
-            arrays = (
-                fast.geometry.constants,
-                formula_constants,
-                target,
-                inputs,
-                cursor.state,
-                q,
-                out,
-            )
+            arrays = *constants, target, inputs, cursor.state, q, out
             once = program.bind("once", fast.follow_address, *arrays, fast.tolerances)
-            return _QuantityWorkspace(cursor, q, (inputs[n:], inputs[:n], target, out, once))
+            return cursor, q, (inputs[n:], inputs[:n], target, out, once)
 
-        self._workspace = ThreadLocal(memory)
+        self._workspace = ThreadLocal(create_workspace)
 
     @property
     def cursor(self) -> ContinuationCursor:
         """Continuation cursor of this thread."""
-        return self._workspace.value.cursor
+        return self._workspace.value[0]
 
     def evaluate_sample(self, q_a: Any, v_a: Any, x: Any) -> Array | None:
         """The quantity of one sample, or None where arguments need to be checked first.
@@ -169,7 +145,7 @@ class CompiledQuantity:
             x: (n,), or None if the quantity does not depend on it.
         """
         shape = self._shape
-        second, first, target, out, once = self._workspace.value.sample_buffers
+        second, first, target, out, once = self._workspace.value[2]
         for buffer, array in ((second, x), (first, v_a), (target, q_a)):
             if array is not None:
                 if (
@@ -182,10 +158,21 @@ class CompiledQuantity:
         return out.copy() if once() == 1 else None
 
     def evaluate_closed(self, q: Array, inputs: Array) -> Array:
-        """The quantity at one closed configuration (nq,), inputs [v_A, x] (2 n,)."""
-        out = np.empty(self.size)
-        geometry = self._compiled_closure.geometry.constants
-        self._program.call("formula", geometry, self._formula_constants, q, inputs, out)
+        """The quantity at closed configurations.
+
+        Args:
+            q: (nq,) or (N, nq).
+            inputs: [v_A, x], (2 n,) or (N, 2 n).
+
+        Returns:
+            (size,) or (N, size).
+        """
+        out = np.empty((*q.shape[:-1], self.size))
+        arrays = *self._constants, *map(np.ascontiguousarray, (q, inputs)), out
+        if q.ndim == 1:
+            self._program.call("formula", *arrays)
+        else:
+            self._program.call("closed_each", len(q), *arrays)
         return out
 
     def evaluate_targets(self, targets: Array, inputs: Array, out: Array) -> int:
@@ -194,24 +181,9 @@ class CompiledQuantity:
         Returns:
             Number of evaluated samples.
         """
-        fast, memory = self._compiled_closure, self._workspace.value
-        arrays = (
-            fast.geometry.constants,
-            self._formula_constants,
-            targets,
-            inputs,
-            memory.cursor.state,
-        )
-        return self._program.call(
-            "each", len(targets), fast.follow_address, *arrays, memory.q, out, fast.tolerances
-        )
-
-    def evaluate_closed_stack(self, q: Array, inputs: Array, out: Array) -> None:
-        """The quantity at closed configurations (N, nq), inputs (N, 2 n), into out (N, size)."""
-        geometry = self._compiled_closure.geometry.constants
-        self._program.call(
-            "closed_each", len(q), geometry, self._formula_constants, q, inputs, out
-        )
+        fast, (cursor, q, _) = self._compiled_closure, self._workspace.value
+        arrays = *self._constants, targets, inputs, cursor.state, q, out, fast.tolerances
+        return self._program.call("each", len(targets), fast.follow_address, *arrays)
 
 
 def _build_quantity(
@@ -293,16 +265,11 @@ class CompiledParameterDerivatives:
         geometry_derivatives: Array,
         constant_derivatives: Array,
     ):
-        fast = self._compiled_closure = machine.closure.compiled_closure
-        self._formula_constants, self._geometry_derivatives, self._constant_derivatives = (
-            formula_constants,
-            geometry_derivatives,
-            constant_derivatives,
-        )
-        geometry_changes, constants_change = (
-            np.any(geometry_derivatives != 0, axis=0),
-            np.any(constant_derivatives != 0, axis=0),
-        )
+        fast = machine.closure.compiled_closure
+        self._directions = geometry_derivatives, constant_derivatives
+        self._constants = fast.geometry.constants, formula_constants
+        geometry_changes = np.any(geometry_derivatives != 0, axis=0)
+        constants_change = np.any(constant_derivatives != 0, axis=0)
         folded_constants = (
             np.where(geometry_changes, np.nan, fast.geometry.constants),
             np.where(constants_change, np.nan, constant_pattern),
@@ -320,38 +287,32 @@ class CompiledParameterDerivatives:
         def build(program: Program) -> None:
             tape = Tape()
             q, kinematics, loops = fast.trace_kinematics(tape, 0, 2, folded_constants[0])
-            constants, v_a = (
-                FormulaConstants(tape, 1, folded_constants[1]),
-                tape.load_vector(3, 0, n),
+            constants = FormulaConstants(tape, 1, folded_constants[1])
+            v_a = tape.load_vector(3, 0, n)
+            values = QUANTITIES[quantity](
+                DynamicsFormulas(kinematics, loops, constants, q, v_a, formula_structure),
+                tape.load_vector(3, n, n),
             )
-            sweep = DynamicsFormulas(kinematics, loops, constants, q, v_a, formula_structure)
-            values = QUANTITIES[quantity](sweep, tape.load_vector(3, n, n))
             seeds: dict[int, Scalar] = {}
             for i in np.flatnonzero(geometry_changes).tolist():
                 seeds[tape.load(0, i).index] = tape.load(4, i)
             opened = directional_derivative([row.phi for row in loops.rows], seeds)
-            held: dict[int, list[Scalar]] = {joint: [0.0] for joint in loops.active_joints}
-            moving, _ = loops.solve_passive(held, [[-1.0 * x] for x in opened])
+            moving, _ = loops.solve_passive(
+                {joint: [0.0] for joint in loops.active_joints}, [[-1.0 * x] for x in opened]
+            )
             seeds |= {_tape_index(q[i - 1]): rate for i, (rate,) in moving.items()}
             for i in np.flatnonzero(constants_change).tolist():
                 seeds[tape.load(1, i).index] = tape.load(5, i)
             program.add_formula("formula", 6, directional_derivative(values, seeds))
 
-        if key not in fast.programs:
-            fast.programs[key] = fast.cached_program(key, build)
-        self._program = fast.programs[key]
-        self.result_size = self._program.formula_outputs("formula").size
+        self._program = fast.cached_program(key, build)
 
     def evaluate_closed(self, q: Array, inputs: Array) -> Array:
         """(size, k) at one closed configuration (nq,), inputs [v_A, x] (2 n,)."""
-        out = np.empty((len(self._constant_derivatives), self.result_size))
-        geometry = self._compiled_closure.geometry.constants
-        for row, bent, moved in zip(
-            out, self._geometry_derivatives, self._constant_derivatives, strict=True
-        ):
-            self._program.call(
-                "formula", geometry, self._formula_constants, q, inputs, bent, moved, row
-            )
+        size = self._program.formula_outputs("formula").size
+        out = np.empty((len(self._directions[0]), size))
+        for row, *directions in zip(out, *self._directions, strict=True):
+            self._program.call("formula", *self._constants, q, inputs, *directions, row)
         return out.T
 
 
@@ -388,8 +349,9 @@ def _add_evaluation_routines(program: Program, nq: int, n: int) -> None:
     outputs = program.formula_outputs("formula").size
     with program.add_routine("each", counts=("count",), functions=("follow",), arrays=arrays) as r:
         with r.loop(r.count) as i:
-            target = r.targets.row_pointer(i, n)
-            got = r.call("follow", 1, r.geometry, target, r.cursor, r.q, r.tolerances)
+            got = r.call(
+                "follow", 1, r.geometry, r.targets.row_pointer(i, n), r.cursor, r.q, r.tolerances
+            )
             with r.if_then(got < 1):
                 r.return_value(i)
             out = r.out.row_pointer(i, outputs)

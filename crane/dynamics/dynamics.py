@@ -14,9 +14,7 @@ from crane.common.samples import (
     stack_length,
 )
 from crane.description.external_forces import WRENCH_COMPONENTS
-from crane.dynamics.compiled_dynamics import (
-    WITH_FRICTION,
-)
+from crane.dynamics.compiled_dynamics import DERIVATIVES_OF, WITH_FRICTION
 from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.dynamics.quantity_evaluator import QuantityEvaluator
 
@@ -93,8 +91,9 @@ class Dynamics(QuantityEvaluator):
         Returns:
             tau_A, (n,) or (N, n) [N], [N m].
         """
-        quantity = "inverse with friction" if friction else "inverse"
-        return self._evaluate(quantity, (), q_a, v_a, a_a, "a_a")
+        return self._evaluate(
+            "inverse with friction" if friction else "inverse", (), q_a, v_a, a_a, "a_a"
+        )
 
     def forward(
         self, q_a: ArrayLike, v_a: ArrayLike, tau_a: ArrayLike, friction: bool = False
@@ -111,8 +110,9 @@ class Dynamics(QuantityEvaluator):
         Returns:
             a_A, (n,) or (N, n) [m/s2], [rad/s2].
         """
-        quantity = "forward with friction" if friction else "forward"
-        return self._evaluate(quantity, (), q_a, v_a, tau_a, "tau_a")
+        return self._evaluate(
+            "forward with friction" if friction else "forward", (), q_a, v_a, tau_a, "tau_a"
+        )
 
     def hybrid(
         self, q_a: ArrayLike, v_a: ArrayLike, a_d: ArrayLike, friction: bool = False
@@ -136,8 +136,7 @@ class Dynamics(QuantityEvaluator):
         Source: Featherstone 2008, Rigid Body Dynamics Algorithms, 9.2 (hybrid dynamics); Spong
         1994, Partial feedback linearization of underactuated mechanical systems (collocated).
         """
-        a_a = self.machine.expand_driven(a_d, "a_d")
-        c = self.inverse(q_a, v_a, a_a, friction)
+        c = self.inverse(q_a, v_a, self.machine.expand_driven(a_d, "a_d"), friction)
         driven = self.machine.is_driven
         mass = self.mass_matrix(q_a)
         coupling_block, free_block = (
@@ -337,7 +336,8 @@ class Dynamics(QuantityEvaluator):
         key = quantity.replace("_", " ") + (WITH_FRICTION if friction else "")
         shape, found = self.result_shape(quantity), dict[str, Array]()
         if len(parameters) < len(by):
-            parts = self._argument_derivatives(key, q, inputs).reshape(count, 3, *shape, n)
+            formula = self._required_formula(DERIVATIVES_OF + key)
+            parts = formula.evaluate_closed(q, inputs).reshape(count, 3, *shape, n)
             found = {name: parts[:, i].copy() for i, name in enumerate(arguments) if name in by}
         if parameters:
             every = self._parameter_derivatives_at(key, parameters, q, inputs)
@@ -386,10 +386,9 @@ class Dynamics(QuantityEvaluator):
         )  # comparable: virtual work per 1 rad or characteristic length
         weighted_jacobian = weights[:, None] * np.swapaxes(drive_jacobian, -1, -2)
         inverse = np.linalg.pinv(drive_jacobian @ weighted_jacobian, rcond=1e-12, hermitian=True)
-        joint_forces: Array = np.einsum(
-            "...ij,...jk,...k->...i", weighted_jacobian, inverse, tau_a * units
+        return np.asarray(
+            np.einsum("...ij,...jk,...k->...i", weighted_jacobian, inverse, tau_a * units)
         )
-        return joint_forces
 
     def active_forces(self, q_a: ArrayLike, forces: ArrayLike) -> Array:
         """Active forces from forces of the drives: tau_A = (S gamma)^T u, see `drive_forces`.
@@ -403,8 +402,7 @@ class Dynamics(QuantityEvaluator):
         """
         names = [drive.name for drive in self.machine.drives]
         u = as_samples(forces, len(names), "forces", names)
-        found: Array = np.einsum("...ij,...j->...i", self._drive_jacobian(q_a), u)
-        return found
+        return np.asarray(np.einsum("...ij,...j->...i", self._drive_jacobian(q_a), u))
 
     def _drive_jacobian(self, q_a: ArrayLike) -> Array:
         """B = (S gamma)^T, (n, m) or (N, n, m), of the drives."""
@@ -413,5 +411,4 @@ class Dynamics(QuantityEvaluator):
         for row, drive in zip(lengths, machine.drives, strict=True):
             for joint, factor in drive.factors.items():
                 row[machine.column(joint)] += factor
-        gamma = machine.closure.gamma(machine.closure.solve(q_a))
-        return np.swapaxes(lengths @ gamma, -1, -2)
+        return np.swapaxes(lengths @ machine.closure.gamma(machine.closure.solve(q_a)), -1, -2)

@@ -14,16 +14,16 @@ and those of the wrench f = I A + V x* I V = I A + B V of a body are
 
 with sums over the points r of the body (Singh, Russell, Wensing 2022, equations (39) to (46), have
 the same for open trees, with other signs and names). The columns include the derivatives of gamma
-(`crane.closure.gamma_derivatives`). Joints of one cluster (`crane.closure.clusters`) move with its
-own coordinates only: sums over bodies are taken by cluster, with all bodies beyond as one inertia.
+(`crane.closure.gamma_derivatives`). Joints of one cluster (`crane.closure.loop_equations`) move
+with its own coordinates only: sums over bodies are taken by cluster, with all bodies beyond as one
+inertia.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
-from crane.closure.gamma_derivatives import BodyMotions, GammaDerivatives, JointRates
-from crane.closure.spatial_vectors import (
+from crane.closure.gamma_derivatives import BodyMotions, GammaDerivatives
+from crane.closure.kinematics_formulas import (
     SpatialVector,
     Vector,
     add_spatial,
@@ -32,8 +32,8 @@ from crane.closure.spatial_vectors import (
     spatial_dot,
 )
 from crane.codegen.differentiation import directional_derivative
-from crane.codegen.matrix_factorization import LdltFactorization
 from crane.codegen.symbolic import (
+    LdltFactorization,
     Scalar,
     SymbolicExpression,
     add_vectors,
@@ -41,32 +41,11 @@ from crane.codegen.symbolic import (
     dot_products,
     scale_vector,
     subtract_vectors,
+    sum_scalars,
     transpose,
 )  # fmt: skip
 from crane.dynamics.dynamics_formulas import DynamicsFormulas
 from crane.dynamics.spatial_inertia import MassMoments, Matrix
-
-
-@dataclass(frozen=True)
-class _CoordinateEffect:
-    """Derivatives of inverse dynamics by one coordinate, within its cluster and on its carrier.
-
-    Attributes:
-        joint_forces_by_q: Derivative of the forces along the cluster's joints by the coordinate,
-            by joint, without the part in `wrench_shifts`.
-        joint_forces_by_v: Half of their derivative by the coordinate's velocity.
-        wrench_shifts: By joint, derivative of the wrench that rotates with it.
-        base_wrench_by_q: Derivative of the wrench on the carrier of the cluster by the coordinate.
-        base_wrench_by_v: Half of its derivative by the coordinate's velocity.
-        transposed_product: B^T J_j of all bodies.
-    """
-
-    joint_forces_by_q: JointRates
-    joint_forces_by_v: JointRates
-    wrench_shifts: dict[int, SpatialVector]
-    base_wrench_by_q: SpatialVector
-    base_wrench_by_v: SpatialVector
-    transposed_product: Vector
 
 
 class DynamicsDerivatives:
@@ -155,13 +134,11 @@ class DynamicsDerivatives:
             for j in own:
                 wrenches = self._unit_acceleration_wrenches[j]
                 for k in [k for k in own if k <= j]:
-                    total: Scalar = 0.0
-                    for i in cluster.joints:
-                        force = (
-                            spatial_dot(self._joint_axes[i], wrenches[i]) + rotors[i] * gamma[i][j]
-                        )
-                        total = total + gamma[i][k] * force
-                    out[k][j] = out[j][k] = total
+                    out[k][j] = out[j][k] = sum_scalars(
+                        gamma[i][k]
+                        * (spatial_dot(self._joint_axes[i], wrenches[i]) + rotors[i] * gamma[i][j])
+                        for i in cluster.joints
+                    )
                 for k, body in self._carrying_coordinates(c):
                     out[k][j] = out[j][k] = spatial_dot(twists[k][body], wrenches[cluster.base])
         return out
@@ -202,11 +179,10 @@ class DynamicsDerivatives:
                 twist_derivatives[j] = gamma_derivatives.twist_derivatives(
                     cluster, j, axis_derivatives, second[j]
                 )
-                effect = self._coordinate_effect(
-                    c, j, twist_derivatives[j], subtree_wrenches, second[j]
-                )
-                self._add_cluster_block(c, j, effect, required_joint_forces, by_q, by_v)
-                self._add_carrier_blocks(c, j, effect, twist_derivatives, by_q, by_v)
+                self._add_coordinate(
+                    c, j, twist_derivatives, second[j], subtree_wrenches, required_joint_forces,
+                    by_q, by_v,
+                )  # fmt: skip
                 force_derivatives = self._joint_force_derivatives(c, j, forces)
                 for k in range(self._n):
                     column = [formulas.gamma[i][k] for i in range(1, size)]
@@ -243,112 +219,89 @@ class DynamicsDerivatives:
             )
         return out
 
-    def _coordinate_effect(
-        self,
-        cluster_index: int,
-        coordinate: int,
-        twist_derivatives: tuple[BodyMotions, BodyMotions],
-        subtree_wrenches: Mapping[int, SpatialVector],
-        second_time_derivative: Mapping[int, Scalar],
-    ) -> "_CoordinateEffect":
-        """Effect of one of a cluster's coordinates on the bodies of the cluster."""
-        formulas, cluster, (rate, twice) = (
-            self._formulas,
-            self._gamma_derivatives.clusters[cluster_index],
-            twist_derivatives,
-        )
-        by_q: dict[int, SpatialVector] = {}
-        by_v: dict[int, SpatialVector] = {}
-        wrench_shifts: dict[int, SpatialVector] = {}
-        turned: Vector = [0.0] * 3
-        for i in cluster.joints:
-            moments, twist = self._lumped_moments[i], self._gamma_derivatives.twists[coordinate][i]
-            by_q[i] = add_spatial(
-                moments.inertial_wrench(twice[i]),
-                moments.velocity_wrench(scale_vector(2.0, rate[i][1])),
-            )
-            by_v[i] = add_spatial(
-                moments.inertial_wrench(rate[i]), moments.velocity_wrench(twist[1])
-            )
-            wrench_shifts[i] = scale_spatial(
-                formulas.gamma[i][coordinate],
-                cross_wrench(self._joint_axes[i], subtree_wrenches[i]),
-            )
-            turned = add_vectors(turned, moments.transposed_velocity_product(twist))
-        by_q, by_v = (
-            self._accumulate_wrenches(cluster_index, by_q),
-            self._accumulate_wrenches(cluster_index, by_v),
-        )
-        first = self._gamma_derivatives.first[coordinate]
-        return _CoordinateEffect(
-            {
-                i: spatial_dot(self._joint_axes[i], by_q[i])
-                + formulas.rotor_inertias[i] * second_time_derivative[i]
-                for i in cluster.joints
-            },
-            {
-                i: spatial_dot(self._joint_axes[i], by_v[i])
-                + formulas.rotor_inertias[i] * first[i]
-                for i in cluster.joints
-            },
-            wrench_shifts,
-            add_spatial(by_q[cluster.base], *wrench_shifts.values()),
-            by_v[cluster.base],
-            turned,
-        )
-
-    def _add_cluster_block(
+    def _add_coordinate(
         self,
         cluster_index: int,
         j: int,
-        effect: "_CoordinateEffect",
+        twist_derivatives: Mapping[int, tuple[BodyMotions, BodyMotions]],
+        second_time_derivative: Mapping[int, Scalar],
+        subtree_wrenches: Mapping[int, SpatialVector],
         required_joint_forces: Vector,
         by_q: Matrix,
         by_v: Matrix,
     ) -> None:
-        """Add the entries of coordinates of the same cluster, with the derivative of gamma."""
-        gamma, gamma_derivatives = self._formulas.gamma, self._gamma_derivatives
-        joints = gamma_derivatives.clusters[cluster_index].joints
-        for k in gamma_derivatives.own[cluster_index]:
-            row = [gamma[i][k] for i in joints]
-            partial_derivative = gamma_derivatives.partial_derivatives.get(
-                (min(k, j), max(k, j)), {}
-            )
-            by_q[k][j] = dot(row, [effect.joint_forces_by_q[i] for i in joints])
-            by_q[k][j] = by_q[k][j] + dot(
-                [required_joint_forces[i] for i in partial_derivative],
-                list(partial_derivative.values()),
-            )
-            for i in joints:
-                by_q[k][j] = by_q[k][j] + spatial_dot(
-                    gamma_derivatives.twists[k][i], effect.wrench_shifts[i]
-                )
-            by_v[k][j] = 2.0 * dot(row, [effect.joint_forces_by_v[i] for i in joints])
+        """Add the derivatives by coordinate j of a cluster, and those by the ones that carry it.
 
-    def _add_carrier_blocks(
-        self,
-        cluster_index: int,
-        j: int,
-        effect: "_CoordinateEffect",
-        twist_derivatives: Mapping[int, tuple[BodyMotions, BodyMotions]],
-        by_q: Matrix,
-        by_v: Matrix,
-    ) -> None:
-        """Add the entries of coordinates that carry the cluster."""
-        wrench = self._unit_acceleration_wrenches[j][
-            self._gamma_derivatives.clusters[cluster_index].base
-        ]
+        Args:
+            cluster_index: The cluster.
+            j: One of its coordinates.
+            twist_derivatives: J_k' and J_k'' of the coordinates up to j.
+            second_time_derivative: gamma_j'' by joint.
+            subtree_wrenches: By joint, the wrench that accelerates all bodies beyond it.
+            required_joint_forces: (nb + 1,) forces of drives at all joints.
+            by_q: (n, n) derivatives of tau_A by q_A.
+            by_v: (n, n) derivatives of tau_A by v_A.
+        """
+        formulas, gamma_derivatives = self._formulas, self._gamma_derivatives
+        gamma, cluster = formulas.gamma, gamma_derivatives.clusters[cluster_index]
+        rate, twice = twist_derivatives[j]
+        wrenches_by_q: dict[int, SpatialVector] = {}
+        half_wrenches_by_v: dict[int, SpatialVector] = {}
+        wrench_shifts: dict[int, SpatialVector] = {}  # of the wrench that rotates with a joint
+        transposed_product: Vector = [0.0] * 3  # B^T J_j of all bodies
+        for i in cluster.joints:
+            moments, twist = self._lumped_moments[i], gamma_derivatives.twists[j][i]
+            wrenches_by_q[i] = add_spatial(
+                moments.inertial_wrench(twice[i]),
+                moments.velocity_wrench(scale_vector(2.0, rate[i][1])),
+            )
+            half_wrenches_by_v[i] = add_spatial(
+                moments.inertial_wrench(rate[i]), moments.velocity_wrench(twist[1])
+            )
+            wrench_shifts[i] = scale_spatial(
+                gamma[i][j], cross_wrench(self._joint_axes[i], subtree_wrenches[i])
+            )
+            transposed_product = add_vectors(
+                transposed_product, moments.transposed_velocity_product(twist)
+            )
+        wrenches_by_q = self._accumulate_wrenches(cluster_index, wrenches_by_q)
+        half_wrenches_by_v = self._accumulate_wrenches(cluster_index, half_wrenches_by_v)
+        forces_by_q, half_forces_by_v = (
+            [
+                spatial_dot(self._joint_axes[i], wrenches[i])
+                + formulas.rotor_inertias[i] * gamma_rates[i]
+                for i in cluster.joints
+            ]
+            for wrenches, gamma_rates in (
+                (wrenches_by_q, second_time_derivative),
+                (half_wrenches_by_v, gamma_derivatives.first[j]),
+            )
+        )
+        base_wrench = add_spatial(wrenches_by_q[cluster.base], *wrench_shifts.values())
+        for k in gamma_derivatives.own[cluster_index]:
+            row = [gamma[i][k] for i in cluster.joints]
+            bent = gamma_derivatives.partial_derivatives.get((min(k, j), max(k, j)), {})
+            by_q[k][j] = dot(row, forces_by_q)
+            by_q[k][j] = by_q[k][j] + dot(
+                [required_joint_forces[i] for i in bent], list(bent.values())
+            )
+            for i in cluster.joints:
+                by_q[k][j] = by_q[k][j] + spatial_dot(
+                    gamma_derivatives.twists[k][i], wrench_shifts[i]
+                )
+            by_v[k][j] = 2.0 * dot(row, half_forces_by_v)
+        wrench = self._unit_acceleration_wrenches[j][cluster.base]
         for k, body in self._carrying_coordinates(cluster_index):
-            twist = self._gamma_derivatives.twists[k][body]
-            rate, twice = (motions[body] for motions in twist_derivatives[k])
-            by_q[k][j] = by_q[k][j] + spatial_dot(twist, effect.base_wrench_by_q)
-            by_v[k][j] = by_v[k][j] + 2.0 * spatial_dot(twist, effect.base_wrench_by_v)
+            twist = gamma_derivatives.twists[k][body]
+            rate_k, twice_k = (motions[body] for motions in twist_derivatives[k])
+            by_q[k][j] = by_q[k][j] + spatial_dot(twist, base_wrench)
+            by_v[k][j] = by_v[k][j] + 2.0 * spatial_dot(twist, half_wrenches_by_v[cluster.base])
             by_q[j][k] = (
                 by_q[j][k]
-                + spatial_dot(twice, wrench)
-                + 2.0 * dot(effect.transposed_product, rate[1])
+                + spatial_dot(twice_k, wrench)
+                + 2.0 * dot(transposed_product, rate_k[1])
             )
-            back = spatial_dot(rate, wrench) + dot(effect.transposed_product, twist[1])
+            back = spatial_dot(rate_k, wrench) + dot(transposed_product, twist[1])
             by_v[j][k] = by_v[j][k] + 2.0 * back
 
     def forward_dynamics_derivatives(self, tau: Sequence[Scalar]) -> tuple[Matrix, Matrix, Matrix]:

@@ -9,11 +9,11 @@ from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass
 
-from crane.closure.spatial_vectors import (
+from crane.closure.kinematics_formulas import (
     Vector,
 )
-from crane.codegen.matrix_factorization import LdltFactorization
 from crane.codegen.symbolic import (
+    LdltFactorization,
     Scalar,
     add_vectors,
     apply_function,
@@ -32,8 +32,8 @@ from crane.dynamics.cluster_recursion import (
     joint_accelerations,
 )
 from crane.dynamics.inertial_force_formulas import InertialForceFormulas
-from crane.dynamics.joint_force_formulas import SLIP_INDEX, friction_sign
-from crane.dynamics.joint_forces import REST_ACCELERATION, REST_VELOCITY
+from crane.dynamics.joint_force_formulas import friction_sign
+from crane.dynamics.joint_forces import REST_ACCELERATION, REST_VELOCITY, SLIP_INDEX
 
 # degrees of freedom up to which factorizing M_A takes fewer operations than recursion
 _MAX_MOBILITY_FACTORIZED = 7
@@ -138,9 +138,9 @@ class DynamicsFormulas(InertialForceFormulas):
             *_flatten_by_row(map(self._rotate_to_world, jacobian)),
         ]
         out += [mass + self._fixed_inertia[0], *self.passive_force]
-        if self._tip_point is None or self.formula_structure.tip_body is None:
-            return out
         body = self.formula_structure.tip_body
+        if body is None:
+            return out
         point = add_vectors(
             kinematics.origin[body], matvec(kinematics.rotation[body], self._tip_point)
         )
@@ -263,12 +263,11 @@ class DynamicsFormulas(InertialForceFormulas):
             s * v * p for s, v, p in zip(slip_signs, velocities, inverse_velocities, strict=True)
         ]
         if not with_joints_at_rest:
-            none: Vector = [0.0] * len(laws)
             return StickSlipAccelerations(
                 self.forward_dynamics(tau, True),
-                none,
+                [0.0] * len(laws),
                 self.friction_force,
-                _minimum(slip_velocities),
+                minimum(1.0, *slip_velocities),
             )
         rows = [self.gamma[i + 1] for i in self._stick_slip_columns]
         right = self._net_force(tau)
@@ -287,7 +286,7 @@ class DynamicsFormulas(InertialForceFormulas):
             where_positive(w - 0.5, one, other)
             for w, one, other in zip(is_held, remaining_limit, slip_velocities, strict=True)
         ]
-        any_held = 1.0 - _minimum([1.0 - w for w in is_held])  # whether any is held
+        any_held = 1.0 - minimum(1.0, *[1.0 - w for w in is_held])  # whether any is held
         # of held joints, or a share of the limit, or all of it besides held joints
         at_rest = [
             where_positive(
@@ -313,7 +312,7 @@ class DynamicsFormulas(InertialForceFormulas):
             a_a,
             at_rest,
             add_vectors(self.friction_force, holding_active_forces),
-            _minimum(margins),
+            minimum(1.0, *margins),
         )
 
     def _holding_forces(
@@ -374,9 +373,8 @@ class DynamicsFormulas(InertialForceFormulas):
         for i in sorted(
             set(range(1, self._body_count)) - self.kinematics.geometry.massless_bodies
         ):
-            turn = self.kinematics.geometry.body_rotations[i]
             axes = matmul(
-                self.kinematics.rotation[i], turn.T.tolist()
+                self.kinematics.rotation[i], self.kinematics.geometry.body_rotations[i].T.tolist()
             )  # columns: axes of the joint
             local = list(zip(*axes, strict=True))  # rows: reference body to joint
             origin = self.kinematics.origin[i]
@@ -390,8 +388,13 @@ class DynamicsFormulas(InertialForceFormulas):
             w, e, at = matvec(local, w), matvec(local, e), matvec(local, at)
             for k in range(self._mobility):
                 linear, angular = self._body_jacobians[i][k]
-                u = matvec(local, add_vectors(linear, cross(angular, origin)))
-                out[k] += _body_regressor_row(u, matvec(local, angular), w, e, at)
+                out[k] += _body_regressor_row(
+                    matvec(local, add_vectors(linear, cross(angular, origin))),
+                    matvec(local, angular),
+                    w,
+                    e,
+                    at,
+                )
         for i, row in sorted(self.gamma.items()):
             if self.rotor_inertias[i] != 0.0:
                 rate = dot(row, a_a) + self.drift[i]
@@ -403,14 +406,6 @@ class DynamicsFormulas(InertialForceFormulas):
 def _flatten_by_row(columns: Iterable[Vector]) -> Vector:
     """The entries of a matrix (3, n) given by columns, row by row."""
     return [entry for row in zip(*columns, strict=True) for entry in row]
-
-
-def _minimum(values: Sequence[Scalar]) -> Scalar:
-    """The least value, at most 1."""
-    out: Scalar = 1.0
-    for value in values:
-        out = minimum(out, value)
-    return out
 
 
 def _body_regressor_row(u: Vector, r: Vector, w: Vector, e: Vector, a: Vector) -> Vector:
@@ -425,5 +420,8 @@ def _body_regressor_row(u: Vector, r: Vector, w: Vector, e: Vector, a: Vector) -
             return r[j] * e[j] + s[j] * w[j]
         return r[j] * e[k] + r[k] * e[j] + s[j] * w[k] + s[k] * w[j]
 
-    pairs = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
-    return [dot(u, a), *first, *(entry(j, k) for j, k in pairs)]
+    return [
+        dot(u, a),
+        *first,
+        *(entry(j, k) for j, k in ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))),
+    ]

@@ -4,9 +4,8 @@ from collections.abc import Hashable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import pinocchio as pin
 
-from crane.closure.spatial_vectors import Vector
+from crane.closure.kinematics_formulas import Vector
 from crane.codegen import PythonCallback, SymbolicExpression, Tape
 from crane.codegen.symbolic import (
     Scalar,
@@ -22,7 +21,7 @@ from crane.codegen.symbolic import (
 from crane.common.samples import Array
 from crane.description.external_forces import WRENCH_COMPONENTS, ExternalForce, FrameMotion
 from crane.dynamics.dynamics_formulas import DynamicsFormulas
-from crane.dynamics.frame_jacobians import FrameJacobians
+from crane.dynamics.frame_jacobians import FrameJacobians, frame_placement
 from crane.machine.machine import Machine
 
 _CALLBACK_INPUT_SIZE = 19  # inputs of a Python function
@@ -86,8 +85,7 @@ def formula_key(machine: Machine) -> Hashable:
         machine.external_forces, reference_counts(machine.external_forces), strict=True
     ):
         tape = Tape()
-        parts = (tape.load_vector(i, 0, 3) for i in range(3))
-        place, velocity, spin = parts
+        place, velocity, spin = (tape.load_vector(i, 0, 3) for i in range(3))
         turn = [tape.load_vector(3, 3 * row, 3) for row in range(3)]
         references_and_states = (
             tape.load_vector(4, 0, count),
@@ -103,9 +101,14 @@ def formula_key(machine: Machine) -> Hashable:
                 force.state_rates(here),
             )  # fmt: skip
         ]
-        joint, pose = _frame_placement(machine, force)
-        shape = count, force.state_count
-        out.append((repr((shape, tape.operations, outputs)), joint, pose.homogeneous.tobytes()))
+        joint, pose = frame_placement(machine, force.frame)
+        out.append(
+            (
+                repr(((count, force.state_count), tape.operations, outputs)),
+                joint,
+                pose.homogeneous.tobytes(),
+            )
+        )
     return tuple(out)
 
 
@@ -135,11 +138,13 @@ def trace_external_forces(
     for force, count in zip(
         machine.external_forces, reference_counts(machine.external_forces), strict=True
     ):
-        joint, pose = _frame_placement(machine, force)
+        joint, pose = frame_placement(machine, force.frame)
         body = machine.coordinates.body_of_joint[joint]
         turn = geometry.body_rotations[body].T
-        arm = matvec(kinematics.rotation[body], (turn @ pose.translation).tolist())
-        at = add_vectors(kinematics.origin[body], arm)
+        at = add_vectors(
+            kinematics.origin[body],
+            matvec(kinematics.rotation[body], (turn @ pose.translation).tolist()),
+        )
         axes = matmul(kinematics.rotation[body], (turn @ pose.rotation).tolist())
         carriers = geometry.supporting_bodies(body)
         velocity: Vector = [0.0] * 3
@@ -164,11 +169,10 @@ def trace_external_forces(
         first += count
         state_rates += force.state_rates(here)
         if not force.is_traceable:
-            axes_ = [x for row in here.rotation for x in row]
             callback_inputs += [
                 here.reference[0],
                 *here.position,
-                *axes_,
+                *[x for row in here.rotation for x in row],
                 *here.velocity,
                 *here.angular_velocity,
             ]
@@ -216,9 +220,9 @@ class ExternalForceCallback(PythonCallback):
     def _evaluate_forces(self, inputs: Array, references: Array) -> None:
         for k, (force, place) in enumerate(self._reference_slices):
             x = inputs[_CALLBACK_INPUT_SIZE * k : _CALLBACK_INPUT_SIZE * (k + 1)].tolist()
-            turn = [x[4:7], x[7:10], x[10:13]]
-            here = FrameMotion(x[1:4], turn, x[13:16], x[16:], x[:1])
-            push, moment = force.wrench(here)
+            push, moment = force.wrench(
+                FrameMotion(x[1:4], [x[4:7], x[7:10], x[10:13]], x[13:16], x[16:], x[:1])
+            )
             references[place] = np.array([*push, *moment], dtype=np.float64)
 
 
@@ -280,9 +284,3 @@ def static_active_forces(machine: Machine, q: Array) -> Array:
         0.0, q, still, none
     )
     return np.asarray(machine.closure.gamma(q).T @ applied.generalized_forces)
-
-
-def _frame_placement(machine: Machine, force: ExternalForce) -> tuple[int, pin.SE3]:
-    """Pinocchio's joint that moves a force's frame, and the placement of the frame in it."""
-    frame = machine.model.frames[machine.frame(force.frame)]
-    return int(frame.parentJoint), frame.placement

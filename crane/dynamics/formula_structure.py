@@ -4,20 +4,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.closure.kinematics_formulas import (
-    TreeGeometry,
-)
+from crane.closure.kinematics_formulas import TreeGeometry
+from crane.codegen import Layout
 from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array
-from crane.dynamics.cluster_recursion import (
-    RecursionPlan,
-    plan_recursion,
-)
-from crane.dynamics.joint_force_formulas import LAW_SIZE, SLIP_INDEX, DistanceBodies
-from crane.dynamics.joint_forces import JointForces
+from crane.dynamics.cluster_recursion import RecursionPlan, plan_recursion
+from crane.dynamics.frame_jacobians import frame_placement
+from crane.dynamics.joint_forces import LAW_SIZE, SLIP_INDEX, JointForces
 from crane.machine.machine import Machine
 
 BODY_SIZE = 10  # inertia constants of a body
+DISTANCE_SIZE = LAW_SIZE + 6  # constants of a distance: law, attachment points
 _UPPER_TRIANGLE = np.triu_indices(3)
 FORMULATIONS = ("exact", "decoupled")
 
@@ -53,7 +50,7 @@ def carrier_bodies(machine: Machine, formulation: str) -> tuple[int, ...]:
 
 
 def dynamics_constants(machine: Machine, geometry: TreeGeometry, forces: JointForces) -> Array:
-    """Inertias, force laws and gravity in the order in which `DynamicsFormulas` reads them.
+    """Inertias, force laws and gravity, see `FormulaStructure.constants_layout`.
 
     Per body mass, COM (3), inertia about it (xx, xy, xz, yy, yz, zz) in the axes of the geometry;
     per joint the 22 values of `JointForces.table`; gravity (3); per joint its rotor inertia; per
@@ -67,8 +64,13 @@ def dynamics_constants(machine: Machine, geometry: TreeGeometry, forces: JointFo
             bodies.append([0.0] * BODY_SIZE)
             continue
         turn, inertia = geometry.body_rotations[i], machine.model.inertias[int(joint)]
-        tensor = turn.T @ inertia.inertia @ turn
-        bodies.append([inertia.mass, *(turn.T @ inertia.lever), *tensor[_UPPER_TRIANGLE]])
+        bodies.append(
+            [
+                inertia.mass,
+                *(turn.T @ inertia.lever),
+                *(turn.T @ inertia.inertia @ turn)[_UPPER_TRIANGLE],
+            ]
+        )
     gravity = machine.model.gravity.linear
     rotors = machine.model.armature
     joint_laws, distance_laws = np.split(forces.table, [len(bodies)])
@@ -77,8 +79,7 @@ def dynamics_constants(machine: Machine, geometry: TreeGeometry, forces: JointFo
         turns = (
             geometry.body_rotations[machine.coordinates.body_of_joint[joint]] for joint, _ in ends
         )
-        places = (turn.T @ place for turn, (_, place) in zip(turns, ends, strict=True))
-        numbers += [law, *places]
+        numbers += [law, *(turn.T @ place for turn, (_, place) in zip(turns, ends, strict=True))]
     numbers += [
         [forces.moving_factor],
         forces.circuit_friction[list(forces.circuit_friction_columns)],
@@ -86,34 +87,10 @@ def dynamics_constants(machine: Machine, geometry: TreeGeometry, forces: JointFo
     fixed_inertia = machine.model.inertias[0]
     numbers += [[fixed_inertia.mass], fixed_inertia.mass * fixed_inertia.lever]
     if machine.tip is not None:
-        body, place = tip_body_and_point(machine)
-        numbers.append(geometry.body_rotations[body].T @ place)
+        joint, placement = frame_placement(machine, machine.tip)
+        turn = geometry.body_rotations[machine.coordinates.body_of_joint[joint]]
+        numbers.append(turn.T @ placement.translation)
     return np.concatenate(numbers)
-
-
-def tip_body_and_point(machine: Machine) -> tuple[int, Array]:
-    """The body of a machine's tip, and the point on it (3,) [m]."""
-    assert machine.tip is not None
-    frame = machine.model.frames[machine.frame(machine.tip)]
-    return machine.coordinates.body_of_joint[frame.parentJoint], np.array(
-        frame.placement.translation
-    )
-
-
-def circuit_friction_indices(machine: Machine, forces: JointForces) -> list[int]:
-    """Indices in `dynamics_constants` of what `JointForces.set_circuit_friction` sets."""
-    first = stick_slip_mode_indices(machine, forces)[-1] + 1
-    return list(range(first, first + len(forces.circuit_friction_columns)))
-
-
-def stick_slip_mode_indices(machine: Machine, forces: JointForces) -> list[int]:
-    """Indices in `dynamics_constants` of the values of `JointForces.set_stick_slip_modes`."""
-    bodies = machine.model.nv
-    first = BODY_SIZE * bodies + SLIP_INDEX
-    last = (
-        (BODY_SIZE + LAW_SIZE + 1) * bodies + 3 + (LAW_SIZE + 6) * len(forces.lengths.end_points)
-    )
-    return [first + LAW_SIZE * i + k for i in forces.sticking for k in range(3)] + [last]
 
 
 @dataclass(frozen=True)
@@ -124,7 +101,8 @@ class FormulaStructure:
         carrier_bodies: See `carrier_bodies`.
         recursion_plan: How forward dynamics reduces the machine's clusters; see
             `crane.dynamics.cluster_recursion`.
-        distance_bodies: Bodies of the two ends of each distance of `JointForces.lengths`.
+        distance_bodies: Bodies of the two ends of each distance of `JointForces.lengths`; 0 is the
+            world.
         stick_slip_columns: Columns of the joints with stick-slip friction.
         circuit_friction_columns: Columns of the joints with circuit friction.
         tip_body: Body of the tip, if there is one.
@@ -132,7 +110,7 @@ class FormulaStructure:
 
     carrier_bodies: tuple[int, ...]
     recursion_plan: RecursionPlan
-    distance_bodies: DistanceBodies
+    distance_bodies: tuple[tuple[int, int], ...]
     stick_slip_columns: tuple[int, ...]
     circuit_friction_columns: tuple[int, ...]
     tip_body: int | None
@@ -150,5 +128,24 @@ class FormulaStructure:
         spans = ((bodies[one], bodies[two]) for (one, _), (two, _) in forces.lengths.end_points)
         plan = plan_recursion(machine) if formulation == "exact" else ()
         kinds = forces.sticking, forces.circuit_friction_columns
-        tip = None if machine.tip is None else tip_body_and_point(machine)[0]
+        tip = None if machine.tip is None else bodies[frame_placement(machine, machine.tip)[0]]
         return cls(carrier_bodies(machine, formulation), plan, tuple(spans), *kinds, tip)
+
+    @property
+    def constants_layout(self) -> Layout:
+        """Layout of `dynamics_constants`."""
+        bodies, distances = len(self.carrier_bodies) - 1, len(self.distance_bodies)
+        return Layout(
+            inertias=BODY_SIZE * bodies, joint_laws=LAW_SIZE * bodies, gravity=3,
+            rotor_inertias=bodies, distances=DISTANCE_SIZE * distances, moving_factor=1,
+            circuit_friction=len(self.circuit_friction_columns), fixed_inertia=4,
+            tip_point=0 if self.tip_body is None else 3,
+        )  # fmt: skip
+
+    @property
+    def stick_slip_mode_indices(self) -> list[int]:
+        """Indices in `dynamics_constants` of the values of `JointForces.set_stick_slip_modes`."""
+        layout = self.constants_layout
+        first = layout.start_index("joint_laws") + SLIP_INDEX
+        modes = [first + LAW_SIZE * i + k for i in self.stick_slip_columns for k in range(3)]
+        return [*modes, layout.start_index("moving_factor")]

@@ -10,6 +10,12 @@ from crane.common.threads import ThreadLocal
 from crane.machine.machine import Machine
 
 
+def frame_placement(machine: Machine, link: str) -> tuple[int, pin.SE3]:
+    """Pinocchio's joint that moves a link's frame, and the placement of the frame in it."""
+    frame = machine.model.frames[machine.frame(link)]
+    return int(frame.parentJoint), frame.placement.copy()
+
+
 class FrameJacobians:
     """Poses and Jacobians of links at one configuration at a time.
 
@@ -27,12 +33,13 @@ class FrameJacobians:
 
     def set_configuration(self, q: Array) -> None:
         """Evaluate at a configuration (nq,), in this thread."""
-        configuration = self._machine.coordinates.configuration(q)
-        pin.computeJointJacobians(self._model, self._data, configuration)
+        pin.computeJointJacobians(
+            self._model, self._data, self._machine.coordinates.configuration(q)
+        )
 
     def frame_origins(self, q: Array, links: Sequence[str]) -> Array:
         """Origins (N, k, 3) of k links' frames in the world, at configurations (N, nq) [m]."""
-        placements = [self._frame_placement(link) for link in links]
+        placements = [frame_placement(self._machine, link) for link in links]
         joints = [joint for joint, _ in placements]
         local_origins = np.array([placement.translation for _, placement in placements]).reshape(
             -1, 3
@@ -51,19 +58,15 @@ class FrameJacobians:
 
     def frame_pose(self, link: str) -> pin.SE3:
         """Pose of a link's frame in the world."""
-        joint, placement = self._frame_placement(link)
+        joint, placement = frame_placement(self._machine, link)
         return self._data.oMi[joint] * placement
 
     def jacobian(self, link: str) -> Array:
         """(6, nv) Jacobian of a frame's origin and angular velocity, in the world's axes."""
-        joint, placement = self._frame_placement(link)
+        joint, placement = frame_placement(self._machine, link)
         if not joint:
             return np.zeros((6, self._model.nv))
         return point_jacobian(self._model, self._data, joint, placement.translation)
-
-    def _frame_placement(self, link: str) -> tuple[int, pin.SE3]:
-        frame = self._model.frames[self._machine.frame(link)]
-        return int(frame.parentJoint), frame.placement
 
 
 def point_jacobian(model: pin.Model, data: pin.Data, joint: int, point: Array) -> Array:
@@ -110,13 +113,9 @@ class FrameDistances:
 
     def __init__(self, machine: Machine, pairs: Sequence[FramePair]):
         self.pairs, self._coordinates = tuple(pairs), machine.coordinates
-        frames = machine.model.frames
+        placements = [[frame_placement(machine, link) for link in pair] for pair in self.pairs]
         self.end_points = [
-            [
-                (int(frames[i].parentJoint), frames[i].placement.translation.copy())
-                for i in map(machine.frame, pair)
-            ]
-            for pair in self.pairs
+            [(joint, placement.translation) for joint, placement in pair] for pair in placements
         ]
         if self.pairs:
             self._model = pin.Model(machine.model)
@@ -137,8 +136,9 @@ class FrameDistances:
         if not count:
             return lengths, jacobians
         for i in np.ndindex(q.shape[:-1]):
-            configuration = self._coordinates.configuration(q[i])
-            pin.computeJointJacobians(self._model, self._workspace.value, configuration)
+            pin.computeJointJacobians(
+                self._model, self._workspace.value, self._coordinates.configuration(q[i])
+            )
             for k, (one, two) in enumerate(self.end_points):
                 (p1, j1), (p2, j2) = self._point(*one), self._point(*two)
                 vector = p2 - p1

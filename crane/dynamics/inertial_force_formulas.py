@@ -1,17 +1,16 @@
-"""Inertial and gravity forces, mass matrix and energies as symbolic formulas."""
+"""Inertial and gravity forces, mass matrix, energies and hybrid dynamics as symbolic formulas."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 
-from crane.closure.kinematics_formulas import FormulaConstants, PositionKinematics
-from crane.closure.loop_formulas import LoopFormulas, VelocityKinematics
-from crane.closure.spatial_vectors import (
+from crane.closure.kinematics_formulas import (
     SpatialVector,
     Vector,
     rotation_matrix,
     rotation_vector_derivative,
 )
 from crane.codegen.symbolic import (
+    LdltFactorization,
     Scalar,
     add_vectors,
     cross,
@@ -20,74 +19,14 @@ from crane.codegen.symbolic import (
     matvec,
     scale_vector,
     subtract_vectors,
+    sum_scalars,
 )  # fmt: skip
-from crane.dynamics.formula_structure import BODY_SIZE, FormulaStructure
-from crane.dynamics.joint_force_formulas import LAW_SIZE, JointForceFormulas
-from crane.dynamics.spatial_inertia import CompositeMassMatrix
+from crane.dynamics.joint_force_formulas import JointForceFormulas
+from crane.dynamics.spatial_inertia import composite_mass_matrix
 
 
 class InertialForceFormulas(JointForceFormulas):
     """Symbolic inertial forces and energies; base class of `DynamicsFormulas`."""
-
-    def __init__(
-        self,
-        kinematics: PositionKinematics,
-        loops: LoopFormulas,
-        constants: FormulaConstants,
-        q: Sequence[Scalar],
-        v_a: Sequence[Scalar],
-        formula_structure: FormulaStructure,
-        use_modes: bool = False,
-        drift: Vector | None = None,
-    ):
-        self.formula_structure, self._use_modes = formula_structure, use_modes
-        self._distance_bodies = formula_structure.distance_bodies
-        self._stick_slip_columns = formula_structure.stick_slip_columns
-        self.v_a = list(v_a)
-        self.kinematics, self.loops, self.q = kinematics, loops, q
-        self._body_count = len(kinematics.geometry.parents)
-        self._mobility = len(v_a)
-        bodies = self._body_count - 1
-        self._inertia_constants = [
-            constants.vector(BODY_SIZE * i, BODY_SIZE) for i in range(bodies)
-        ]
-        first = BODY_SIZE * bodies
-        self._joint_laws = [
-            constants.vector(first + LAW_SIZE * i, LAW_SIZE) for i in range(bodies)
-        ]
-        gravity = constants.vector((BODY_SIZE + LAW_SIZE) * bodies)
-        self._gravity = matvec(kinematics.rotation[0], gravity)
-        self.rotor_inertias: Vector = [
-            0.0,
-            *constants.vector((BODY_SIZE + LAW_SIZE) * bodies + 3, bodies),
-        ]
-        after = (BODY_SIZE + LAW_SIZE + 1) * bodies + 3
-        self._distance_constants = [
-            constants.vector(after + (LAW_SIZE + 6) * k, LAW_SIZE + 6)
-            for k in range(len(formula_structure.distance_bodies))
-        ]
-        last = after + (LAW_SIZE + 6) * len(formula_structure.distance_bodies)
-        self._moving_factor = constants[last]
-        self.circuit_friction = constants.vector(
-            last + 1, len(formula_structure.circuit_friction_columns)
-        )
-        last += len(formula_structure.circuit_friction_columns)
-        self._fixed_inertia = constants.vector(last + 1, 4)
-        self._tip_point = (
-            None if formula_structure.tip_body is None else constants.vector(last + 5)
-        )
-        self.gamma = loops.gamma
-        self.joint_velocities: Vector = [
-            0.0,
-            *(dot(self.gamma[i], v_a) for i in range(1, self._body_count)),
-        ]
-        # the drift of the loops is that of the whole machine in both formulations
-        tree_velocities, carrier_velocities = (
-            VelocityKinematics(kinematics, loops, self.joint_velocities, self._gravity, parents)
-            for parents in (kinematics.geometry.parents, formula_structure.carrier_bodies)
-        )
-        self.drift = tree_velocities.drift if drift is None else drift
-        self._tree_velocities, self._carrier_velocities = tree_velocities, carrier_velocities
 
     @cached_property
     def _body_jacobians(self) -> list[list[tuple[Vector, Vector]]]:
@@ -135,27 +74,20 @@ class InertialForceFormulas(JointForceFormulas):
             for origin, (mass, lever, tensor) in zip(origins, self._body_inertias, strict=True)
         ]
 
-    def _centre_of_mass_jacobian(self, i: int) -> list[tuple[Vector, Vector]]:
-        """Columns of body i: linear at its COM, angular."""
-        _, centre, _ = self.body_inertias[i - 1]
-        return [
-            (add_vectors(v, cross(w, centre)), w)
-            for v, w in self._body_jacobians[i][: self._mobility]
-        ]
-
     @cached_property
     def mass_matrix(self) -> list[Vector]:
         """M_A = sum J_b^T I_b J_b + sum gamma_i^T I_r,i gamma_i."""
         if self.formula_structure.recursion_plan:
             clusters = [cluster for cluster, _ in self.formula_structure.recursion_plan]
             masses, rotors = self._body_inertias, self.rotor_inertias
-            return CompositeMassMatrix(
-                self.kinematics, self.loops, masses, rotors, clusters
-            ).mass_matrix
+            return composite_mass_matrix(self.kinematics, self.loops, masses, rotors, clusters)
         out: list[Vector] = [[0.0] * self._mobility for _ in range(self._mobility)]
         for i in range(1, self._body_count):
-            mass, _, tensor = self.body_inertias[i - 1]
-            columns = self._centre_of_mass_jacobian(i)
+            mass, centre, tensor = self.body_inertias[i - 1]
+            columns = [  # linear at the COM, angular
+                (add_vectors(v, cross(w, centre)), w)
+                for v, w in self._body_jacobians[i][: self._mobility]
+            ]
             for k, (v, w) in enumerate(columns):
                 momentum, spin = scale_vector(mass, v), matvec(tensor, w)
                 for j in range(k + 1):
@@ -177,8 +109,10 @@ class InertialForceFormulas(JointForceFormulas):
         out: Vector = [0.0] * self._body_count
         for i in range(self._body_count - 1, 0, -1):
             force, moment = forces[i - 1], moments[i - 1]
-            axis = self.kinematics.joint_axis(i)
-            out[i] = dot(axis, moment if self.kinematics.geometry.is_revolute[i] else force)
+            out[i] = dot(
+                self.kinematics.joint_axis(i),
+                moment if self.kinematics.geometry.is_revolute[i] else force,
+            )
             carrier = self.formula_structure.carrier_bodies[i]
             if carrier:
                 arm = self.kinematics.offsets[i]
@@ -229,13 +163,12 @@ class InertialForceFormulas(JointForceFormulas):
 
     def _inertial_joint_forces(self, joint_accelerations: Sequence[Scalar]) -> Vector:
         """Joint forces (nb + 1,) for joint accelerations (nb + 1,), weights included."""
-        rotor_inertias = [
+        rotor_forces = [
             inertia * rate
             for inertia, rate in zip(self.rotor_inertias, joint_accelerations, strict=True)
         ]
-        return add_vectors(
-            self._propagate_wrenches(self.body_wrenches(joint_accelerations)), rotor_inertias
-        )
+        bodies = self._propagate_wrenches(self.body_wrenches(joint_accelerations))
+        return add_vectors(bodies, rotor_forces)
 
     @cached_property
     def inertial_bias(self) -> Vector:
@@ -245,10 +178,14 @@ class InertialForceFormulas(JointForceFormulas):
     @cached_property
     def gravity_force(self) -> Vector:
         """gamma^T g(q)."""
-        wrenches: list[SpatialVector] = [
-            (scale_vector(-mass, self._gravity), [0.0] * 3) for mass, _, _ in self._body_inertias
-        ]
-        return self.project(self._propagate_wrenches(wrenches))
+        return self.project(
+            self._propagate_wrenches(
+                [
+                    (scale_vector(-mass, self._gravity), [0.0] * 3)
+                    for mass, _, _ in self._body_inertias
+                ]
+            )
+        )
 
     @property
     def coordinate_derivatives(self) -> Vector:
@@ -273,9 +210,9 @@ class InertialForceFormulas(JointForceFormulas):
     @property
     def rate_jacobian(self) -> list[Vector]:
         """d(rates)/dv_A (nb, n), zero for floating bases."""
-        flying = {i + k for i in self.kinematics.geometry.floating_bases for k in range(6)}
+        floating = self.kinematics.geometry.floating_bodies
         none: Vector = [0.0] * self._mobility
-        return [none if i in flying else self.gamma[i] for i in range(1, self._body_count)]
+        return [none if i in floating else self.gamma[i] for i in range(1, self._body_count)]
 
     @cached_property
     def kinetic(self) -> Scalar:
@@ -294,10 +231,49 @@ class InertialForceFormulas(JointForceFormulas):
     @cached_property
     def potential(self) -> Scalar:
         """Weights, springs, constant forces, gas, end stops, ropes [J]."""
-        total: Scalar = 0.0
-        for found in self._law_values:
-            total = total + found.stored_energy
+        total = sum_scalars(found.stored_energy for found in self._law_values)
         for mass, centre, _ in self.body_inertias:
-            height = subtract_vectors(centre, self.kinematics.origin[0])
-            total = total - mass * dot(self._gravity, height)
+            total = total - mass * dot(
+                self._gravity, subtract_vectors(centre, self.kinematics.origin[0])
+            )
         return total
+
+
+def hybrid_dynamics(
+    inverse: Callable[[Sequence[Scalar], bool], Vector],
+    driven: Sequence[bool],
+    a_d: Sequence[Scalar],
+    friction: bool,
+) -> tuple[Vector, Vector]:
+    """`Dynamics.hybrid` from a function of inverse dynamics, for numbers or formulas.
+
+    Columns of M_A are differences of inverse dynamics, which share all but the accelerations.
+
+    Args:
+        inverse: (a_A (n,), friction) -> tau_A (n,).
+        driven: (n,) whether a joint is driven.
+        a_d: (k,) accelerations of the driven joints [m/s2], [rad/s2].
+        friction: Whether friction is included.
+
+    Returns:
+        Forces (k,) of the driven joints and accelerations (n - k,) of the others.
+    """
+    n, given = len(driven), iter(a_d)
+    forces_without_free_motion = inverse(
+        [next(given) if moved else 0.0 for moved in driven], friction
+    )
+    free = [i for i in range(n) if not driven[i]]
+    if not free:
+        return forces_without_free_motion, []
+    bias = inverse([0.0] * n, False)
+    columns = [
+        subtract_vectors(inverse([float(k == i) for k in range(n)], False), bias) for i in free
+    ]
+    a_f = LdltFactorization([[column[i] for column in columns] for i in free]).solve(
+        [-forces_without_free_motion[i] for i in free]
+    )
+    tau = add_vectors(
+        forces_without_free_motion,
+        *(scale_vector(a, column) for a, column in zip(a_f, columns, strict=True)),
+    )
+    return [x for x, moved in zip(tau, driven, strict=True) if moved], a_f

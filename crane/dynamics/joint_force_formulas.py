@@ -5,11 +5,11 @@ from functools import cached_property
 from typing import NamedTuple
 
 from crane.closure.kinematics_formulas import (
+    FormulaConstants,
     PositionKinematics,
-)
-from crane.closure.spatial_vectors import (
     Vector,
 )
+from crane.closure.loop_formulas import LoopFormulas, VelocityKinematics
 from crane.codegen.symbolic import (
     Scalar,
     add_vectors,
@@ -20,16 +20,12 @@ from crane.codegen.symbolic import (
     maximum,
     scale_vector,
     subtract_vectors,
+    sum_scalars,
     where_positive,
 )  # fmt: skip
+from crane.dynamics.formula_structure import BODY_SIZE, DISTANCE_SIZE, FormulaStructure
 from crane.dynamics.frame_jacobians import MIN_LENGTH
-
-# bodies of both ends of each distance; 0 is the world
-DistanceBodies = tuple[tuple[int, int], ...]
-LAW_SIZE = 22  # values of a law, see `JointForces.table`
-_SHARPNESS_INDEX = 4
-SLIP_INDEX = 7  # first of the stick-slip mode: slip sign, is held, inverse velocity
-END_STOP_INDEX = 14  # first of the end stop: stiffness, damping, lower, upper limit
+from crane.dynamics.joint_forces import END_STOP_INDEX, LAW_SIZE, SHARPNESS_INDEX, SLIP_INDEX
 
 
 class ForceLawValues(NamedTuple):
@@ -65,7 +61,7 @@ def friction_sign(law: Vector, velocity: Scalar, has_stick_slip: bool, use_modes
     if has_stick_slip:
         negative_sign = where_positive(-1.0 * velocity, -1.0, 0.0)
         return law[SLIP_INDEX] if use_modes else where_positive(velocity, 1.0, negative_sign)
-    return apply_function("tanh", law[_SHARPNESS_INDEX] * velocity)
+    return apply_function("tanh", law[SHARPNESS_INDEX] * velocity)
 
 
 def evaluate_force_law(
@@ -128,32 +124,64 @@ def evaluate_force_law(
 
 
 class JointForceFormulas:
-    """Symbolic forces along joints and distances; base class of `DynamicsFormulas`.
+    """Symbolic forces along joints and distances; base class of `DynamicsFormulas`."""
 
-    Attributes: See `DynamicsFormulas`, which sets them.
-    """
+    def __init__(
+        self,
+        kinematics: PositionKinematics,
+        loops: LoopFormulas,
+        constants: FormulaConstants,
+        q: Sequence[Scalar],
+        v_a: Sequence[Scalar],
+        formula_structure: FormulaStructure,
+        use_modes: bool = False,
+        drift: Vector | None = None,
+    ):
+        self.formula_structure, self._use_modes = formula_structure, use_modes
+        self._stick_slip_columns = formula_structure.stick_slip_columns
+        self.v_a = list(v_a)
+        self.kinematics, self.loops, self.q = kinematics, loops, q
+        self._body_count = len(kinematics.geometry.parents)
+        self._mobility = len(v_a)
+        layout = formula_structure.constants_layout
 
-    kinematics: PositionKinematics
-    gamma: dict[int, Vector]
-    q: Sequence[Scalar]
-    joint_velocities: Vector
-    _mobility: int
-    _body_count: int
-    _use_modes: bool
-    _joint_laws: list[Vector]
-    _distance_constants: list[Vector]
-    _distance_bodies: DistanceBodies
-    _stick_slip_columns: tuple[int, ...]
+        def load(part: str) -> Vector:
+            return constants.vector(layout.start_index(part), layout.parts[part])
+
+        def load_rows(part: str, size: int) -> list[Vector]:
+            values = load(part)
+            return [values[i : i + size] for i in range(0, len(values), size)]
+
+        self._inertia_constants = load_rows("inertias", BODY_SIZE)
+        self._joint_laws = load_rows("joint_laws", LAW_SIZE)
+        self._gravity = matvec(kinematics.rotation[0], load("gravity"))
+        self.rotor_inertias: Vector = [0.0, *load("rotor_inertias")]
+        self._distance_constants = load_rows("distances", DISTANCE_SIZE)
+        (self._moving_factor,) = load("moving_factor")
+        self.circuit_friction = load("circuit_friction")
+        self._fixed_inertia, self._tip_point = load("fixed_inertia"), load("tip_point")
+        self.gamma = loops.gamma
+        self.joint_velocities: Vector = [
+            0.0,
+            *(dot(self.gamma[i], v_a) for i in range(1, self._body_count)),
+        ]
+        # the drift of the loops is that of the whole machine in both formulations
+        tree_velocities, carrier_velocities = (
+            VelocityKinematics(kinematics, loops, self.joint_velocities, self._gravity, parents)
+            for parents in (kinematics.geometry.parents, formula_structure.carrier_bodies)
+        )
+        self.drift = tree_velocities.drift if drift is None else drift
+        self._tree_velocities, self._carrier_velocities = tree_velocities, carrier_velocities
 
     @cached_property
     def _joint_law_values(self) -> list[ForceLawValues]:
         """Values of the force laws of all joints (nb + 1,)."""
         every = zip(self._joint_laws, self.q, self.joint_velocities[1:], strict=True)
         sticking = self._stick_slip_columns
-        laws = (
-            evaluate_force_law(*x, i in sticking, self._use_modes) for i, x in enumerate(every)
-        )
-        return [NO_FORCE, *laws]
+        return [
+            NO_FORCE,
+            *(evaluate_force_law(*x, i in sticking, self._use_modes) for i, x in enumerate(every)),
+        ]
 
     @cached_property
     def _distance_law_values(self) -> list[tuple[dict[int, Scalar], ForceLawValues, Scalar]]:
@@ -164,7 +192,9 @@ class JointForceFormulas:
         affected.
         """
         kinematics, out = self.kinematics, []
-        for bodies, numbers in zip(self._distance_bodies, self._distance_constants, strict=True):
+        for bodies, numbers in zip(
+            self.formula_structure.distance_bodies, self._distance_constants, strict=True
+        ):
             law, places = numbers[:LAW_SIZE], (numbers[LAW_SIZE:-3], numbers[-3:])
             one, two = (
                 add_vectors(kinematics.origin[body], matvec(kinematics.rotation[body], place))
@@ -262,10 +292,7 @@ class JointForceFormulas:
     @property
     def dissipated_power(self) -> Scalar:
         """Power dissipated by friction, dampers, end stops and ropes [W]."""
-        total: Scalar = 0.0
-        for found in self._law_values:
-            total = total + found.dissipated_power
-        return total
+        return sum_scalars(found.dissipated_power for found in self._law_values)
 
     def project(self, joint_forces: Sequence[Scalar]) -> Vector:
         """gamma^T of forces along the joints (nb + 1,)."""

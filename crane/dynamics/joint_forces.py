@@ -20,10 +20,14 @@ _LAW_FIELDS = (
     "stop_stiffness", "stop_damping", "lower_limit", "upper_limit",
     "gas_force", "gas_area_per_volume", "gas_rest_position", "gas_exponent",
 )  # fmt: skip
-_MODE_FIELDS = slice(_LAW_FIELDS.index("slip_sign"), _LAW_FIELDS.index("inverse_velocity") + 1)
+LAW_SIZE = len(_LAW_FIELDS)  # values of a law, see `JointForces.table`
+SHARPNESS_INDEX = _LAW_FIELDS.index("sharpness")
+SLIP_INDEX = _LAW_FIELDS.index("slip_sign")  # first of the stick-slip mode
+END_STOP_INDEX = _LAW_FIELDS.index("stop_stiffness")  # first of the end stop
+_MODE_FIELDS = slice(SLIP_INDEX, _LAW_FIELDS.index("inverse_velocity") + 1)
 _SPRING_FIELDS = slice(_LAW_FIELDS.index("stiffness"), _LAW_FIELDS.index("energy_offset") + 1)
-_END_STOP_FIELDS = slice(_LAW_FIELDS.index("stop_stiffness"), _LAW_FIELDS.index("upper_limit") + 1)
-_GAS_FIELDS = slice(_LAW_FIELDS.index("gas_force"), len(_LAW_FIELDS))
+_END_STOP_FIELDS = slice(END_STOP_INDEX, _LAW_FIELDS.index("upper_limit") + 1)
+_GAS_FIELDS = slice(_LAW_FIELDS.index("gas_force"), LAW_SIZE)
 # for joints with circuit friction only, so that friction is never zero
 MIN_COULOMB_FRICTION = 1e-6
 REST_VELOCITY = 5e-10  # scaled velocity that counts as rest
@@ -63,14 +67,15 @@ class JointForces:
     def __init__(self, machine: Machine):
         rows, pairs = _table_rows(machine)
         self._joint_count, self.lengths = machine.model.nv, FrameDistances(machine, pairs)
-        law_table = self.table = np.zeros((self._joint_count + len(pairs), len(_LAW_FIELDS)))
+        law_table = self.table = np.zeros((self._joint_count + len(pairs), LAW_SIZE))
         self.sticking, self.moving_factor = find_stick_slip_columns(machine), 1.0
         self.circuit_friction_columns, self.circuit_friction = (
             find_circuit_friction_columns(machine),
             np.zeros(self._joint_count),
         )
-        friction_laws = dict.fromkeys(machine.joints, Friction()) | dict(machine.friction)
-        for joint, friction in friction_laws.items():
+        for joint, friction in (
+            dict.fromkeys(machine.joints, Friction()) | dict(machine.friction)
+        ).items():
             column = machine.column(joint)
             only_circuit_friction = column in self.sticking and not friction.has_stick_slip
             law_table[column, :7] = (
@@ -135,15 +140,16 @@ class JointForces:
     def _joint_breakaway(self) -> Array:
         """The same without circuit friction."""
         law = self.table[list(self.sticking)]
-        limits: Array = (
+        return np.asarray(
             law[:, _LAW_FIELDS.index("coulomb")] + law[:, _LAW_FIELDS.index("stiction")]
         )
-        return limits
 
     def friction_at_rest(self, limit_share: Array) -> Array:
         """(k,) friction of stick-slip joints at rest, from shares (k,) of its limit."""
-        offset: Array = self.table[list(self.sticking), _LAW_FIELDS.index("coulomb_offset")]
-        return offset + limit_share * self.breakaway
+        return (
+            self.table[list(self.sticking), _LAW_FIELDS.index("coulomb_offset")]
+            + limit_share * self.breakaway
+        )
 
     @property
     def stick_slip_modes(self) -> tuple[Array, Array, Array]:
@@ -186,12 +192,13 @@ class JointForces:
         Returns:
             (nv,) [N], [N m].
         """
-        law = self.table[: self._joint_count].T
-        coulomb, coulomb_offset, viscous, viscous_offset, sharpness, stiction, stribeck = law[:7]
+        coulomb, coulomb_offset, viscous, viscous_offset, sharpness, stiction, stribeck = (
+            self.table[: self._joint_count].T[:7]
+        )
         sign = np.tanh(v * sharpness)
         if use_modes:
             stick_slip = list(self.sticking)
-            sign[stick_slip] = self.table[stick_slip, _LAW_FIELDS.index("slip_sign")]
+            sign[stick_slip] = self.table[stick_slip, SLIP_INDEX]
             coulomb = coulomb + self.circuit_friction
         stick_slip_columns = stiction * np.exp(-((v * stribeck) ** 2))
         return (
@@ -326,8 +333,13 @@ def find_stick_slip_columns(machine: Machine) -> tuple[int, ...]:
     """
     laws = machine.friction.items()
     found = {machine.column(joint) for joint, law in laws if law.has_stick_slip}
-    smoothed = {machine.column(joint) for joint, law in laws if law.smoothing}
-    return tuple(sorted(found | set(find_circuit_friction_columns(machine)) - smoothed))
+    return tuple(
+        sorted(
+            found
+            | set(find_circuit_friction_columns(machine))
+            - {machine.column(joint) for joint, law in laws if law.smoothing}
+        )
+    )
 
 
 def find_circuit_friction_columns(machine: Machine) -> tuple[int, ...]:

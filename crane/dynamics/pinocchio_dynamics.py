@@ -1,7 +1,7 @@
 """Equations of motion by Pinocchio's algorithms on the spanning tree, projected by gamma."""
 
 from collections.abc import Iterator, Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +10,7 @@ import pinocchio as pin
 from crane.common.errors import MechanismError
 from crane.common.samples import Array, solve_linear
 from crane.common.threads import ThreadLocal
-from crane.dynamics.frame_jacobians import point_jacobian
+from crane.dynamics.frame_jacobians import frame_placement, point_jacobian
 from crane.dynamics.joint_forces import REST_VELOCITY, JointForces
 from crane.machine.machine import Machine
 
@@ -69,23 +69,6 @@ class _Subtree:
         self.data = self.model.createData()
 
 
-class _TreeWorkspace:
-    """Data of one thread that evaluates a quantity.
-
-    Args:
-        model: The tree.
-        body_groups: Bodies that carry each other, by group.
-
-    Attributes:
-        data: Data of the tree.
-        subtrees: Models of the groups and their data.
-    """
-
-    def __init__(self, model: pin.Model, body_groups: Sequence[Sequence[int]]):
-        self.data = model.createData()
-        self.subtrees = [_Subtree(model, bodies) for bodies in body_groups]
-
-
 class PinocchioDynamics:
     """Quantities of `QUANTITIES` at a closed configuration, by Pinocchio's algorithms.
 
@@ -103,33 +86,26 @@ class PinocchioDynamics:
         self._rotor_columns = np.flatnonzero(self._armature)
         self._closure, self._joint_forces = machine.closure, forces
         self._coordinates, self._carrier_bodies = machine.coordinates, carrier_bodies
-        self._tip_point: tuple[int, Array] | None = None
-        if machine.tip is not None:
-            frame = self._model.frames[machine.frame(machine.tip)]
-            self._tip_point = int(frame.parentJoint), np.array(frame.placement.translation)
+        self._tip = None if machine.tip is None else frame_placement(machine, machine.tip)
 
     @cached_property
-    def _workspace(self) -> ThreadLocal[_TreeWorkspace]:
-        return ThreadLocal(
-            partial(_TreeWorkspace, self._model, self._group_bodies(self._carrier_bodies))
-        )
-
-    def _group_bodies(self, carrier_bodies: Sequence[int]) -> list[list[int]]:
-        """Groups of bodies that carry each other, a parent before its children."""
-        joints = [0, *self._coordinates.joints.tolist()]
-        roots: dict[int, list[int]] = {}
+    def _workspace(self) -> ThreadLocal[tuple[pin.Data, list[_Subtree]]]:
+        """Data of the tree, and the subtrees of bodies that carry each other, a parent first."""
+        model, joints = self._model, [0, *self._coordinates.joints.tolist()]
+        groups: dict[int, list[int]] = {}
         root_of = {0: 0}
-        for body in range(1, self._model.njoints):
-            carrier = joints[carrier_bodies[self._model.joints[body].idx_v + 1]]
+        for body in range(1, model.njoints):
+            carrier = joints[self._carrier_bodies[model.joints[body].idx_v + 1]]
             root_of[body] = root_of[carrier] or body
-            roots.setdefault(root_of[body], []).append(body)
-        return list(roots.values())
+            groups.setdefault(root_of[body], []).append(body)
+        return ThreadLocal(
+            lambda: (model.createData(), [_Subtree(model, bodies) for bodies in groups.values()])
+        )
 
     @property
     def inertial_parameters(self) -> Array:
         """See `Dynamics.parameters`."""
-        inertias = list(self._model.inertias)[1:]
-        bodies = [inertia.toDynamicParameters() for inertia in inertias]
+        bodies = [inertia.toDynamicParameters() for inertia in list(self._model.inertias)[1:]]
         return np.concatenate([*bodies, self._armature[self._rotor_columns]])
 
     def evaluate(self, quantity: str, q: Array, v_a: Array, x: Array) -> Array:
@@ -150,10 +126,13 @@ class PinocchioDynamics:
             case "inverse" | "inverse with friction":
                 a = gamma @ x + state.drift
                 friction = quantity.endswith("friction")
-                start = self._joint_forces.breakaway_forces(v, a) if friction else np.zeros_like(v)
-                return self._inverse_dynamics(state, a, friction) + gamma.T @ start
+                return self._inverse_dynamics(state, a, friction) + gamma.T @ (
+                    self._joint_forces.breakaway_forces(v, a) if friction else np.zeros_like(v)
+                )
             case "forward" | "forward with friction":
-                return self._forward_dynamics(state, x, quantity.endswith("friction"))
+                friction = quantity.endswith("friction")
+                bias = self._inverse_dynamics(state, state.drift, friction)
+                return self._solve_mass_matrix(state, x - bias)
             case "mass matrix":
                 return self._mass_matrix(state).ravel()
             case "bias":
@@ -168,8 +147,13 @@ class PinocchioDynamics:
                 return self._kinetic_and_potential_energy(state)
             case "rates":
                 a_a, _, margin, _ = self._accelerations_with_stick_slip(state, x)
-                rates = self._coordinates.coordinate_derivatives(q, v)
-                return np.concatenate([rates, a_a, [self._dissipated_power(state), margin]])
+                return np.concatenate(
+                    [
+                        self._coordinates.coordinate_derivatives(q, v),
+                        a_a,
+                        [self._dissipated_power(state), margin],
+                    ]
+                )
             case "observation":
                 _, joint_friction, _, holding_forces = self._accelerations_with_stick_slip(
                     state, x
@@ -208,23 +192,21 @@ class PinocchioDynamics:
     def _static_quantities(self, state: ClosedState) -> Array:
         """See `DynamicsFormulas.static_quantities`."""
         q, gamma = state.q, state.gamma
-        model, data = self._model, self._workspace.value.data
+        model, (data, _) = self._model, self._workspace.value
         jacobian = pin.jacobianCenterOfMass(model, data, self._coordinates.configuration(q), False)
         still, moving = model.inertias[0], data.mass[0]
-        moment = moving * data.com[0] + still.mass * still.lever
-        out = [moment, moving * jacobian @ gamma, [moving + still.mass]]
+        out = [
+            moving * data.com[0] + still.mass * still.lever,
+            moving * jacobian @ gamma,
+            [moving + still.mass],
+        ]
         out.append(gamma.T @ self._joint_forces.passive_forces(q, state.v))
-        if self._tip_point is not None:
-            joint, place = self._tip_point
+        if self._tip is not None:
+            joint, place = self._tip[0], self._tip[1].translation
             pin.computeJointJacobians(model, data, self._coordinates.configuration(q))
             out.append(data.oMi[joint].act(place))
             out.append(point_jacobian(model, data, joint, place)[:3] @ gamma)
         return np.concatenate([np.ravel(part) for part in out])
-
-    def _forward_dynamics(self, state: ClosedState, tau_a: Array, friction: bool) -> Array:
-        return self._solve_mass_matrix(
-            state, tau_a - self._inverse_dynamics(state, state.drift, friction)
-        )
 
     def _accelerations_with_stick_slip(
         self, state: ClosedState, tau_a: Array
@@ -246,8 +228,9 @@ class PinocchioDynamics:
         if len(held_indices):
             rows = state.gamma[stick_slip][held_indices]
             unit_accelerations = np.array([self._solve_mass_matrix(state, row) for row in rows])
-            required = rows @ a_a + state.drift[stick_slip][held_indices]
-            constraint_forces = np.linalg.solve(rows @ unit_accelerations.T, required)
+            constraint_forces = np.linalg.solve(
+                rows @ unit_accelerations.T, rows @ a_a + state.drift[stick_slip][held_indices]
+            )
             a_a = (a_a - constraint_forces @ unit_accelerations) * forces.moving_factor
             holding_forces[held_indices] = constraint_forces
             joint_friction[stick_slip] += holding_forces
@@ -270,12 +253,18 @@ class PinocchioDynamics:
 
     def _kinetic_and_potential_energy(self, state: ClosedState) -> Array:
         configuration = self._coordinates.configuration(state.q)
-        kinetic, memory = 0.5 * float(self._armature @ state.v**2), self._workspace.value
-        for part in memory.subtrees:
+        data, subtrees = self._workspace.value
+        kinetic = 0.5 * float(self._armature @ state.v**2)
+        for part in subtrees:
             at, v = configuration[part.configuration_indices], state.v[part.velocity_columns]
             kinetic += pin.computeKineticEnergy(part.model, part.data, at, v)
-        weight = pin.computePotentialEnergy(self._model, memory.data, configuration)
-        return np.array([kinetic, weight + self._joint_forces.potential_energy(state.q)])
+        return np.array(
+            [
+                kinetic,
+                pin.computePotentialEnergy(self._model, data, configuration)
+                + self._joint_forces.potential_energy(state.q),
+            ]
+        )
 
     def _dissipated_power(self, state: ClosedState) -> float:
         """Power dissipated by friction, dampers and end stops."""
@@ -297,7 +286,7 @@ class PinocchioDynamics:
     def _mass_matrix(self, state: ClosedState) -> Array:
         configuration = self._coordinates.configuration(state.q)
         total = state.gamma.T @ (self._armature[:, None] * state.gamma)
-        for part in self._workspace.value.subtrees:
+        for part in self._workspace.value[1]:
             upper = np.triu(
                 pin.crba(part.model, part.data, configuration[part.configuration_indices])
             )
@@ -328,9 +317,10 @@ class PinocchioDynamics:
 
     def _subtree_configurations(self, q: Array) -> Iterator[tuple[_Subtree, Array]]:
         """The subtrees and their configurations, with gravity in the axes of their bases."""
-        configuration, memory = self._coordinates.configuration(q), self._workspace.value
-        pin.forwardKinematics(self._model, memory.data, configuration)
-        for part in memory.subtrees:
-            base = memory.data.oMi[part.base_body].rotation
-            part.model.gravity.linear = base.T @ self._model.gravity.linear
+        configuration, (data, subtrees) = self._coordinates.configuration(q), self._workspace.value
+        pin.forwardKinematics(self._model, data, configuration)
+        for part in subtrees:
+            part.model.gravity.linear = (
+                data.oMi[part.base_body].rotation.T @ self._model.gravity.linear
+            )
             yield part, configuration[part.configuration_indices]

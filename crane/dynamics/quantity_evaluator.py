@@ -1,6 +1,6 @@
 """Evaluation of the quantities of a machine's dynamics, compiled or by Pinocchio."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -8,25 +8,111 @@ from numpy.typing import ArrayLike
 
 from crane.closure.kinematics_formulas import tree_geometry
 from crane.codegen import FormulaTooLongError, run_with_fallback
-from crane.common.errors import InputError, MechanismError, suggest_names
+from crane.common.errors import CraneError, InputError, MechanismError, suggest_names
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, apply_per_sample, as_samples, stack_length
+from crane.description.machine_parameters import unknown_parameter_text
 from crane.dynamics.compiled_dynamics import (
-    DERIVATIVES_OF,
     CompiledParameterDerivatives,
     CompiledQuantity,
 )
-from crane.dynamics.constant_derivatives import ConstantDerivatives
-from crane.dynamics.formula_structure import (
-    FormulaStructure,
-    circuit_friction_indices,
-    dynamics_constants,
-    stick_slip_mode_indices,
-)
+from crane.dynamics.formula_structure import FormulaStructure, dynamics_constants
 from crane.dynamics.joint_forces import JointForces
 from crane.dynamics.pinocchio_dynamics import PinocchioDynamics
+from crane.formats.machine_loading import MachineVariants
 from crane.machine.machine import Machine
 from crane.machine.machine_checks import has_mass
+
+UNIT_OF_ZERO_PARAMETER = 0.1  # magnitude assumed for a parameter that is 0
+_RELATIVE_STEP = 1e-3  # step as a fraction of the parameter
+_LINEARITY_TOLERANCE = 1e-11  # second over first difference of linear constants
+# f'(0) h from f(h) - f(0), ... f(5 h) - f(0), of order 5
+_FORWARD_DIFFERENCE_WEIGHTS = np.array([5.0, -5.0, 10 / 3, -5 / 4, 1 / 5], dtype=np.float64)
+
+
+class ConstantDerivatives:
+    """Derivatives of constants by named parameters, in which most constants are linear.
+
+    Constants are elementary functions of a parameter: itself, its inverse, sine and cosine of an
+    angle. The derivative of a linear one is a finite difference, exact to rounding; of others the
+    one-sided difference of order 5, exact to about 1e-11.
+
+    Args:
+        machine: The machine, as loaded.
+    """
+
+    def __init__(self, machine: Machine):
+        self._variants = MachineVariants(machine)
+        self._values = self._variants.values
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of all parameters."""
+        return tuple(self._values)
+
+    def parameter_value(self, name: str) -> float:
+        """Value of a parameter.
+
+        Raises:
+            InputError: Unknown name.
+        """
+        if name not in self._values:
+            raise InputError(unknown_parameter_text(self._variants.spec, self._values, name))
+        return self._values[name]
+
+    def jacobian(self, names: Sequence[str], constants: Callable[[Machine], Array]) -> Array:
+        """Derivatives (k, m) of constants (m,) by k parameters.
+
+        Raises:
+            InputError: Unknown name, or a parameter that no neighbouring machine can be built for.
+        """
+        nominal = self.nominal_constants(constants)
+        return np.array([self.derivative(name, constants, nominal) for name in names])
+
+    def nominal_constants(self, constants: Callable[[Machine], Array]) -> Array:
+        """Constants (m,) of the machine itself."""
+        return constants(self._variants.perturbed_machine({}))
+
+    def derivative(
+        self, name: str, constants: Callable[[Machine], Array], nominal: Array
+    ) -> Array:
+        """Derivatives (m,) by one parameter, given the nominal constants; see `jacobian`."""
+        value = self.parameter_value(name)
+        unit = value if value else UNIT_OF_ZERO_PARAMETER
+
+        def constants_at(steps: int) -> Array:
+            try:
+                found = constants(
+                    self._variants.perturbed_machine({name: value + steps * _RELATIVE_STEP * unit})
+                )
+            except CraneError as error:
+                raise InputError(f"'{name}' cannot be varied about {value:g}: {error}") from error
+            if len(found) != len(nominal):
+                raise InputError(
+                    f"'{name}' cannot be varied about {value:g}, where the machine has other "
+                    "equations: give it another value"
+                )
+            return found
+
+        one_step = constants_at(1)
+        if (one_step == nominal).all():
+            return np.zeros_like(nominal)
+        two_steps = constants_at(2)
+        first = two_steps - nominal
+        if (
+            np.abs(two_steps - 2.0 * one_step + nominal)
+            <= _LINEARITY_TOLERANCE * np.abs(first) + 4e-16 * np.abs(nominal)
+        ).all():
+            return first / (2.0 * _RELATIVE_STEP * unit)
+        rows = [
+            one_step,
+            two_steps,
+            *map(constants_at, range(3, len(_FORWARD_DIFFERENCE_WEIGHTS) + 1)),
+        ]
+        return np.asarray(
+            _FORWARD_DIFFERENCE_WEIGHTS @ (np.array(rows) - nominal) / (_RELATIVE_STEP * unit)
+        )
+
 
 BACKENDS = ("compiled", "pinocchio")
 
@@ -59,6 +145,7 @@ class QuantityEvaluator(OneLineRepr):
                 "without masses there is kinematics, and no dynamics"
             )
         self.machine, self.formulation = machine, formulation
+        self._mobility = len(machine.active)
         self.forces = JointForces(machine)
         self.formula_structure = FormulaStructure.from_machine(machine, formulation, self.forces)
         self.backend = backend if machine.closure.is_compiled else "pinocchio"
@@ -77,18 +164,13 @@ class QuantityEvaluator(OneLineRepr):
             )
         # constants to fold into formulas; NaN for those that change with the motion
         self.constant_pattern = self.formula_constants.copy()
-        self._mode_indices = (
-            stick_slip_mode_indices(machine, self.forces) if self.backend == "compiled" else []
-        )
-        self.constant_pattern[self._mode_indices] = np.nan
-        self._circuit_friction_indices = (
-            circuit_friction_indices(machine, self.forces) if self.backend == "compiled" else []
-        )
-        self.constant_pattern[self._circuit_friction_indices] = np.nan
-
-    @property
-    def _mobility(self) -> int:
-        return len(self.machine.active)
+        self._mode_indices = self.formula_structure.stick_slip_mode_indices
+        self._circuit_friction_indices = self.formula_structure.constants_layout[
+            "circuit_friction"
+        ]
+        if self.backend == "compiled":
+            self.constant_pattern[self._mode_indices] = np.nan
+            self.constant_pattern[self._circuit_friction_indices] = np.nan
 
     def backend_of(self, quantity: str = "forward") -> str:
         """The backend that computes a quantity of `compiled_dynamics.QUANTITIES`."""
@@ -111,12 +193,7 @@ class QuantityEvaluator(OneLineRepr):
             return apply_per_sample(
                 lambda *one: self.tree_dynamics.evaluate(quantity, *one), q, v_a, x
             )
-        inputs = np.ascontiguousarray(np.concatenate([v_a, x], axis=-1))
-        if q.ndim == 1:
-            return formula.evaluate_closed(np.ascontiguousarray(q), inputs)
-        out = np.empty((len(q), formula.size))
-        formula.evaluate_closed_stack(np.ascontiguousarray(q), inputs, out)
-        return out
+        return formula.evaluate_closed(q, np.concatenate([v_a, x], axis=-1))
 
     def set_stick_slip_modes(
         self, slip_sign: Array, is_held: Array, inverse_velocity: Array, is_moving: bool
@@ -126,7 +203,7 @@ class QuantityEvaluator(OneLineRepr):
         They only affect the quantities of the integration, `STICK_SLIP_QUANTITIES`.
         """
         self.forces.set_stick_slip_modes(slip_sign, is_held, inverse_velocity, is_moving)
-        if self._mode_indices:
+        if self.backend == "compiled":
             self.formula_constants[self._mode_indices] = [
                 *np.column_stack([slip_sign, is_held, inverse_velocity]).ravel(),
                 is_moving,
@@ -194,24 +271,10 @@ class QuantityEvaluator(OneLineRepr):
             )
         return formula
 
-    def _argument_derivatives(self, quantity: str, q: Array, inputs: Array) -> Array:
-        """Derivatives (N, 3 size) by the arguments at closed configurations (N, nq)."""
-        formula = self._required_formula(DERIVATIVES_OF + quantity)
-        flat = np.empty((len(q), formula.size))
-        formula.evaluate_closed_stack(np.ascontiguousarray(q), inputs, flat)
-        return flat
-
     def _parameter_derivatives_at(
         self, quantity: str, names: Sequence[str], q: Array, inputs: Array
     ) -> Array:
         """Derivatives (N, size, k) by parameters at closed configurations (N, nq)."""
-        code = self._parameter_derivative_code(quantity, names)
-        return np.array([code.evaluate_closed(*row) for row in zip(q, inputs, strict=True)])
-
-    def _parameter_derivative_code(
-        self, quantity: str, names: Sequence[str]
-    ) -> CompiledParameterDerivatives:
-        """Machine code of derivatives by parameters of the machine."""
         self._required_formula(quantity)
         key = quantity, tuple(names)
         if key not in self._parameter_derivatives:
@@ -230,7 +293,8 @@ class QuantityEvaluator(OneLineRepr):
                 geometry,
                 numbers,
             )
-        return self._parameter_derivatives[key]
+        code = self._parameter_derivatives[key]
+        return np.array([code.evaluate_closed(*row) for row in zip(q, inputs, strict=True)])
 
     def _evaluate(
         self,
@@ -262,8 +326,9 @@ class QuantityEvaluator(OneLineRepr):
         rows = np.zeros((count, 2 * n))
         for i, array in enumerate(checked):
             rows[:, i * n : (i + 1) * n] = array
-        targets = np.ascontiguousarray(np.broadcast_to(q_a, (count, n)))
-        out = self._evaluate_stack(quantity, targets, rows, q_a.ndim == 2)
+        out = self._evaluate_stack(
+            quantity, np.ascontiguousarray(np.broadcast_to(q_a, (count, n))), rows, q_a.ndim == 2
+        )
         if shape:
             return out.reshape(shape if length is None else (count, *shape))
         return out[0] if length is None else out

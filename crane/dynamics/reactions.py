@@ -12,7 +12,7 @@ from crane.common.errors import InputError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, as_samples
 from crane.description.external_forces import WRENCH_COMPONENTS
-from crane.dynamics.frame_jacobians import MIN_LENGTH
+from crane.dynamics.frame_jacobians import MIN_LENGTH, frame_placement
 from crane.dynamics.joint_forces import JointForces
 from crane.machine.machine import Machine
 
@@ -170,15 +170,18 @@ class Reactions(OneLineRepr):
             (k, 6, 3) or (N, k, 6, 3): `joint_wrenches` of a unit force in the world's x, y, z,
             minus those without.
         """
-        body, place = self._frame_point(link)
+        body, placement = frame_placement(self.machine, link)
         rows, stacked = self._as_stack(q, "q")
         kinematics = self._evaluate_kinematics(rows)
-        point = self._point_in_world(kinematics, body, place)
+        point = self._point_in_world(kinematics, body, placement.translation)
         push = np.broadcast_to(np.eye(3), (len(rows), 3, 3))
-        load = np.concatenate([push, np.cross(point[:, :, None], push, axis=1)], axis=1)
-        carried = -self._is_carried_by[body][None, :, None, None] * load[:, None]
-        none = np.zeros((len(rows), self._model.nv, 3))
-        out = self._solve_loop_forces(kinematics, rows, carried, none)[0]
+        carried = (
+            -self._is_carried_by[body][None, :, None, None]
+            * np.concatenate([push, np.cross(point[:, :, None], push, axis=1)], axis=1)[:, None]
+        )
+        out = self._solve_loop_forces(
+            kinematics, rows, carried, np.zeros((len(rows), self._model.nv, 3))
+        )[0]
         return out if stacked else out[0]
 
     def joint_axes(self, q: ArrayLike) -> Array:
@@ -216,8 +219,11 @@ class Reactions(OneLineRepr):
         wrenches = self._wrenches_with_loop_forces(
             kinematics, none, stress / self._equations.residual_units[:, None]
         )
-        halves = wrenches.reshape(*wrenches.shape[:2], 2, 3, -1)
-        own = np.einsum("nkab,nkhac->nkhbc", self._axes_in_world(kinematics), halves)
+        own = np.einsum(
+            "nkab,nkhac->nkhbc",
+            self._axes_in_world(kinematics),
+            wrenches.reshape(*wrenches.shape[:2], 2, 3, -1),
+        )
         own[:, :, 0] *= self._equations.characteristic_length
         tolerance = _ZERO_STRESS_FACTOR * self.machine.closure.structure.redundancy.tolerance
         out = np.abs(own).max(axis=-1, initial=0.0).reshape(len(rows), -1, 6) < tolerance
@@ -258,7 +264,8 @@ class Reactions(OneLineRepr):
                     f"the wrench on '{link}' has {len(wrench)} samples and q "
                     f"{len(rows) if stacked else 'is one'}, give as many"
                 )
-            self._subtract_wrench(kinematics, carried, self._frame_point(link), wrench)
+            body, placement = frame_placement(self.machine, link)
+            self._subtract_wrench(kinematics, carried, (body, placement.translation), wrench)
         joint_forces = element_forces[:, :nv] - self._model.armature * accelerations
         if friction:
             joint_forces -= forces.friction_forces(velocities) + forces.breakaway_forces(
@@ -269,11 +276,6 @@ class Reactions(OneLineRepr):
         )
         wrench, drive = found[..., 0], drives[..., 0]
         return (wrench, drive) if stacked else (wrench[0], drive[0])
-
-    def _frame_point(self, link: str) -> tuple[int, Array]:
-        """The body that carries a link, and the origin of the link in that body's frame."""
-        frame = self._model.frames[self.machine.frame(link)]
-        return int(frame.parentJoint), frame.placement.translation
 
     def _subtract_wrench(
         self, kinematics: _StackKinematics, carried: Array, point: tuple[int, Array], wrench: Array
@@ -303,8 +305,7 @@ class Reactions(OneLineRepr):
             np.einsum("nsi,nisc->nic", kinematics.columns, carried[:, self._joint_of_column])
             - joint_forces
         )
-        passive_jacobian = kinematics.scaled_jacobian[:, :, closure.passive]
-        turn, pivots = np.linalg.qr(passive_jacobian)
+        turn, pivots = np.linalg.qr(kinematics.scaled_jacobian[:, :, closure.passive])
         size = np.abs(np.diagonal(pivots, axis1=1, axis2=2))
         if (
             edge := size.min(axis=1, initial=1.0)
@@ -333,8 +334,9 @@ class Reactions(OneLineRepr):
             * multipliers[:, : kinematics.loop_wrenches.shape[1], None, :]
         )
         loops = np.einsum("lr,nrsc->nlsc", self._loop_of_row, loaded)
-        joints = carried - np.einsum("lj,nlsc->njsc", self._loop_paths, loops)
-        out = np.concatenate([joints, loops], axis=1)
+        out = np.concatenate(
+            [carried - np.einsum("lj,nlsc->njsc", self._loop_paths, loops), loops], axis=1
+        )
         at = np.concatenate(
             [kinematics.origins[:, 1:], kinematics.loop_frames[1][:, 1::2]], axis=1
         )
@@ -390,8 +392,9 @@ class Reactions(OneLineRepr):
         self, kinematics: _StackKinematics, body: int, local_point: Array
     ) -> Array:
         """(N, 3) positions of a point of a body in the world."""
-        out: Array = kinematics.origins[:, body] + kinematics.rotations[:, body] @ local_point
-        return out
+        return np.asarray(
+            kinematics.origins[:, body] + kinematics.rotations[:, body] @ local_point
+        )
 
     def _as_stack(self, value: ArrayLike, what: str) -> tuple[Array, bool]:
         given = as_samples(value, self._model.nv, what, self.machine.joints)

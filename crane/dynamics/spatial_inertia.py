@@ -15,11 +15,9 @@ operations in proportion to its entries.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from crane.closure.clusters import Cluster
-from crane.closure.kinematics_formulas import PositionKinematics
-from crane.closure.loop_formulas import LoopFormulas
-from crane.closure.spatial_vectors import (
+from crane.closure.kinematics_formulas import (
     ZERO_VECTOR,
+    PositionKinematics,
     SpatialVector,
     Vector,
     add_spatial,
@@ -27,8 +25,10 @@ from crane.closure.spatial_vectors import (
     shift_wrench,
     spatial_dot,
 )
-from crane.codegen.matrix_factorization import LdltFactorization
+from crane.closure.loop_equations import Cluster
+from crane.closure.loop_formulas import LoopFormulas
 from crane.codegen.symbolic import (
+    LdltFactorization,
     Scalar,
     add_vectors,
     cross,
@@ -50,14 +50,10 @@ def forward_substitute(
     rows = transpose(
         [
             factorization.forward_substitute(column)
-            for column in zip(*map(_flatten, vectors), strict=True)
+            for column in zip(*([*linear, *angular] for linear, angular in vectors), strict=True)
         ]
     )
     return [(row[:3], row[3:]) for row in rows]
-
-
-def _flatten(pair: SpatialVector) -> Vector:
-    return [*pair[0], *pair[1]]
 
 
 class SpatialInertia:
@@ -87,8 +83,11 @@ class SpatialInertia:
                 tensor[r][c] - moment[r] * lever[c] + (dot(moment, lever) if r == c else 0.0)
             )
         )
-        straight: Matrix = [[mass if r == c else 0.0 for c in range(3)] for r in range(3)]
-        return cls(straight, [scale_vector(-1.0, row) for row in _skew(moment)], out)
+        return cls(
+            [[mass if r == c else 0.0 for c in range(3)] for r in range(3)],
+            [scale_vector(-1.0, row) for row in _skew(moment)],
+            out,
+        )
 
     def __add__(self, other: "SpatialInertia") -> "SpatialInertia":
         return SpatialInertia(
@@ -125,10 +124,13 @@ class SpatialInertia:
             for rows in zip(self.mixed, matmul(self.mass, skew), strict=True)
         ]
         old, new, across = transpose(self.mixed), transpose(coupling), transpose(skew)
-        rotational = _symmetric_matrix(
-            lambda r, c: self.turning[r][c] - dot(old[r], across[c]) + dot(skew[r], new[c])
+        return SpatialInertia(
+            self.mass,
+            coupling,
+            _symmetric_matrix(
+                lambda r, c: self.turning[r][c] - dot(old[r], across[c]) + dot(skew[r], new[c])
+            ),
         )
-        return SpatialInertia(self.mass, coupling, rotational)
 
 
 def _symmetric_matrix(entry: Callable[[int, int], Scalar]) -> Matrix:
@@ -192,8 +194,9 @@ class ClusterMassColumns:
         for k in count:
             column = [row[k] for row in moved.values()]
             for j in range(k + 1):
-                entry = dot([row[j] for row in gamma.values()], column)
-                self.mass_block[j][k] = self.mass_block[k][j] = entry
+                self.mass_block[j][k] = self.mass_block[k][j] = dot(
+                    [row[j] for row in gamma.values()], column
+                )
 
 
 def propagate_wrench(
@@ -211,8 +214,14 @@ def propagate_wrench(
         body = kinematics.geometry.parents[body]
 
 
-class CompositeMassMatrix:
-    """M_A = gamma^T M gamma.
+def composite_mass_matrix(
+    kinematics: PositionKinematics,
+    loops: LoopFormulas,
+    body_inertias: Sequence[tuple[Scalar, Vector, list[Vector]]],
+    rotor_inertias: Vector,
+    clusters: Sequence[Cluster],
+) -> Matrix:
+    """M_A = gamma^T M gamma (n, n).
 
     Args:
         kinematics: Position kinematics.
@@ -221,46 +230,35 @@ class CompositeMassMatrix:
             COM.
         rotor_inertias: (nb + 1,) rotor inertias of the joints.
         clusters: Clusters of the joints.
-
-    Attributes:
-        mass_matrix: (n, n).
     """
-
-    def __init__(
-        self,
-        kinematics: PositionKinematics,
-        loops: LoopFormulas,
-        body_inertias: Sequence[tuple[Scalar, Vector, list[Vector]]],
-        rotor_inertias: Vector,
-        clusters: Sequence[Cluster],
-    ):
-        n, parents = len(loops.active_joints), kinematics.geometry.parents
-        inertias = {
-            i: SpatialInertia.rigid_body(*body) for i, body in enumerate(body_inertias, start=1)
-        }
-        for i in range(len(body_inertias), 0, -1):
-            if parents[i]:
-                inertias[parents[i]] = inertias[parents[i]] + inertias[i].shift_origin(
-                    kinematics.offsets[i]
-                )
-        self.mass_matrix: list[Vector] = [[0.0] * n for _ in range(n)]
-        coordinates_of_joint = {
-            i: cluster.own_coordinates(loops.active_joints)
-            for cluster in clusters
-            for i in cluster.joints
-        }
-        for cluster in clusters:
-            coordinates = coordinates_of_joint[cluster.joints[0]]
-            gamma = {i: [loops.gamma[i][k] for k in coordinates] for i in cluster.joints}
-            columns = ClusterMassColumns(kinematics, cluster, gamma, inertias, rotor_inertias)
-            for row, k in zip(columns.mass_block, coordinates, strict=True):
-                for entry, j in zip(row, coordinates, strict=True):
-                    self.mass_matrix[k][j] = entry
-            for k, wrench in zip(coordinates, columns.base_wrenches, strict=True):
-                for i, met, _ in propagate_wrench(kinematics, cluster.base, wrench, 0):
-                    for j in coordinates_of_joint[i]:
-                        entry = self.mass_matrix[j][k] + loops.gamma[i][j] * met
-                        self.mass_matrix[j][k] = self.mass_matrix[k][j] = entry
+    n, parents = len(loops.active_joints), kinematics.geometry.parents
+    inertias = {
+        i: SpatialInertia.rigid_body(*body) for i, body in enumerate(body_inertias, start=1)
+    }
+    for i in range(len(body_inertias), 0, -1):
+        if parents[i]:
+            inertias[parents[i]] = inertias[parents[i]] + inertias[i].shift_origin(
+                kinematics.offsets[i]
+            )
+    out: Matrix = [[0.0] * n for _ in range(n)]
+    coordinates_of_joint = {
+        i: cluster.own_coordinates(loops.active_joints)
+        for cluster in clusters
+        for i in cluster.joints
+    }
+    for cluster in clusters:
+        coordinates = coordinates_of_joint[cluster.joints[0]]
+        gamma = {i: [loops.gamma[i][k] for k in coordinates] for i in cluster.joints}
+        columns = ClusterMassColumns(kinematics, cluster, gamma, inertias, rotor_inertias)
+        for row, k in zip(columns.mass_block, coordinates, strict=True):
+            for entry, j in zip(row, coordinates, strict=True):
+                out[k][j] = entry
+        for k, wrench in zip(coordinates, columns.base_wrenches, strict=True):
+            for i, met, _ in propagate_wrench(kinematics, cluster.base, wrench, 0):
+                for j in coordinates_of_joint[i]:
+                    entry = out[j][k] + loops.gamma[i][j] * met
+                    out[j][k] = out[k][j] = entry
+    return out
 
 
 @dataclass(frozen=True)
@@ -309,8 +307,13 @@ class MassMoments:
             for p, row in zip(momentum, spun, strict=True)
         ]
         sums = [k[1][1] + k[2][2], k[0][0] + k[2][2], k[0][0] + k[1][1]]
-        mixed = [[sums[r] if r == c else -k[r][c] for c in range(3)] for r in range(3)]
-        return cls(mass, first, inertia, momentum, mixed)
+        return cls(
+            mass,
+            first,
+            inertia,
+            momentum,
+            [[sums[r] if r == c else -k[r][c] for c in range(3)] for r in range(3)],
+        )
 
     def __add__(self, other: "MassMoments") -> "MassMoments":
         return MassMoments(

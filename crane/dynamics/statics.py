@@ -107,13 +107,13 @@ class StaticsEvaluator:
     def coordinate_derivatives(self, q: Array) -> StaticQuantities:
         """Derivatives by q_A at closed configurations (N, nq), along one more last axis (n,)."""
         q_a = np.ascontiguousarray(q[:, self.machine.closure.active])
-        found = self.dynamics.derivatives("statics", q_a, by=["q_a"])["q_a"]
-        return self._split_quantities(found)
+        return self._split_quantities(self.dynamics.derivatives("statics", q_a, by=["q_a"])["q_a"])
 
     def parameter_derivatives(self, q: Array, names: Sequence[str]) -> StaticQuantities:
         """Derivatives by named parameters of the machine, at the same q_A."""
-        q_a = np.ascontiguousarray(q[:, self.machine.closure.active])
-        found = self.dynamics.derivatives("statics", q_a, by=names)
+        found = self.dynamics.derivatives(
+            "statics", np.ascontiguousarray(q[:, self.machine.closure.active]), by=names
+        )
         return self._split_quantities(np.stack([found[name] for name in names], axis=-1))
 
     def _split_quantities(self, rows: Array) -> StaticQuantities:

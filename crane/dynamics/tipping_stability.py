@@ -33,8 +33,7 @@ class TippingMargins(NamedTuple):
     @property
     def smallest_ratio(self) -> Array:
         """(N,) the smallest weight ratio."""
-        least: Array = self.weight_ratios.min(axis=1)
-        return least
+        return np.asarray(self.weight_ratios.min(axis=1))
 
 
 class TippingStability:
@@ -114,8 +113,9 @@ class TippingStability:
             q_a: (n,) or (N, n) [m], [rad].
         """
         machine = self.machine
-        given = np.atleast_2d(as_samples(q_a, len(machine.active), "q_a", machine.active))
-        q = machine.closure.solve(given)
+        q = machine.closure.solve(
+            np.atleast_2d(as_samples(q_a, len(machine.active), "q_a", machine.active))
+        )
         return self.tipping_margins(q, self.ground_wrench(q))
 
     def tipping_load(self, q_a: ArrayLike, frame: str | None = None) -> tuple[Array, list[str]]:
@@ -133,20 +133,23 @@ class TippingStability:
         link = machine.tip if frame is None else frame
         if link is None:
             raise InputError(f"'{machine.name}' has no tip, name the frame that a load hangs from")
-        given = np.atleast_2d(as_samples(q_a, len(machine.active), "q_a", machine.active))
-        q = machine.closure.solve(given)
+        q = machine.closure.solve(
+            np.atleast_2d(as_samples(q_a, len(machine.active), "q_a", machine.active))
+        )
         moments = self.tipping_margins(q, self.ground_wrench(q)).moments
         hanging = self._frame_jacobians.frame_origins(q, [link])[:, 0]
-        unit_load_wrenches = np.hstack(
-            [-self._gravity + 0 * hanging, np.cross(hanging, -self._gravity)]
+        levers = self._moments_about_lines(
+            self.support_positions(q),
+            np.hstack([-self._gravity + 0 * hanging, np.cross(hanging, -self._gravity)]),
         )
-        levers = self._moments_about_lines(self.support_positions(q), unit_load_wrenches)
         with np.errstate(divide="ignore"):
             loads_by_line = np.where(levers < 0, moments / -levers, np.inf)
         first = loads_by_line.argmin(axis=1)
         loads = loads_by_line[np.arange(len(q)), first]
-        named = [" to ".join(self.line_names[k]) for k in first.tolist()]
-        return loads, [x if np.isfinite(y) else "" for x, y in zip(named, loads, strict=True)]
+        return loads, [
+            " to ".join(self.line_names[k]) if np.isfinite(load) else ""
+            for k, load in zip(first.tolist(), loads, strict=True)
+        ]
 
     def ground_wrench(
         self,
@@ -224,8 +227,7 @@ class TippingStability:
         Of all nonnegative forces that balance the ground wrench, those with the least sum of
         squares; where the machine tips, those nearest to balance.
         """
-        points = self.support_positions(q)
-        x, y, z = np.moveaxis(points, 2, 0)
+        x, y, z = np.moveaxis(self.support_positions(q), 2, 0)
         force, moment = ground_wrench[:, :3], ground_wrench[:, 3:]
         level = np.zeros_like(force)
         level[:, 2] = z.mean(axis=1)
@@ -296,5 +298,4 @@ def _nonnegative_support_forces(balance: Array, required: Array) -> Array:
         loaded = [i for i, force in zip(loaded, part, strict=True) if force > 0]
     from scipy.optimize import nnls  # slow to import
 
-    found: Array = nnls(balance, required)[0]
-    return found
+    return np.asarray(nnls(balance, required)[0])

@@ -1,5 +1,5 @@
-from .additions.cylinder_addition import add_cylinder as add_cylinder
-from .additions.loop_addition import add_loops as add_loops
+from .additions.machine_additions import add_cylinder as add_cylinder
+from .additions.machine_additions import add_loops as add_loops
 from .checks.check_report import check as check
 from .home_writer import write_home as write_home
 from .machine_file.machine_reader import read_machine_spec as read_machine_spec

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
-from crane.closure.active_joint_selection import translational_coordinates
 from crane.closure.assembly_modes import AssemblyMode, find_alternative_assembly_modes
 from crane.closure.closure import Closure
 from crane.closure.constraint_structure import OpenLoopError
@@ -22,7 +21,7 @@ from crane.machine.drive_selection import select_free_joints
 from crane.machine.machine import Machine
 from crane.machine.misfit import misfit
 
-_MAX_LISTED = 4
+_MAX_LISTED = 4  # loops and joints in a message
 
 
 def check_home(
@@ -83,11 +82,7 @@ def _different_home_text(
     spec: MachineSpec, closure: Closure, search: HomeSearchResult, initial_guess: Array
 ) -> str:
     joint, deviation = search.off_said
-    name = closure.equations.coordinates.names[joint]
-    deviation_text = (
-        f"{deviation * closure.units[joint]:.3g} "
-        f"{'m' if translational_coordinates(closure.model)[joint] else 'rad'}"
-    )
+    deviation_text = _coordinate_text(closure, joint, deviation * closure.units[joint], " is")
     loops = _list_names([f"'{loop}'" for loop in search.reversed])
     reversed_loops_text = f", loop {loops} the other way round" if loops else ""
     geometry_misfit = misfit(spec, closure.model, initial_guess)
@@ -103,7 +98,7 @@ def _different_home_text(
         "" if is_simulator_file(spec.path) else "keep it with crane check --write-home, or "
     )
     return (
-        f"the loops close only far from the home of the file: {name} is {deviation_text} "
+        f"the loops close only far from the home of the file: {deviation_text} "
         f"off{reversed_loops_text}; {cause_text}; "
         f"if what was found is meant, {write_hint}take it with {argument_hint}"
     )
@@ -112,8 +107,7 @@ def _different_home_text(
 def _home_search_text(spec: MachineSpec, closure: Closure, search: HomeSearchResult) -> str:
     names = closure.equations.coordinates.names
     location = spec.source_locations.get("home", spec.path.name)
-    joint, deviation = search.largest_deviation
-    unit = "m" if translational_coordinates(closure.model)[joint] else "rad"
+    deviation_text = _coordinate_text(closure, *search.largest_deviation)
     free = select_free_joints(spec, closure.active_names)
     driven_columns = [i for i in closure.active if names[int(i)] not in free]
     moved_text = _list_names([names[int(i)] for i in driven_columns if i in search.moved_columns])
@@ -126,8 +120,8 @@ def _home_search_text(spec: MachineSpec, closure: Closure, search: HomeSearchRes
     command = "convert, then crane check" if is_simulator_file(spec.path) else "check"
     return (
         f"{location}: home was searched for, because from the home of the file {search.reason}; "
-        f"{movement_text}, {selection_text} that was found has {names[joint]} {deviation:.3g} "
-        f"{unit} off: look at it with crane sketch, and keep it with crane {command} --write-home"
+        f"{movement_text}, {selection_text} that was found has {deviation_text} "
+        f"off: look at it with crane sketch, and keep it with crane {command} --write-home"
     )
 
 
@@ -151,12 +145,18 @@ def _rounding_text(spec: MachineSpec, closure: Closure) -> str:
     )
 
 
+def _coordinate_text(closure: Closure, column: int, value: float, verb: str = "") -> str:
+    coordinates = closure.equations.coordinates
+    unit = "m" if coordinates.is_translation[column] else "rad"
+    return f"{coordinates.names[column]}{verb} {value:.3g} {unit}"
+
+
 def _list_names(names: Sequence[str]) -> str:
     remaining = len(names) - _MAX_LISTED
     return ", ".join(names[:_MAX_LISTED]) + (f" and {remaining} more" if remaining > 0 else "")
 
 
-_MAX_LISTED, _MAX_COORDINATES = 4, 6  # loops and coordinates in a message
+_MAX_COORDINATES = 6  # in a message
 # starts of the search in one block; they take milliseconds, and up to a second
 _QUICK_STARTS, _THOROUGH_STARTS = 6, 100
 
@@ -177,9 +177,11 @@ def warn_about_assembly_modes(
     is_from_simulator = is_simulator_file(spec.path)
     names = closure.equations.coordinates.names
     is_specified = [is_from_simulator or name in spec.home for name in names]
-    max_starts = _THOROUGH_STARTS if thorough else _QUICK_STARTS
     alternatives = find_alternative_assembly_modes(
-        closure, initial_guess, np.flatnonzero(is_specified), max_starts
+        closure,
+        initial_guess,
+        np.flatnonzero(is_specified),
+        _THOROUGH_STARTS if thorough else _QUICK_STARTS,
     )
     remainder = ""
     if len(alternatives) > 1 and not thorough:
@@ -217,30 +219,27 @@ def _alternative_text(spec: MachineSpec, closure: Closure, alternative: Assembly
         f"loop {alternative.loops[0]}", spec.path.name
     )
     names = closure.equations.coordinates.names
-    is_translation = translational_coordinates(closure.model)
-
-    def deviation_text(at: tuple[int, float]) -> str:
-        return f"{names[at[0]]} {at[1]:.3g} {'m' if is_translation[at[0]] else 'rad'} off"
-
-    home_text = (
-        "outside of limits"
-        if alternative.home_outside_limits
-        else deviation_text(alternative.home_deviation)
-    )
+    deviation_text = _coordinate_text(closure, *alternative.largest_deviation)
+    home_text = "outside of limits"
+    if not alternative.home_outside_limits:
+        home_text = f"{_coordinate_text(closure, *alternative.home_deviation)} off what it says"
     columns = [int(i) for i in alternative.changed_columns]
     if len(columns) > _MAX_COORDINATES:  # with the largest differences
         differences = np.abs(closure.home - alternative.q)[columns]
         columns = [columns[i] for i in np.argsort(-differences, kind="stable")[:_MAX_LISTED]]
+    pattern = "{}: {:.4g}"
+    if spec.path.suffix in (".urdf", ".xacro"):
+        pattern = '<joint name="{}" value="{:.4g}"/>'
     home_values, alternative_values = (
-        _coordinates_text(spec, [names[i] for i in columns], q[columns])
+        ", ".join(pattern.format(names[i], q[i]) for i in columns)
         for q in (closure.home, alternative.q)
     )
     return (
         f"{location}: loop{'s' * (len(alternative.loops) > 1)} {loops} can be assembled another "
         f"way at home, and the file does not say which is meant; {_home_element_text(spec)} write "
-        f"{alternative_values} for the other ({deviation_text(alternative.largest_deviation)}) or "
-        f"{home_values} to keep this one ({home_text} what it says)"
-    ).replace("limits what it says", "limits")
+        f"{alternative_values} for the other ({deviation_text} off) or {home_values} to keep this "
+        f"one ({home_text})"
+    )
 
 
 def _home_element_text(spec: MachineSpec) -> str:
@@ -250,15 +249,3 @@ def _home_element_text(spec: MachineSpec) -> str:
     if is_sdf_file(spec.path):
         return "in <initial_position> of axes"
     return 'in <group_state name="home">' if is_robot_file(spec.path) else "in the key 'home'"
-
-
-def _coordinates_text(spec: MachineSpec, names: Sequence[str], values: Array) -> str:
-    """Return coordinates in the syntax of the file."""
-    pattern = (
-        '<joint name="{}" value="{:.4g}"/>'
-        if spec.path.suffix in (".urdf", ".xacro")
-        else "{}: {:.4g}"
-    )
-    return ", ".join(
-        pattern.format(name, value) for name, value in zip(names, values, strict=True)
-    )

@@ -1,11 +1,10 @@
-"""Warnings about parts of a machine that a conversion between formats leaves out or changes."""
+"""Warnings about parts of a file that a conversion between formats leaves out or changes."""
 
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from crane.common.errors import CraneWarning
-from crane.machine.machine import Machine
 
 
 class ConversionNotes:
@@ -53,38 +52,3 @@ class ConversionNotes:
         if (more := len(listed) - self._max_names) > 0:
             listed[self._max_names :] = [f"{more} more"]
         return f" ({', '.join(listed)})" if listed else ""
-
-
-def warn_about_unsupported(
-    machine: Machine, format_name: str, names: Sequence[str] | Iterator[str]
-) -> None:
-    """Warn of parts of a machine that a written format cannot represent."""
-    if listed := ", ".join(names):
-        warnings.warn(
-            f"{machine.name}: {format_name} has no place for {listed}, left out (a machine "
-            "file has)",
-            CraneWarning,
-            stacklevel=3,
-        )
-
-
-def unsupported_sections(machine: Machine) -> list[str]:
-    """Sections of a machine that only a machine file represents, and its friction laws.
-
-    Other formats have Coulomb and viscous friction alone.
-    """
-    unsupported = [
-        f"the friction law of {joint}"
-        for joint, law in machine.friction.items()
-        if law.coulomb_offset or law.viscous_offset or law.stiction or (
-            law.coulomb and law.smoothing
-        )
-    ]  # fmt: skip
-    sections = {
-        "gas springs": machine.gas_springs,
-        "end stops": machine.end_stops,
-        "tasks": machine.tasks,
-        "gains": machine.control,
-        "hydraulics": machine.hydraulics,
-    }
-    return unsupported + [name for name, section in sections.items() if section]

@@ -57,9 +57,12 @@ def write_home(
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
-        lenient_arguments = {**(arguments or {}), NEAREST_ASSEMBLY: True}
         machine = load(
-            name, active=active, free=free, packages=packages, arguments=lenient_arguments
+            name,
+            active=active,
+            free=free,
+            packages=packages,
+            arguments={**(arguments or {}), NEAREST_ASSEMBLY: True},
         )
         path = machine.path.resolve()
         _check_is_writable(machine, path)
@@ -247,8 +250,14 @@ def _xml_edits(text: str, home: Mapping[str, float]) -> list[TextEdit]:
     tag = _TAG_PATTERN.match(text, first)
     assert tag is not None, "it was parsed"
     if tag[0].endswith("/>"):
-        new = f"{tag[0][:-2].rstrip()}>{_joint_elements(missing, line_break)}  </group_state>"
-        return [*edits, (tag.start(), tag.end(), new)]
+        return [
+            *edits,
+            (
+                tag.start(),
+                tag.end(),
+                f"{tag[0][:-2].rstrip()}>{_joint_elements(missing, line_break)}  </group_state>",
+            ),
+        ]
     return [*edits, (last, last, f"{_joint_elements(missing, line_break).lstrip()}  ")]
 
 
@@ -263,8 +272,9 @@ def _value_edit(text: str, position: int, value: float) -> TextEdit:
 def _joint_elements(home: Mapping[str, float], line_break: str) -> str:
     from xml.sax.saxutils import quoteattr  # slow to import
 
-    tags = (
-        f'    <joint name={quoteattr(x)} value="{value!r}"/>{line_break}'
-        for x, value in home.items()
+    return line_break + "".join(
+        (
+            f'    <joint name={quoteattr(x)} value="{value!r}"/>{line_break}'
+            for x, value in home.items()
+        )
     )
-    return line_break + "".join(tags)

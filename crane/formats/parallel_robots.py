@@ -13,11 +13,9 @@ from crane.description.key_types import (
     NumberKey,
     SectionSchema,
 )
-from crane.description.kinematic_tree import Joint, Link, Tree
+from crane.description.kinematic_tree import Joint, Link, Tree, joint_series
 from crane.description.specification import Chain, Drive, LoopSpec, MachineSpec, source_locations
-from crane.formats.joint_series import joint_series
-from crane.formats.machine_file.structure_sections import read_home
-from crane.formats.machine_file.tree_builder import TreeBuilder
+from crane.formats.machine_file.structure_sections import TreeBuilder, read_home
 from crane.formats.machine_file.yaml_parser import MAX_FILE_SIZE, format_value
 from crane.formats.machine_file.yaml_section import YamlSection
 from crane.formats.urdf.link_joint_elements import MOVABLE_TYPES
@@ -209,19 +207,25 @@ def _read_loops(top: YamlSection, urdf: UrdfModel, tree: TreeBuilder) -> tuple[L
         links = [name if name in tree.links else child_links.get(name, "") for name in pair]
         unknown_frames = [name for name, link in zip(pair, links, strict=True) if not link]
         if unknown_frames:
-            problem = (
-                f"the frame '{unknown_frames[0]}' is unknown, "
-                f"{suggest_names(tree.links, unknown_frames[0])}"
+            raise top.error_at(
+                "closed_loop",
+                (
+                    f"the frame '{unknown_frames[0]}' is unknown, "
+                    f"{suggest_names(tree.links, unknown_frames[0])}"
+                ),
             )
-            raise top.error_at("closed_loop", problem)
         name = f"{pair[0]}_{pair[1]}"
         if name in loops:
             raise top.error_at(
                 "closed_loop", f"{pair[0]} and {pair[1]} are closed twice, once will do"
             )
-        where = top.source_location("closed_loop")
         loop = LoopSpec(
-            name, _LOOP_TYPES[kind.lower()], links[0], links[1], (0.0, 0.0, 1.0), where
+            name,
+            _LOOP_TYPES[kind.lower()],
+            links[0],
+            links[1],
+            (0.0, 0.0, 1.0),
+            top.source_location("closed_loop"),
         )
         tree.check_loop(loop)
         loops[name] = loop
@@ -242,8 +246,9 @@ def _read_pairs(top: YamlSection, key: str) -> list[list[str]]:
         "write pairs as [a, b]",
     )
     for invalid in [x for pair in pairs for x in pair if not _is_text(x)]:
-        problem = f"'{key}' lists {format_value(invalid)}, which is not a name, quote it"
-        raise top.error_at(key, problem)
+        raise top.error_at(
+            key, f"'{key}' lists {format_value(invalid)}, which is not a name, quote it"
+        )
     return pairs
 
 

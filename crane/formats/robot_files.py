@@ -6,43 +6,25 @@ import sys
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from lxml import etree
 
-from crane.common.errors import (
-    CraneError,
-    CraneWarning,
-    DescriptionError,
-    InputError,
-    suggest_names,
-)
+from crane.common.errors import CraneWarning, DescriptionError, InputError, suggest_names
 from crane.common.optional_libraries import installation_hint
 from crane.common.package_search import OWN_ARGUMENTS, load_options, use_load_options
 from crane.description.force_elements import ForceElement
 from crane.formats import xacro_process
-from crane.formats.xml_file import SourceLocations, XmlFile
+from crane.formats.visuals.mesh_process import MAX_SECONDS
+from crane.formats.xml_file import XmlFile, set_source_location
 from crane.machine.machine import Machine
 
-_XACRO_NAMESPACE = "http://www.ros.org/wiki/xacro"
-_INSTALL_HINT = f"is written with xacro, {installation_hint('xacro')}"
 _PACKAGE_ROOT = Path(__file__).resolve().parents[2]
-_TIMEOUT = 10 * xacro_process.MAX_SECONDS  # [s], for systems without CPU limits
+_TIMEOUT = 10 * MAX_SECONDS  # [s], for systems without CPU limits
 
 
-def needs_xacro(xml: XmlFile) -> bool:
-    """Whether a file has elements of xacro, or the suffix .xacro."""
-    if xml.file.suffix.lower() == ".xacro":
-        return True
-    return any(
-        isinstance(element.tag, str) and element.tag.startswith("{") and "xacro" in element.tag
-        for element in xml.root.iter()
-    )
-
-
-def expand_xacro(xml: XmlFile) -> XmlFile:
+def _expand_xacro(xml: XmlFile) -> XmlFile:
     """Return a file with its macros expanded and the source locations of its elements.
 
     xacro itself processes includes by `$(find PACKAGE)`, `package://` and paths, arguments,
@@ -54,24 +36,33 @@ def expand_xacro(xml: XmlFile) -> XmlFile:
     """
     answer = _run_xacro_process(xml.file)
     if "missing" in answer:
-        raise DescriptionError(f"{xml.file.name}: {_INSTALL_HINT}")
+        hint = installation_hint("xacro")
+        raise DescriptionError(f"{xml.file.name}: is written with xacro, {hint}")
     if "wrong" in answer:
-        raise _expansion_error(xml.file, answer)
-    _check_arguments(xml.file, answer["arguments"])
+        location = Path(answer.get("file") or xml.file).name
+        location += f":{answer['line']}" if "line" in answer else ""
+        if name := answer.get("package"):
+            raise DescriptionError(
+                f"{location}: package '{name}' is not found, say where it is: --packages FOLDER, "
+                "packages=[...] in Python"
+            )
+        raise DescriptionError(f"{location}: xacro refuses it ({answer['wrong']}), correct it")
+    for name in load_options().arguments:
+        if name not in (*answer["arguments"], *OWN_ARGUMENTS):
+            hint = suggest_names(answer["arguments"], name)
+            raise InputError(f"{xml.file.name} has no argument '{name}', {hint}")
     parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
     root = etree.fromstring(answer["text"].encode("utf-8"), parser)
-    names = [Path(name).name for name in answer["files"]]
-    locations = SourceLocations(xml.file.name)
+    locations = {xml.file.name: 0}
     for element in root.iter(etree.Element):
-        number, _, line = element.attrib.pop(xacro_process.LOCATION_ATTRIBUTE, "0:1").partition(
-            ":"
-        )
-        locations.set_location(element, f"{names[int(number)]}:{line}")
-    return XmlFile.from_root(xml.file, root, locations.locations)
+        place = element.attrib.pop(xacro_process.LOCATION_ATTRIBUTE, "0:1")
+        number, _, line = place.partition(":")
+        file_name = Path(answer["files"][int(number)]).name
+        set_source_location(element, f"{file_name}:{line}", locations)
+    return XmlFile(xml.file, root, locations)
 
 
 def _run_xacro_process(file: Path) -> dict[str, Any]:
-    """Return the answer of the process."""
     options = load_options()
     request = {
         "file": str(file), "root": str(_PACKAGE_ROOT), "packages": list(options.packages),
@@ -84,63 +75,32 @@ def _run_xacro_process(file: Path) -> dict[str, Any]:
         )
         return dict(json.loads(completed.stdout))
     except (subprocess.TimeoutExpired, ValueError):  # killed before it could answer
-        reason = f"expanding it takes more than {xacro_process.MAX_SECONDS} s"
-        return {"wrong": reason, "file": str(file)}
-
-
-def _expansion_error(file: Path, answer: dict[str, Any]) -> CraneError:
-    location = Path(answer.get("file") or file).name
-    if "line" in answer:
-        location += f":{answer['line']}"
-    if name := answer.get("package"):
-        return DescriptionError(
-            f"{location}: package '{name}' is not found, say where it is: --packages FOLDER, "
-            "packages=[...] in Python"
-        )
-    return DescriptionError(f"{location}: xacro refuses it ({answer['wrong']}), correct it")
-
-
-def _check_arguments(file: Path, known_arguments: list[str]) -> None:
-    for name in load_options().arguments:
-        if name not in (*known_arguments, *OWN_ARGUMENTS):
-            raise InputError(
-                f"{file.name} has no argument '{name}', {suggest_names(known_arguments, name)}"
-            )
+        return {"wrong": f"expanding it takes more than {MAX_SECONDS} s", "file": str(file)}
 
 
 _SDF_SUFFIXES = (".sdf", ".world")
 _ROBOT_SUFFIXES, _AMBIGUOUS_SUFFIXES = (".urdf", ".xacro", *_SDF_SUFFIXES), (".xml", ".mjcf")
 
 
-@dataclass(frozen=True)
-class RobotDocument:
-    """A robot as URDF.
-
-    Attributes:
-        xml: Its elements with their source locations.
-        springs: Springs, which URDF does not have.
-    """
-
-    xml: XmlFile
-    springs: tuple[ForceElement, ...] = ()
-
-
-def open_robot(file: Path) -> RobotDocument:
-    """Return the robot of a file as URDF.
+def open_robot(file: Path) -> tuple[XmlFile, tuple[ForceElement, ...]]:
+    """Return the robot of a file as URDF, and its springs, which URDF does not have.
 
     Raises:
         DescriptionError: The file cannot be read, expanded or translated.
     """
     xml = XmlFile(file)
-    if needs_xacro(xml):
-        xml = expand_xacro(xml)
+    if file.suffix.lower() == ".xacro" or any(
+        isinstance(element.tag, str) and element.tag.startswith("{") and "xacro" in element.tag
+        for element in xml.root.iter()
+    ):
+        xml = _expand_xacro(xml)
     if file.suffix.lower() in _SDF_SUFFIXES and xml.root.tag not in ("sdf", "robot"):
         raise xml.error_at(xml.root, f"an SDF starts with <sdf>, this file with <{xml.root.tag}>")
     if xml.root.tag == "sdf":
         from crane.formats.sdf.sdf_translation import translate_to_urdf  # few files are SDF
 
-        return RobotDocument(*translate_to_urdf(xml))
-    return RobotDocument(xml)
+        return translate_to_urdf(xml)
+    return xml, ()
 
 
 def is_robot_file(file: Path) -> bool:
@@ -179,7 +139,7 @@ def open_robots(machine: Machine, chains: Iterable[str] | None = None) -> Iterat
         with warnings.catch_warnings():  # they were issued when it was loaded
             warnings.simplefilter("ignore", CraneWarning)
             documents = [
-                open_robot(chain.urdf).xml
+                open_robot(chain.urdf)[0]
                 for chain in machine.chains
                 if is_robot_file(chain.urdf) and (not chain_names or chain.name in chain_names)
             ]

@@ -57,8 +57,9 @@ def add_joint(robot: etree._Element, joint: Joint) -> etree._Element:
     limits = joint.limits
     limit_values = finite_limits(limits)
     is_continuous = limit_values is None and joint.kind == "revolute"
-    kind = "continuous" if is_continuous else joint.kind
-    element = etree.SubElement(robot, "joint", name=joint.name, type=kind)
+    element = etree.SubElement(
+        robot, "joint", name=joint.name, type=("continuous" if is_continuous else joint.kind)
+    )
     add_origin(element, joint.xyz, joint.rpy)
     etree.SubElement(element, "parent", link=joint.parent)
     etree.SubElement(element, "child", link=joint.child)
@@ -80,5 +81,8 @@ def add_joint(robot: etree._Element, joint: Joint) -> etree._Element:
 def add_friction(joint: etree._Element, viscous: float, coulomb: float) -> None:
     """Add the `<dynamics>` of a joint that has Coulomb or viscous friction."""
     if viscous or coulomb:
-        values = {"damping": format_numbers([viscous]), "friction": format_numbers([coulomb])}
-        etree.SubElement(joint, "dynamics", values)
+        etree.SubElement(
+            joint,
+            "dynamics",
+            {"damping": format_numbers([viscous]), "friction": format_numbers([coulomb])},
+        )

@@ -20,7 +20,6 @@ from typing import Any
 from xml.dom import expatbuilder
 from xml.parsers.expat import ExpatError
 
-MAX_MEMORY, MAX_SECONDS = 2 << 30, 20  # [bytes], [s] of computing
 MAX_LENGTH = 50_000_000  # characters of an expanded file
 LOCATION_ATTRIBUTE = "crane_place"
 _XACRO_PREFIX = "xacro:"
@@ -40,26 +39,9 @@ def main() -> None:
     except ImportError:
         answer: dict[str, Any] = {"missing": True}
     else:
-        _limit_resources()
         answer = _expand(xacro, request)
     output.write(json.dumps(answer) + "\n")
     output.flush()
-
-
-def _limit_resources() -> None:
-    """Limit time and memory, if the system supports it."""
-    try:
-        import resource
-    except ImportError:
-        return
-    for resource_kind, maximum in (
-        (resource.RLIMIT_CPU, MAX_SECONDS),
-        (resource.RLIMIT_AS, MAX_MEMORY),
-    ):
-        hard_limit = resource.getrlimit(resource_kind)[1]
-        resource.setrlimit(
-            resource_kind, (maximum if hard_limit < 0 else min(maximum, hard_limit), hard_limit)
-        )
 
 
 class _ReadableFolders:
@@ -101,39 +83,37 @@ class _ReadableFolders:
         return Path(file)
 
 
-class _ReadFiles:
-    """The files that were read, with the lines of their elements, and their arguments."""
+class _LocationBuilder(expatbuilder.ExpatBuilderNS):
+    """Builds the document of a file with the locations of all elements but those of xacro.
 
-    def __init__(self, checked_path: Callable[[str], Path]) -> None:
-        self._checked_path = checked_path
-        self.names: list[str] = []
-        self.arguments: dict[str, None] = {}
+    Args:
+        number: Index of the file.
+        arguments: Receives the arguments of the file.
+    """
 
-    def parse_file(self, file: str) -> Any:
-        """Return the document of a file with the locations of all elements but those of xacro."""
-        data = self._checked_path(file).read_bytes()
-        number = len(self.names)
-        self.names.append(file)
-        files = self
+    def __init__(self, number: int, arguments: dict[str, None]):
+        super().__init__()
+        self._number, self._arguments = number, arguments
 
-        class LocationBuilder(expatbuilder.ExpatBuilderNS):
-            def start_element_handler(self, name: str, attributes: list[str]) -> None:
-                super().start_element_handler(name, attributes)
-                files.set_location(self.curNode, number, self.getParser().CurrentLineNumber)
-
-        return LocationBuilder().parseString(data)
-
-    def set_location(self, element: Any, number: int, line: int) -> None:
-        """Record where an element is written."""
+    def start_element_handler(self, name: str, attributes: list[str]) -> None:
+        """Called at each element."""
+        super().start_element_handler(name, attributes)
+        element: Any = self.curNode
         if not element.tagName.startswith(_XACRO_PREFIX):
-            element.setAttribute(LOCATION_ATTRIBUTE, f"{number}:{line}")
+            location = f"{self._number}:{self.getParser().CurrentLineNumber}"
+            element.setAttribute(LOCATION_ATTRIBUTE, location)
         elif element.localName == "arg":
-            self.arguments[element.getAttribute("name")] = None
+            self._arguments[element.getAttribute("name")] = None
 
 
 def _expand(xacro: Any, request: dict[str, Any]) -> dict[str, Any]:
+    from crane.formats.visuals.mesh_process import MAX_MEMORY, limit_resources
+
+    limit_resources()
     folders = _ReadableFolders(Path(request["file"]), request["packages"])
-    files = _ReadFiles(Path if request["trust"] else folders.check)
+    readable_path: Callable[[str], Path] = Path if request["trust"] else folders.check
+    names: list[str] = []
+    arguments: dict[str, None] = {}
     missing: list[str] = []
     _provide_package_search(request, folders, missing, xacro)
     if not request["trust"]:
@@ -142,8 +122,10 @@ def _expand(xacro: Any, request: dict[str, Any]) -> dict[str, Any]:
     def parse(inp: Any, filename: str | None = None) -> Any:
         if filename is None:
             return inp
+        names.append(filename)
         try:
-            return files.parse_file(filename)
+            builder = _LocationBuilder(len(names) - 1, arguments)
+            return builder.parseString(readable_path(filename).read_bytes())
         except OSError as error:
             xacro.filestack.pop()
             raise xacro.XacroException(f"{error.strerror}: {filename}", exc=error) from None
@@ -157,7 +139,7 @@ def _expand(xacro: Any, request: dict[str, Any]) -> dict[str, Any]:
         found["text"] = text
     except ExpatError as error:
         words = str(error).partition(": line")[0]
-        found = {"wrong": f"not XML, {words}", "file": files.names[-1], "line": error.lineno}
+        found = {"wrong": f"not XML, {words}", "file": names[-1], "line": error.lineno}
     except MemoryError:
         found["wrong"] = f"expanding it takes more than {MAX_MEMORY >> 30} GB"
     except RecursionError:
@@ -167,8 +149,8 @@ def _expand(xacro: Any, request: dict[str, Any]) -> dict[str, Any]:
     if "wrong" in found and missing:
         found |= {"package": missing[0]}
     stack = [name for name in (getattr(xacro, "filestack", None) or []) if name]
-    return {"file": stack[-1] if stack else request["file"], "files": files.names,
-            "arguments": list(files.arguments), **found}  # fmt: skip
+    return {"file": stack[-1] if stack else request["file"], "files": names,
+            "arguments": list(arguments), **found}  # fmt: skip
 
 
 def _restrict(xacro: Any, folders: _ReadableFolders) -> None:

@@ -1,7 +1,7 @@
 """Strict reading of XML: no entities, no network access, source locations in all errors."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -24,66 +24,78 @@ _MAX_VALUE_LENGTH = 60  # characters shown
 _REPEATABLE_ELEMENTS = {"link", "joint", "loop", "visual", "collision"}
 
 
-class SourceLocations:
-    """Source locations of elements that come from several files.
+def set_source_location(element: etree._Element, location: str, locations: dict[str, int]) -> None:
+    """Set the source location of an element of an `XmlFile` whose parts come from several files.
 
     Args:
-        file: Name of the file, the location of elements without another.
-
-    Attributes:
-        locations: All locations.
+        element: The element.
+        location: File and line.
+        locations: Index of each location; the first is that of elements without another.
     """
+    number = locations.setdefault(location, len(locations))
+    element.sourceline = number if number < _MAX_LINE_NUMBER else 0  # 16 bits in libxml2
 
-    def __init__(self, file: str):
-        self.locations = [file]
-        self._location_numbers = {file: 0}
 
-    def set_location(self, element: etree._Element, location: str) -> None:
-        """Set the location of an element."""
-        number = self._location_numbers.setdefault(location, len(self.locations))
-        if number == len(self.locations):
-            self.locations.append(location)
-        element.sourceline = number if number < _MAX_LINE_NUMBER else 0  # 16 bits in libxml2
+class _DocumentTypeError(Exception):
+    """The file has a document type."""
 
 
 class _RootDetector:
     """Parser target that stops at the root element or document type, in any encoding."""
 
-    class RootElementReached(Exception):  # noqa: N818
-        """The root element was reached."""
-
-    class DocumentTypeReached(Exception):  # noqa: N818
-        """A document type was reached."""
-
     def doctype(self, *_: object) -> None:
         """Called before the declarations of the document type."""
-        raise self.DocumentTypeReached
+        raise _DocumentTypeError
 
     def start(self, *_: object) -> None:
-        """Called at each element."""
-        raise self.RootElementReached
-
-    def end(self, *_: object) -> None:
-        """Never called."""
+        """Called at the root element."""
+        raise StopIteration
 
     def close(self) -> None:
         """Called at the end of a file without elements."""
 
 
-def _refuse_document_type(file: Path, data: bytes) -> None:
-    """Raise for <!DOCTYPE>, whose entities can expand without bounds or read other files."""
+def _read_root(file: Path) -> etree._Element:
+    """Read the root element of a file, without comments.
+
+    <!DOCTYPE> is refused, because its entities can expand without bounds or read other files.
+    """
+    try:
+        data = read_plain_file(file, MAX_FILE_SIZE)
+    except OSError as error:
+        raise DescriptionError(
+            f"{file}: cannot be read ({error.strerror}), check the path"
+        ) from None
+    if not data.strip():
+        root = _ROOT_ELEMENTS.get(file.suffix.lower(), "a <robot>")
+        raise DescriptionError(f"{file.name}: the file is empty, write {root} in it")
     try:
         etree.fromstring(data, etree.XMLParser(target=_RootDetector(), no_network=True))
-    except _RootDetector.DocumentTypeReached:
+    except _DocumentTypeError:
         line = data.count(b"\n", 0, max(data.find(b"<!DOCTYPE"), 0)) + 1
         raise DescriptionError(
             f"{file.name}:{line}: <!DOCTYPE> is not supported, remove it"
         ) from None
-    except (
-        _RootDetector.RootElementReached,
-        etree.XMLSyntaxError,
-    ):  # errors are reported by the actual parsing
+    except (StopIteration, etree.XMLSyntaxError):  # errors are reported by the actual parsing
         pass
+    if b"encoding" not in data[:200] and not data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        try:
+            data.decode("utf-8")
+        except UnicodeDecodeError as error:
+            line = data.count(b"\n", 0, error.start) + 1
+            raise DescriptionError(
+                f"{file.name}:{line}: not UTF-8, save it as UTF-8 or declare its encoding"
+            ) from None
+    parser = etree.XMLParser(
+        resolve_entities=False, no_network=True, remove_comments=True, remove_pis=True
+    )
+    try:
+        return etree.fromstring(data, parser)
+    except etree.XMLSyntaxError as error:
+        text = (error.msg or "broken").splitlines()[0].split(", line")[0].rstrip(" !")
+        raise DescriptionError(
+            f"{file.name}:{error.lineno or 1}: not XML, {text}, mend it"
+        ) from None
 
 
 class XmlFile:
@@ -91,57 +103,25 @@ class XmlFile:
 
     Args:
         file: The file.
+        root: Its root element if the file was expanded; else the file is read.
+        locations: Source locations if elements come from several files.
 
     Attributes:
         file: The file.
         root: Its root element, without comments.
         unnamed_kinds: Tags of elements of which one has no unique name.
-        locations: Source locations if elements come from several files; `sourceline` of an element
-            is then an index in this list.
+        locations: As given; `sourceline` of an element is then an index in this list.
 
     Raises:
         DescriptionError: The file cannot be read, is not XML, or has a document type.
     """
 
-    def __init__(self, file: Path):
-        self.file = file
+    def __init__(
+        self, file: Path, root: etree._Element | None = None, locations: Iterable[str] = ()
+    ):
+        self.file, self.locations = file, list(locations)
         self.unnamed_kinds: set[str] = set()
-        self.locations: Sequence[str] = ()
-        try:
-            data = read_plain_file(file, MAX_FILE_SIZE)
-        except OSError as error:
-            raise DescriptionError(
-                f"{file}: cannot be read ({error.strerror}), check the path"
-            ) from None
-        if not data.strip():
-            root = _ROOT_ELEMENTS.get(file.suffix.lower(), "a <robot>")
-            raise DescriptionError(f"{file.name}: the file is empty, write {root} in it")
-        _refuse_document_type(file, data)
-        if b"encoding" not in data[:200] and not data.startswith((b"\xff\xfe", b"\xfe\xff")):
-            try:
-                data.decode("utf-8")
-            except UnicodeDecodeError as error:
-                line = data.count(b"\n", 0, error.start) + 1
-                raise DescriptionError(
-                    f"{file.name}:{line}: not UTF-8, save it as UTF-8 or declare its encoding"
-                ) from None
-        parser = etree.XMLParser(
-            resolve_entities=False, no_network=True, remove_comments=True, remove_pis=True
-        )
-        try:
-            self.root = etree.fromstring(data, parser)
-        except etree.XMLSyntaxError as error:
-            text = (error.msg or "broken").splitlines()[0].split(", line")[0].rstrip(" !")
-            raise DescriptionError(
-                f"{file.name}:{error.lineno or 1}: not XML, {text}, mend it"
-            ) from None
-
-    @classmethod
-    def from_root(cls, file: Path, root: etree._Element, locations: Sequence[str]) -> "XmlFile":
-        """Return an expanded file: its root element, and the source locations of its parts."""
-        xml = cls.__new__(cls)
-        xml.file, xml.root, xml.unnamed_kinds, xml.locations = file, root, set(), locations
-        return xml
+        self.root = _read_root(file) if root is None else root
 
     def source_location(self, element: etree._Element) -> str:
         """Return file and line of an element."""
@@ -196,8 +176,10 @@ class XmlFile:
             is_correctable = bool(similar) and element.get(similar[0]) is None
             if element.tag in closed_elements or is_correctable:
                 hint = suggest_names(known_attributes, key.lower())
-                problem = f'unknown {key}="..." in <{element.tag}>, {hint}'
-                report_error(self.error_at(element, problem), harmless=is_correctable)
+                report_error(
+                    self.error_at(element, f'unknown {key}="..." in <{element.tag}>, {hint}'),
+                    harmless=is_correctable,
+                )
             if is_correctable:
                 element.set(similar[0], element.attrib.pop(key))
 
@@ -210,8 +192,10 @@ class XmlFile:
         if similar:
             hint = suggest_names(tags, child.tag.lower())
             is_correctable = similar[0] in _REPEATABLE_ELEMENTS or element.find(similar[0]) is None
-            problem = f"unknown <{child.tag}> in <{element.tag}>, {hint}"
-            report_error(self.error_at(child, problem), harmless=is_correctable)
+            report_error(
+                self.error_at(child, f"unknown <{child.tag}> in <{element.tag}>, {hint}"),
+                harmless=is_correctable,
+            )
             if is_correctable:
                 child.tag = similar[0]
         elif any(child.tag in x for x in children.values() if tags):
@@ -256,27 +240,17 @@ class XmlFile:
         default: tuple[float, ...] | None = None,
     ) -> tuple[float, ...]:
         """Read finite numbers, see `number`."""
+        text = element.get(name)
+        if text is None and default is not None:
+            return default
         try:
-            return self._read_vector(element, name, label, length, default)
+            if text is None:
+                raise self.error_at(element, f'{label} has no {name}, add {name}="..."')
+            short = text if len(text) < _MAX_VALUE_LENGTH else text[:_MAX_VALUE_LENGTH] + "..."
+            return self.parse_numbers(element, text, f'{name}="{short}" of {label}', length)
         except DescriptionError as error:
             report_error(error)
             return (math.nan,) * length
-
-    def _read_vector(
-        self,
-        element: etree._Element,
-        name: str,
-        label: str,
-        length: int,
-        default: tuple[float, ...] | None,
-    ) -> tuple[float, ...]:
-        text = element.get(name)
-        if text is None:
-            if default is None:
-                raise self.error_at(element, f'{label} has no {name}, add {name}="..."')
-            return default
-        short_text = text if len(text) < _MAX_VALUE_LENGTH else text[:_MAX_VALUE_LENGTH] + "..."
-        return self.parse_numbers(element, text, f'{name}="{short_text}" of {label}', length)
 
     def parse_numbers(
         self, element: etree._Element, text: str, label: str, length: int
@@ -292,9 +266,8 @@ class XmlFile:
         Raises:
             DescriptionError: The text is something else.
         """
-        words = text.split()
         try:
-            values = tuple(float(word) for word in words)
+            values = tuple(float(word) for word in text.split())
         except ValueError:
             hint = "write digits"
             if "," in text:

@@ -1,6 +1,7 @@
 """Pumps, engine, lines, accumulators and elements of a circuit, and checks of parameters."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
+from typing import Any
 
 from crane.common.errors import InputError, suggest_names
 from crane.common.plausible_ranges import suggested_units_text
@@ -78,13 +79,8 @@ def check_conditions(*conditions: tuple[bool, str, str]) -> None:
             raise ComponentParameterError(key, message)
 
 
-def positive_field() -> float:
-    """A required field that must be positive."""
-    return field(metadata={"positive": True})
-
-
-def positive_field_with_default(default: float) -> float:
-    """A field with a default that must be positive."""
+def positive_field(default: Any = MISSING) -> Any:
+    """A field that must be positive, required without a default."""
     return field(default=default, metadata={"positive": True})
 
 
@@ -149,8 +145,8 @@ class Supply:
     pressure: float
     tank: float = 1.0e5
     flow: float = 0.0
-    droop: float = positive_field_with_default(2.0e5)
-    volume: float = positive_field_with_default(2.0e-3)
+    droop: float = positive_field(2.0e5)
+    volume: float = positive_field(2.0e-3)
     margin: float = 0.0
     standby: float = 0.0
     signal: float = 0.0
@@ -160,7 +156,7 @@ class Supply:
     sensing: float = 0.3
     power: float = 0.0
     relief: float = 0.0
-    relief_gain: float = positive_field_with_default(1.0e-8)
+    relief_gain: float = positive_field(1.0e-8)
     slip: float = 0.0
     friction: float = 0.0
     drag: float = 0.0
@@ -169,17 +165,17 @@ class Supply:
 
     def __post_init__(self) -> None:
         check_parameters(self, "the supply")
-        if self.control not in PUMP_CONTROLS:
-            hint = suggest_names(PUMP_CONTROLS, self.control)
-            raise ComponentParameterError(
-                "control", f"control '{self.control}' is unknown, {hint}"
-            )
         p, tank, control, relief = self.pressure, self.tank, self.control, self.relief
         pressure_hint, relief_hint = (
             suggested_units_text("pressure", p) or ", give a little more for a pump that rests",
             suggested_units_text("relief", relief) or ", give a higher one",
         )
         check_conditions(
+            (
+                control not in PUMP_CONTROLS,
+                "control",
+                f"control '{control}' is unknown, {suggest_names(PUMP_CONTROLS, control)}",
+            ),
             (
                 p <= tank,
                 "pressure",
@@ -265,7 +261,7 @@ class Engine:
     speed: float = positive_field()
     torque: float = positive_field()
     inertia: float = positive_field()
-    speed_droop: float = positive_field_with_default(10.0)
+    speed_droop: float = positive_field(10.0)
     fuel: float = 0.0
     idle: float = 0.0
 
@@ -354,9 +350,9 @@ class Accumulator:
 
     volume: float = positive_field()
     precharge: float = positive_field()
-    exponent: float = positive_field_with_default(1.4)
+    exponent: float = positive_field(1.4)
     time_constant: float = 0.0
-    line: float = positive_field_with_default(1.0e-4)
+    line: float = positive_field(1.0e-4)
     pressure: float = 0.0
 
     def __post_init__(self) -> None:
@@ -406,17 +402,18 @@ class CircuitElement:
 
     def __post_init__(self) -> None:
         check_parameters(self, "the element")
-        if self.kind not in ELEMENT_KINDS:
-            raise ComponentParameterError(
-                "type",
-                f"element '{self.kind}' is unknown, {suggest_names(ELEMENT_KINDS, self.kind)}",
-            )
-        if self.side not in OPENING_SIDES:
-            raise ComponentParameterError(
-                "side", f"side '{self.side}' is unknown, {suggest_names(OPENING_SIDES, self.side)}"
-            )
         key = "coefficient" if self.kind in ("orifice", "check") else "gain"
         check_conditions(
+            (
+                self.kind not in ELEMENT_KINDS,
+                "type",
+                f"element '{self.kind}' is unknown, {suggest_names(ELEMENT_KINDS, self.kind)}",
+            ),
+            (
+                self.side not in OPENING_SIDES,
+                "side",
+                f"side '{self.side}' is unknown, {suggest_names(OPENING_SIDES, self.side)}",
+            ),
             (
                 self.side != "both" and not self.joints,
                 "side",

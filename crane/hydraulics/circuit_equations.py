@@ -1,8 +1,8 @@
-"""Equations of a circuit: pressures of its nodes, flows between them, and their balances."""
+"""Equations of a circuit: pressures of its nodes, flows between them, balances and powers."""
 
 from collections.abc import Sequence
 
-from crane.codegen.symbolic import Scalar, maximum
+from crane.codegen.symbolic import Scalar, SymbolicExpression, dot, maximum
 from crane.hydraulics.circuit_elements import MAIN_PUMP, TANK_NODE
 from crane.hydraulics.circuit_states import CircuitStates
 from crane.hydraulics.flow_equations import (
@@ -18,7 +18,6 @@ from crane.hydraulics.flow_equations import (
 )
 from crane.hydraulics.pump_equations import PumpEquations
 from crane.hydraulics.valve_cylinder_equations import (
-    CYLINDER_CONSTANTS,
     INTERNAL_FLOWS,
     ChamberValues,
     ValveCylinderEquations,
@@ -100,11 +99,7 @@ class CircuitValues:
         self._cylinders = self._cylinder_equations(x, v, state, signals)
         self.forces = [cylinder.force for cylinder in self._cylinders]
         self.circuit_friction = [cylinder.circuit_friction(tank) for cylinder in self._cylinders]
-        self.damper_power = {
-            cylinder.joint: cylinder.damper_power
-            for cylinder in self._cylinders
-            if cylinder.spring_rate
-        }
+        self.damper_power = {x.joint: x.damper_power for x in self._cylinders if x.spring_rate}
         self.engine_speed_ratio = self._states.get("engine", 1.0)
         self._balance = FlowBalance(self.pressures)
         self.flows = self._balance.flows
@@ -116,11 +111,18 @@ class CircuitValues:
             name: [x for x in self._cylinders if x.valve.supply == name] for name in self.pressures
         }
         openings = {cylinder.joint: cylinder.inlet_openings for cylinder in self._cylinders}
-        elements = circuit.hydraulics.elements
-        loads = merged_load_pressures(elements.values(), self._load_pressures(), tank, openings)
+        elements, pumps = circuit.hydraulics.elements, circuit.hydraulics.pumps
+        # of the pumps whose regulator or valves use them
+        loads = {
+            name: largest_of([x.sensed_load_pressure(tank) for x in cylinders])
+            for name, cylinders in self._cylinders_by_supply.items()
+            if any(x.valve.sharing for x in cylinders)
+            or (cylinders and name in pumps and pumps[name].control == "load-sensing")
+        }
+        loads = merged_load_pressures(elements.values(), loads, tank, openings)
         for name, element in elements.items():
-            element_constants = self._constants.elements[name]
-            flow = element_flow(name, element, element_constants, self.pressures, openings)
+            constants_of_element = self._constants.elements[name]
+            flow = element_flow(name, element, constants_of_element, self.pressures, openings)
             self._balance.add_flows([flow])
         self.chambers = [
             self._add_cylinder(cylinder, rates, loads)
@@ -132,8 +134,19 @@ class CircuitValues:
         for name in self._constants.accumulators:
             self._add_accumulator(name)
         if circuit.engine is not None:
-            self._add_engine()
-        self._add_integrals()
+            engine = self._constants.engine
+            pump_torque = sum((pump.torque for pump in self.pumps.values()), 0.0)
+            droop = (1.0 + engine["droop"] - self.engine_speed_ratio) * engine["per_droop"]
+            torque = engine["torque"] * clip(droop, 0.0, 1.0) - pump_torque / engine["speed"]
+            self.state_rates.append(torque * engine["per_inertia"])
+        self.state_rates += [
+            self._balance.pumped_flow,
+            self._balance.returned_flow,
+            self._oil_rate,
+            self._balance.pump_power - tank * self._balance.returned_flow,
+            self._balance.lost_power + self._heat,
+            sum(self.stored_power.values(), 0.0),
+        ]  # of `BALANCE_UNITS`
 
     def _cylinder_equations(
         self,
@@ -146,14 +159,10 @@ class CircuitValues:
         cylinders: list[ValveCylinderEquations] = []
         circuit, remaining_signals = self._circuit, iter(signals)
         for i, (cylinder, valve, _) in enumerate(circuit.cylinders_and_valves):
-            constants, second_spool = (
-                self._constants.cylinders[i],
-                self._constants.second_spools[i],
-            )
-            spool_constants = dict(zip(CYLINDER_CONSTANTS, constants, strict=False)), second_spool
+            constants = self._constants.cylinders[i], self._constants.second_spools[i]
             spools = [
                 spool_equations(name, spool, part, self._states, next(remaining_signals))
-                for part, (name, spool) in zip(spool_constants, valve.spools.items(), strict=False)
+                for part, (name, spool) in zip(constants, valve.spools.items(), strict=False)
             ]
             positions = [u for u, _ in spools]
             self.spool_positions += positions
@@ -161,22 +170,12 @@ class CircuitValues:
             own_states = slice(circuit.cylinder_state_starts[i], circuit.cylinder_state_ends[i])
             cylinders.append(
                 ValveCylinderEquations(
-                    self._constants.common, constants, cylinder, valve, positions, second_spool,
+                    self._constants.common, constants[0], cylinder, valve, positions, constants[1],
                     x[i], v[i], state[own_states],
                 )
             )  # fmt: skip
             self.pressures |= cylinders[i].pressures_by_node
         return cylinders
-
-    def _load_pressures(self) -> dict[str, Scalar]:
-        """Highest load pressure of the valves of each pump whose regulator or valves use it."""
-        pumps = self._circuit.hydraulics.pumps
-        return {
-            name: largest_of([x.sensed_load_pressure(self.tank_pressure) for x in cylinders])
-            for name, cylinders in self._cylinders_by_supply.items()
-            if any(x.valve.sharing for x in cylinders)
-            or (cylinders and name in pumps and pumps[name].control == "load-sensing")
-        }
 
     def _add_cylinder(
         self,
@@ -190,12 +189,16 @@ class CircuitValues:
             Its chambers.
         """
         valve, tank, balance = cylinder.valve, self.tank_pressure, self._balance
+        supply = self.pressures[valve.supply]
+        shortages = [
+            x.relative_shortage(supply, tank)
+            for x in self._cylinders_by_supply[valve.supply]
+            if x.valve.priority and not valve.priority
+        ]
+        priority_share = clip(1.0 - largest_of(shortages), 0.0, 1.0) if shortages else 1.0
         return_pressures = [self.pressures[valve.return_a], self.pressures[valve.return_b]]
         flows = cylinder.flows(
-            self.pressures[valve.supply],
-            return_pressures,
-            loads.get(valve.supply, tank),
-            self._priority_share(cylinder),
+            supply, return_pressures, loads.get(valve.supply, tank), priority_share
         )
         flows += cylinder.leak_and_relief_flows(tank)
         balance.add_flows(flows)
@@ -217,16 +220,6 @@ class CircuitValues:
     def _store(self, name: str, power: Scalar, flow: Scalar) -> None:
         """Add power [W] and oil [m3/s] that a node or spring stores."""
         self.stored_power[name], self._oil_rate = power, self._oil_rate + flow
-
-    def _priority_share(self, cylinder: ValveCylinderEquations) -> Scalar:
-        """Share of the flow that priority valves leave to a valve; see `Valve`."""
-        name, tank = cylinder.valve.supply, self.tank_pressure
-        shortages = [
-            x.relative_shortage(self.pressures[name], tank)
-            for x in self._cylinders_by_supply[name]
-            if x.valve.priority and not cylinder.valve.priority
-        ]
-        return clip(1.0 - largest_of(shortages), 0.0, 1.0) if shortages else 1.0
 
     def _add_pumps(self, loads: dict[str, Scalar]) -> dict[str, PumpEquations]:
         """Add flows of all pumps.
@@ -253,8 +246,9 @@ class CircuitValues:
             self._balance.add_flows(pump.flows)
         for name in self._circuit.hydraulics.pumps:
             if name not in pumps:  # it keeps its pressure at any flow
-                flow = Flow(TANK_NODE, name, -self._balance.net_inflows[name], "pump")
-                self._balance.add_flows([flow])
+                self._balance.add_flows(
+                    [Flow(TANK_NODE, name, -self._balance.net_inflows[name], "pump")]
+                )
         return pumps
 
     def _power_limiting_pressure(self, name: str) -> Scalar:
@@ -263,15 +257,10 @@ class CircuitValues:
         names = pumps[name].summed or (name,)
         if len(names) == 1:
             return self.pressures[names[0]]
-        total: Scalar = 0.0
-        weighted: Scalar = 0.0
-        for pump in names:
-            power: Scalar = pumps[pump].power
-            if pump in self._constants.pumps:  # else its pressure is measured
-                power = self._constants.pumps[pump]["power"]
-            total = total + power
-            weighted = weighted + power * self.pressures[pump]
-        return weighted / total
+        # the pressure of a pump without constants is measured
+        limited = self._constants.pumps
+        powers = [limited[x]["power"] if x in limited else pumps[x].power for x in names]
+        return dot(powers, [self.pressures[x] for x in names]) / sum(powers, 0.0)
 
     def _add_line(self, name: str) -> None:
         """Add the state rates of a line or of a pump with its line."""
@@ -297,24 +286,69 @@ class CircuitValues:
         self._store(name, p * net - cooling_power, net)
         self._heat = self._heat + cooling_power
 
-    def _add_engine(self) -> None:
-        """Add the state rate of the engine."""
-        engine = self._constants.engine
-        pump_torque = sum((pump.torque for pump in self.pumps.values()), 0.0)
-        share = clip(
-            (1.0 + engine["droop"] - self.engine_speed_ratio) * engine["per_droop"], 0.0, 1.0
-        )
-        torque = engine["torque"] * share - pump_torque / engine["speed"]
-        self.state_rates.append(torque * engine["per_inertia"])
 
-    def _add_integrals(self) -> None:
-        """Add the rates of `BALANCE_UNITS`."""
-        balance = self._balance
-        self.state_rates += [
-            balance.pumped_flow,
-            balance.returned_flow,
-            self._oil_rate,
-            balance.pump_power - self.tank_pressure * balance.returned_flow,
-            balance.lost_power + self._heat,
-            sum(self.stored_power.values(), 0.0),
-        ]
+SHAFT_POWER, ROD_POWER = "shaft", "rod"
+STORED_POWERS = ("stored", "spring")
+_MERGED_PATHS = {"piston": "leak", "cross": "relief"}  # flows that are added to others
+
+
+def component_powers(
+    circuit: CircuitEquations, values: CircuitValues, v: Sequence[Scalar]
+) -> dict[str, Scalar]:
+    """Power [W] of every component as `COMPONENT.KIND`, see `PowerBalance`.
+
+    With Q the flow from a node of pressure p_1 to one of p_2, and F the force of a cylinder, the
+    powers are
+
+        throttles Q (p_1 - p_2),    nodes p_i sum of their Q,    rods F v.
+
+    The tank is a node like the others. The power of the shafts is the sum of all other powers.
+
+    Args:
+        circuit: The circuit.
+        values: Its values at the instant.
+        v: (m,) velocities of its joints [m/s], [rad/s].
+    """
+    powers: dict[str, Scalar] = {}
+    p, parts = values.pressures, circuit.hydraulics
+    joints = {f"{joint}.{side}": joint for joint in circuit.joints for side in "ab"}
+
+    def add(owner: str, what: str, power: Scalar) -> None:
+        if isinstance(power, SymbolicExpression) or power != 0:
+            name = f"{owner}.{what}"
+            powers[name] = powers.get(name, 0.0) + power
+
+    for name, pump in values.pumps.items():
+        add(name, SHAFT_POWER, pump.shaft_power)
+        add(name, "friction", pump.lost_power)
+    for flow in values.flows:
+        lost = flow.rate * (p[flow.source] - p[flow.target])
+        element = parts.elements.get(flow.path)
+        if flow.path == "pump":
+            if flow.target not in values.pumps:
+                add(flow.target, SHAFT_POWER, -1.0 * lost)
+        elif element and (element.source, element.target) == flow[:2]:
+            add(flow.path, "element", lost)
+        else:
+            owner = joints.get(flow.target) or joints.get(flow.source) or flow.source
+            if flow.metering_drop is not None:
+                metering_power = flow.rate * flow.metering_drop
+                add(owner, "compensator", lost - metering_power)
+                lost = metering_power
+            add(owner, _MERGED_PATHS.get(flow.path, flow.path), lost)
+    for name, damped in values.damper_power.items():
+        add(name, "damper", damped)
+    for name, force, speed in zip(circuit.joints, values.forces, v, strict=True):
+        add(name, ROD_POWER, force * speed)
+    net_inflows = net_inflows_of(values.flows, p)
+    for name, power in values.stored_power.items():
+        if name in joints:
+            add(joints[name], "stored", power)
+        elif name.endswith(".spring"):
+            add(name.removesuffix(".spring"), "spring", power)
+        else:
+            add(name, "stored", power)
+        if name in parts.accumulators:
+            add(name, "cooling", p[name] * net_inflows[name] - power)
+    add(TANK_NODE, "stored", p[TANK_NODE] * net_inflows[TANK_NODE])
+    return powers

@@ -1,19 +1,16 @@
 """Constants and states of a circuit, and its initial state."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import islice
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from crane.codegen import Scalar
 from crane.common.samples import Array
-from crane.hydraulics.circuit_elements import MAIN_PUMP, Accumulator, Engine, Supply
+from crane.hydraulics.circuit_elements import MAIN_PUMP
 from crane.hydraulics.components import Cylinder, Valve
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.hydraulics.valve_cylinder_equations import (
-    CYLINDER_CONSTANT_COUNT,
-    SPOOL_CONSTANTS,
     cylinder_constants,
     spool_constants,
 )
@@ -26,14 +23,6 @@ BALANCE_UNITS = {
     "oil_pumped": "m3", "oil_returned": "m3", "oil_stored": "m3",
     "pump_work": "J", "hydraulic_loss": "J", "oil_energy": "J",
 }  # fmt: skip
-_COMMON_CONSTANTS = ("oil", "hose", "steel", "vapour", "gas_power", "air", "pump", "tank")
-_PUMP_CONSTANTS = (
-    "pressure", "flow", "per_droop", "line", "margin", "standby", "signal", "throttle", "least",
-    "per_response", "per_sensing", "power", "relief", "relief_gain", "slip", "friction", "drag",
-)  # fmt: skip
-_ENGINE_CONSTANTS = ("speed", "torque", "per_droop", "droop", "per_inertia")
-_ACCUMULATOR_CONSTANTS = ("line", "volume", "precharge", "exponent", "per_time")
-_ELEMENT_CONSTANTS = ("coefficient", "gain", "pressure")
 
 ConstantsByName = dict[str, Scalar]
 StateDefinition = tuple[str, str, float]
@@ -45,7 +34,7 @@ class CircuitConstants(NamedTuple):
 
     Attributes:
         common: Oil, and pressures of main pump and tank.
-        cylinders: Per cylinder, see `cylinder_constants`.
+        cylinders: Per cylinder with its valve, see `cylinder_constants`.
         second_spools: Per cylinder; empty without a second spool.
         pumps: Of the limited pumps, by node.
         unlimited_pressures: Pressures of the other further pumps, by node.
@@ -56,7 +45,7 @@ class CircuitConstants(NamedTuple):
     """
 
     common: ConstantsByName
-    cylinders: list[list[Scalar]]
+    cylinders: list[dict[str, Any]]
     second_spools: list[ConstantsByName]
     pumps: dict[str, ConstantsByName]
     unlimited_pressures: ConstantsByName
@@ -111,9 +100,6 @@ class CircuitStates:
             for name, pump in hydraulics.pumps.items()
             if pump.flow > 0 and not (has_measured_pressures and name == MAIN_PUMP)
         }
-        self._unlimited_pumps = {
-            name: pump for name, pump in hydraulics.supplies.items() if name not in self.pumps
-        }
         self.cylinders_and_valves = [
             (cylinder, valve, 0.0 if cylinder.motor else stroke)
             for cylinder, valve, stroke in zip(
@@ -121,7 +107,10 @@ class CircuitStates:
             )
         ]
         self.engine = hydraulics.engine if self.pumps else None
-        self.constants = np.array([x for row in self._constant_rows() for x in row])
+        self._constants_by_component = list(self._compute_constants())
+        numbers: list[float] = []
+        _map_numbers(self._constants_by_component, numbers.append)
+        self.constants = np.array(numbers)
         cylinder_states = [
             list(self._cylinder_states(*item)) for item in self.cylinders_and_valves
         ]
@@ -170,27 +159,80 @@ class CircuitStates:
         if self.engine is not None:
             yield "engine", "", 1e-7
 
-    def _constant_rows(self) -> Iterator[Sequence[float]]:
-        """Constants by component, in the order of `CircuitConstants`."""
-        oil, supply = self.hydraulics.oil, self.hydraulics.supply
-        yield (
-            1.0 / oil.bulk_modulus, _inverse(oil.hose_modulus), _inverse(oil.steel_modulus),
-            oil.vapour_pressure, 1.0 + 1.0 / oil.gas_exponent, oil.air, supply.pressure,
-            supply.tank,
-        )  # fmt: skip
-        for item in self.cylinders_and_valves:
-            yield cylinder_constants(*item)
-        for _, valve, _ in self.cylinders_and_valves:
-            yield spool_constants(valve.spool_b) if valve.spool_b else ()
-        for pump in self.pumps.values():
-            yield _pump_constants(pump, oil.bulk_modulus)
-        yield [pump.pressure for pump in self._unlimited_pumps.values()]
-        yield _engine_constants(self.engine) if self.engine else ()
-        yield [line.volume / oil.bulk_modulus for line in self.hydraulics.lines.values()]
-        for accumulator in self.hydraulics.accumulators.values():
-            yield _accumulator_constants(accumulator, oil.bulk_modulus)
-        for element in self.hydraulics.elements.values():
-            yield element.coefficient, element.gain, element.pressure
+    def _compute_constants(self) -> CircuitConstants:
+        oil, supply, engine = self.hydraulics.oil, self.hydraulics.supply, self.engine
+        relative_droop = engine.speed_droop / engine.speed if engine else 0.0
+        return CircuitConstants(
+            common={
+                "oil": 1.0 / oil.bulk_modulus,
+                "hose": _inverse(oil.hose_modulus),
+                "steel": _inverse(oil.steel_modulus),
+                "vapour": oil.vapour_pressure,
+                "gas_power": 1.0 + 1.0 / oil.gas_exponent,
+                "air": oil.air,
+                "pump": supply.pressure,
+                "tank": supply.tank,
+            },
+            cylinders=[cylinder_constants(*item) for item in self.cylinders_and_valves],
+            second_spools=[
+                spool_constants(valve.spool_b) if valve.spool_b else {}
+                for _, valve, _ in self.cylinders_and_valves
+            ],
+            pumps={
+                name: {
+                    "pressure": pump.pressure,
+                    "flow": pump.flow,
+                    "per_droop": 1.0 / pump.droop,
+                    "line": pump.volume / oil.bulk_modulus,
+                    "margin": pump.margin,
+                    "standby": pump.standby,
+                    "signal": pump.signal,
+                    "throttle": pump.throttle,
+                    "least": pump.least,
+                    "per_response": _inverse(pump.response),
+                    "per_sensing": _inverse(pump.sensing_time),
+                    "power": pump.power,
+                    "relief": pump.relief,
+                    "relief_gain": pump.relief_gain,
+                    "slip": pump.slip,
+                    "friction": pump.friction,
+                    "drag": pump.drag,
+                }
+                for name, pump in self.pumps.items()
+            },
+            unlimited_pressures={
+                name: pump.pressure
+                for name, pump in self.hydraulics.supplies.items()
+                if name not in self.pumps
+            },
+            engine={
+                "speed": engine.speed,
+                "torque": engine.torque,
+                "per_droop": 1.0 / relative_droop,
+                "droop": relative_droop,
+                "per_inertia": 1.0 / (engine.inertia * engine.speed),
+            }
+            if engine
+            else {},
+            lines={
+                name: line.volume / oil.bulk_modulus
+                for name, line in self.hydraulics.lines.items()
+            },
+            accumulators={
+                name: {
+                    "line": gas.line / oil.bulk_modulus,
+                    "volume": gas.volume,
+                    "precharge": gas.precharge,
+                    "exponent": gas.exponent,
+                    "per_time": _inverse(gas.time_constant),
+                }
+                for name, gas in self.hydraulics.accumulators.items()
+            },
+            elements={
+                name: {"coefficient": x.coefficient, "gain": x.gain, "pressure": x.pressure}
+                for name, x in self.hydraulics.elements.items()
+            },
+        )
 
     def split_constants(self, constants: Sequence[Scalar]) -> CircuitConstants:
         """Constants by component.
@@ -199,27 +241,8 @@ class CircuitStates:
             constants: Values of `constants`, floats or formulas.
         """
         remaining = iter(constants)
-
-        def take(names: Sequence[str] | Mapping[str, object]) -> ConstantsByName:
-            return {name: next(remaining) for name in names}
-
-        hydraulics = self.hydraulics
-        return CircuitConstants(
-            common=take(_COMMON_CONSTANTS),
-            cylinders=[
-                list(islice(remaining, CYLINDER_CONSTANT_COUNT)) for _ in self.cylinders_and_valves
-            ],
-            second_spools=[
-                take(SPOOL_CONSTANTS if valve.spool_b else ())
-                for _, valve, _ in self.cylinders_and_valves
-            ],
-            pumps={name: take(_PUMP_CONSTANTS) for name in self.pumps},
-            unlimited_pressures=take(self._unlimited_pumps),
-            engine=take(_ENGINE_CONSTANTS if self.engine is not None else ()),
-            lines=take(hydraulics.lines),
-            accumulators={name: take(_ACCUMULATOR_CONSTANTS) for name in hydraulics.accumulators},
-            elements={name: take(_ELEMENT_CONSTANTS) for name in hydraulics.elements},
-        )
+        by_component = _map_numbers(self._constants_by_component, lambda _: next(remaining))
+        return CircuitConstants(*by_component)
 
     def initial_state(
         self,
@@ -263,8 +286,9 @@ class CircuitStates:
             values[f"oil_{name}"] = item.volume * (1.0 - item.precharge / max(p, item.precharge))
         if self.engine is not None:
             values["engine"] = 1.0 + self.engine.speed_droop / self.engine.speed
-        stiff_states = [values.get(name, 0.0) for name in self.state_units]
-        return np.array(stiff_states + [0.0] * len(BALANCE_UNITS))
+        return np.array(
+            [values.get(name, 0.0) for name in self.state_units] + [0.0] * len(BALANCE_UNITS)
+        )
 
 
 def _inverse(value: float) -> float:
@@ -272,22 +296,10 @@ def _inverse(value: float) -> float:
     return 1.0 / value if value else 0.0
 
 
-def _pump_constants(pump: Supply, bulk_modulus: float) -> list[float]:
-    return [
-        pump.pressure, pump.flow, 1.0 / pump.droop, pump.volume / bulk_modulus, pump.margin,
-        pump.standby, pump.signal, pump.throttle, pump.least, _inverse(pump.response),
-        _inverse(pump.sensing_time), pump.power, pump.relief, pump.relief_gain, pump.slip,
-        pump.friction, pump.drag,
-    ]  # fmt: skip
-
-
-def _engine_constants(engine: Engine) -> list[float]:
-    relative_droop, inertia = engine.speed_droop / engine.speed, engine.inertia * engine.speed
-    return [engine.speed, engine.torque, 1.0 / relative_droop, relative_droop, 1.0 / inertia]
-
-
-def _accumulator_constants(item: Accumulator, bulk_modulus: float) -> list[float]:
-    return [
-        item.line / bulk_modulus, item.volume, item.precharge, item.exponent,
-        _inverse(item.time_constant),
-    ]  # fmt: skip
+def _map_numbers(tree: Any, function: Callable[[Any], Any]) -> Any:
+    """A tree of dictionaries and lists, with a function of each of its numbers."""
+    if isinstance(tree, dict):
+        return {name: _map_numbers(x, function) for name, x in tree.items()}
+    if isinstance(tree, list):
+        return [_map_numbers(x, function) for x in tree]
+    return function(tree)

@@ -13,7 +13,6 @@ from crane.hydraulics.circuit_elements import (
     check_conditions,
     check_parameters,
     positive_field,
-    positive_field_with_default,
     signed_field,
 )
 from crane.hydraulics.flow_equations import clip
@@ -54,8 +53,7 @@ class OpeningCurve:
         """Share at the stroke |u|, a float or a formula."""
         share: Scalar = self.points[0][1]
         for (u0, share0), (u1, share1) in itertools.pairwise(self.points):
-            slope = (share1 - share0) / (u1 - u0)
-            share = share + slope * (clip(u, u0, u1) - u0)
+            share = share + ((share1 - share0) / (u1 - u0)) * (clip(u, u0, u1) - u0)
         return share
 
 
@@ -139,15 +137,15 @@ class Cylinder:
     leakage_a: float = 0.0
     leakage_b: float = 0.0
     relief: float = 0.0
-    relief_gain: float = positive_field_with_default(1.0e-9)
+    relief_gain: float = positive_field(1.0e-9)
     refill: float = 0.0
     cushion: float = 0.0
-    cushion_coefficient: float = positive_field_with_default(1.0e-7)
+    cushion_coefficient: float = positive_field(1.0e-7)
     stiffness: float = 0.0
-    damping: float = positive_field_with_default(1.0e5)
+    damping: float = positive_field(1.0e5)
     seal_friction: float = 0.0
     brake: float = 0.0
-    brake_release: float = positive_field_with_default(0.05)
+    brake_release: float = positive_field(0.05)
     counterbalance_a: CounterbalanceValve | None = None
     counterbalance_b: CounterbalanceValve | None = None
     cross_relief: float = 0.0
@@ -213,7 +211,7 @@ class Spool:
     full: float = signed_field(1.0)
     dead_band: float = 0.0
     bandwidth: float = 0.0
-    damping: float = positive_field_with_default(1.0)
+    damping: float = positive_field(1.0)
     rate: float = 0.0
     hysteresis: float = 0.0
     delay: float = 0.0
@@ -297,7 +295,7 @@ class Valve:
     full: float = signed_field(1.0)
     dead_band: float = 0.0
     bandwidth: float = 0.0
-    damping: float = positive_field_with_default(1.0)
+    damping: float = positive_field(1.0)
     rate: float = 0.0
     hysteresis: float = 0.0
     delay: float = 0.0
@@ -354,8 +352,9 @@ class Valve:
 
     def opening(self, u: float) -> float:
         """Opening y at a spool position u."""
-        size = min(max((abs(u) - self.dead_band) / (1.0 - self.dead_band), 0.0), 1.0)
-        return math.copysign(size, u)
+        return math.copysign(
+            min(max((abs(u) - self.dead_band) / (1.0 - self.dead_band), 0.0), 1.0), u
+        )
 
 
 def _check_spool(spool: Spool | Valve, label: str) -> None:

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import reduce
 from typing import NamedTuple
 
-from crane.codegen import SymbolicExpression
 from crane.codegen.symbolic import (
     Scalar,
+    SymbolicExpression,
     apply_function,
     copysign,
     maximum,
@@ -61,8 +61,9 @@ def signed_square_root(drop: Scalar) -> Scalar:
     sign(d) sqrt(|d|) beyond L = `LAMINAR_PRESSURE_DROP`. Within, where the flow becomes laminar,
     the odd cubic that continues it with equal derivative, d / sqrt(L) (5 - (d / L)^2) / 4.
     """
-    laminar_drop = clip(drop, -LAMINAR_PRESSURE_DROP, LAMINAR_PRESSURE_DROP)
-    share = laminar_drop * (1.0 / LAMINAR_PRESSURE_DROP)
+    share = clip(drop, -LAMINAR_PRESSURE_DROP, LAMINAR_PRESSURE_DROP) * (
+        1.0 / LAMINAR_PRESSURE_DROP
+    )
     cubic = LAMINAR_PRESSURE_DROP**0.5 * share * (1.25 - 0.25 * share * share)
     turbulent = (
         apply_function("sqrt", maximum(apply_function("abs", drop), LAMINAR_PRESSURE_DROP))
@@ -147,8 +148,9 @@ class FlowBalance:
                 self.returned_flow = self.returned_flow + rate
             elif source == TANK_NODE:
                 self.returned_flow = self.returned_flow - rate
-            drop = self._node_pressures[source] - self._node_pressures[target]
-            self.lost_power = self.lost_power + rate * drop
+            self.lost_power = self.lost_power + rate * (
+                self._node_pressures[source] - self._node_pressures[target]
+            )
 
 
 def net_inflows_of(flows: Iterable[Flow], nodes: Iterable[str]) -> dict[str, Scalar]:
@@ -233,14 +235,14 @@ def accumulator_equations(
         compliance = volume * apply_function("exp", log_volume_ratio / n) / (n * gas_pressure)
         return [inflow / (line + clip(opening_share, 0.0, 1.0) * compliance)], 0.0
     gas_volume = clip(volume - oil, _MIN_GAS_SHARE * volume, volume)
-    isothermal = precharge * volume / gas_volume
-    cooling = (p - isothermal) * constants["per_time"]
+    cooling = (p - (precharge * volume / gas_volume)) * constants["per_time"]
     moving_share = clip(maximum(opening_share, oil / (_EMPTY_SHARE * volume)), 0.0, 1.0)
     pressure_rate = (n * p * inflow / gas_volume - moving_share * cooling) / (
         moving_share + line * n * p / gas_volume
     )
-    heat_flow = moving_share * gas_volume * cooling / (n - 1.0)
-    return [pressure_rate, inflow - line * pressure_rate], heat_flow
+    return [pressure_rate, inflow - line * pressure_rate], moving_share * gas_volume * cooling / (
+        n - 1.0
+    )
 
 
 def element_flow(

@@ -18,7 +18,7 @@ from crane.hydraulics.circuit_elements import (
     check_parameters,
     check_pump_pressures,
     check_summed_pumps,
-    positive_field_with_default,
+    positive_field,
 )
 from crane.hydraulics.components import Cylinder, Spool, Valve
 
@@ -37,11 +37,11 @@ class Oil:
         air: Volume of free air at 1e5 Pa, as a share of the volume of the oil.
     """
 
-    bulk_modulus: float = positive_field_with_default(1.65e9)
+    bulk_modulus: float = positive_field(1.65e9)
     hose_modulus: float = 0.0
     steel_modulus: float = 0.0
     vapour_pressure: float = 1.0e3
-    gas_exponent: float = positive_field_with_default(1.4)
+    gas_exponent: float = positive_field(1.4)
     air: float = 0.0
 
     def __post_init__(self) -> None:
@@ -111,40 +111,32 @@ class Hydraulics:
                     raise CircuitPathError(
                         (section, name), f"two nodes are called '{name}', give them names"
                     )
-        for joint in self.valves:
-            self._check_valve(joint)
-        for name in self.elements:
-            self._check_element(name)
-
-    def _check_valve(self, joint: str) -> None:
-        """Check the connections of the valve of a joint."""
-        valve, path, label = self.valves[joint], ("valves", joint), f"valve of '{joint}'"
-        if valve.supply not in self.pumps:
-            raise CircuitPathError(
-                (*path, "supply"),
-                f"{label} is fed by '{valve.supply}', {suggest_names(self.pumps, valve.supply)}",
-            )
-        if valve.spool_b and f"{joint}_b" in self.valves:
-            raise CircuitPathError(
-                (*path, "spool_b"),
-                f"the second spool of '{joint}' is called as the joint '{joint}_b', give that "
-                "another name",
-            )
-        nodes = [x for x in self.node_names if x not in self._chamber_nodes]
-        _check_node(nodes, label, valve.return_a, (*path, "return_a"))
-        _check_node(nodes, label, valve.return_b, (*path, "return_b"))
-
-    def _check_element(self, name: str) -> None:
-        """Check the nodes of an element, and the joints that open it."""
-        element, path, label = self.elements[name], ("elements", name), f"element '{name}'"
-        _check_node(self.node_names, label, element.source, (*path, "from"))
-        _check_node(self.node_names, label, element.target, (*path, "to"))
-        for joint in element.joints:
-            if joint not in self.valves:
+        return_nodes = [x for x in self.node_names if x not in self._chamber_nodes]
+        for joint, valve in self.valves.items():
+            path, label = ("valves", joint), f"valve of '{joint}'"
+            if valve.supply not in self.pumps:
+                hint = suggest_names(self.pumps, valve.supply)
                 raise CircuitPathError(
-                    (*path, "joints"),
-                    f"{label} is opened by '{joint}', {suggest_names(self.valves, joint)}",
+                    (*path, "supply"), f"{label} is fed by '{valve.supply}', {hint}"
                 )
+            if valve.spool_b and f"{joint}_b" in self.valves:
+                raise CircuitPathError(
+                    (*path, "spool_b"),
+                    f"the second spool of '{joint}' is called as the joint '{joint}_b', give that "
+                    "another name",
+                )
+            _check_node(return_nodes, label, valve.return_a, (*path, "return_a"))
+            _check_node(return_nodes, label, valve.return_b, (*path, "return_b"))
+        for name, element in self.elements.items():
+            path, label = ("elements", name), f"element '{name}'"
+            _check_node(self.node_names, label, element.source, (*path, "from"))
+            _check_node(self.node_names, label, element.target, (*path, "to"))
+            for joint in element.joints:
+                if joint not in self.valves:
+                    raise CircuitPathError(
+                        (*path, "joints"),
+                        f"{label} is opened by '{joint}', {suggest_names(self.valves, joint)}",
+                    )
 
     @property
     def pumps(self) -> dict[str, Supply]:

@@ -66,8 +66,10 @@ class PumpEquations:
         )
         self.share = requested_share if share is None else share
         if share is not None:
-            share_rate = (requested_share - share) * constants["per_response"]
-            self.state_rates = [share_rate, *self.state_rates]
+            self.state_rates = [
+                (requested_share - share) * constants["per_response"],
+                *self.state_rates,
+            ]
         gauge_pressure = self._pressure - self._tank_pressure
         delivered = self.share * constants["flow"] * speed
         self.flows.append(Flow(TANK_NODE, name, delivered, "pump"))
@@ -123,8 +125,9 @@ class PumpEquations:
         elif control == "negative":
             share = minimum(1.0 - throttle_pressure / constants["signal"], cut_off)
         elif control == "positive":
-            demand = sum((cylinder.pump_demand for cylinder in self._cylinders), 0.0)
-            share = minimum(demand, cut_off)
+            share = minimum(
+                sum((cylinder.pump_demand for cylinder in self._cylinders), 0.0), cut_off
+            )
         if self._supply.power > 0:
             full_flow_power = constants["flow"] * maximum(
                 power_limiting_pressure - self._tank_pressure, _MIN_LIMITING_PRESSURE

@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from crane.codegen.symbolic import Scalar, apply_function, maximum, minimum, where_positive
 from crane.hydraulics.circuit_elements import TANK_NODE
-from crane.hydraulics.components import CounterbalanceValve, Cylinder, Spool, Valve
+from crane.hydraulics.components import Cylinder, Spool, Valve
 from crane.hydraulics.flow_equations import (
     LAMINAR_PRESSURE_DROP,
     SENSING_OPENING_GAIN,
@@ -30,12 +31,6 @@ CYLINDER_CONSTANTS = (
     "regeneration", "float_from", "per_float", "float_coefficient", "demand", "hysteresis",
     "seal_friction", "brake", "per_release",
 )  # fmt: skip
-SPOOL_CONSTANTS = (
-    "neutral", "per_signal", "dead_band", "per_stroke", "bandwidth", "spool_damping", "rate",
-    "hysteresis",
-)  # fmt: skip
-_COUNTERBALANCE_CONSTANTS = ("pressure", "pilot_ratio", "per_range", "coefficient")
-CYLINDER_CONSTANT_COUNT = len(CYLINDER_CONSTANTS) + 2 * len(_COUNTERBALANCE_CONSTANTS)
 
 
 @dataclass
@@ -70,7 +65,7 @@ class ValveCylinderEquations:
         cylinder: Description of the cylinder.
         valve: Description of the valve.
         spool_positions: Position u; with two spools, those of the spools of A and B.
-        second_spool: Constants of the second spool, see `SPOOL_CONSTANTS`.
+        second_spool: Constants of the second spool, see `spool_constants`.
         x: Coordinate above the lower limit [m], [rad].
         v: Velocity [m/s], [rad/s].
         states: States of the pressures in A and B, then the compression of the series spring.
@@ -91,7 +86,7 @@ class ValveCylinderEquations:
     def __init__(
         self,
         oil_constants: dict[str, Scalar],
-        constants: Sequence[Scalar],
+        constants: Mapping[str, Any],
         cylinder: Cylinder,
         valve: Valve,
         spool_positions: Sequence[Scalar],
@@ -103,14 +98,10 @@ class ValveCylinderEquations:
         self.joint, self.valve, self._cylinder = cylinder.joint, valve, cylinder
         self._oil_constants, self._states = oil_constants, states
         self._spool_positions = spool_positions
-        count, width = len(CYLINDER_CONSTANTS), len(_COUNTERBALANCE_CONSTANTS)
-        named = self._constants = dict(zip(CYLINDER_CONSTANTS, constants, strict=False))
-        self._counterbalance_constants = [
-            dict(zip(_COUNTERBALANCE_CONSTANTS, constants[count + side * width :], strict=False))
-            for side in range(2)
+        named = self._constants = constants
+        self.pressures = [
+            oil_constants["vapour"] + maximum(states[side], 0.0) for side in range(2)
         ]
-        vapour = oil_constants["vapour"]
-        self.pressures = [vapour + maximum(states[side], 0.0) for side in range(2)]
         self._areas = [named["area_a"], named["area_b"]]
         self.force = self._areas[0] * self.pressures[0] - self._areas[1] * self.pressures[1]
         self.spring_rate: list[Scalar] = []
@@ -155,13 +146,19 @@ class ValveCylinderEquations:
 
     def sensed_load_pressure(self, tank: Scalar) -> Scalar:
         """Load pressure that its valve reports; the tank pressure while it is closed [Pa]."""
-        shares = zip(self._sensing_shares, self.pressures, strict=True)
-        return tank + maximum(*(share * (p - tank) for share, p in shares))
+        return tank + maximum(
+            *(
+                share * (p - tank)
+                for share, p in zip(self._sensing_shares, self.pressures, strict=True)
+            )
+        )
 
     def relative_shortage(self, supply: Scalar, tank: Scalar) -> Scalar:
         """Missing pressure of the pump, relative to the range of `Valve.priority`."""
-        share = largest_of(self._sensing_shares)
-        required_pressure = self.sensed_load_pressure(tank) + share * self._constants["margin"]
+        required_pressure = (
+            self.sensed_load_pressure(tank)
+            + largest_of(self._sensing_shares) * self._constants["margin"]
+        )
         return (required_pressure - supply) / (_PRIORITY_MARGIN_SHARE * self._constants["margin"])
 
     def open_centre_coefficient(self) -> Scalar:
@@ -239,8 +236,7 @@ class ValveCylinderEquations:
         constants, flows = self._constants, []
         for name, p in zip("ab", self.pressures, strict=True):
             node = f"{self.joint}.{name}"
-            leakage = constants[f"leakage_{name}"] * (p - tank)
-            flows.append(Flow(node, TANK_NODE, leakage, "leak"))
+            flows.append(Flow(node, TANK_NODE, constants[f"leakage_{name}"] * (p - tank), "leak"))
             if self._cylinder.relief > 0:
                 rate = constants["relief_gain"] * maximum(p - constants["relief"], 0.0)
                 flows.append(Flow(node, TANK_NODE, rate, "relief"))
@@ -319,8 +315,9 @@ class ValveCylinderEquations:
         elif self.valve.margin > 0:
             drop = clip(supply - p, 0.0, margin)
         else:
-            outflow = series_coefficient(inlet, *self._outflow_restrictions(side))
-            return directional_flow(supply - p, inlet, outflow), None
+            return directional_flow(
+                supply - p, inlet, series_coefficient(inlet, *self._outflow_restrictions(side))
+            ), None
         return inlet * signed_square_root(drop), drop
 
     def _has_rupture_valve(self, side: int) -> bool:
@@ -334,7 +331,7 @@ class ValveCylinderEquations:
     def _outflow_restrictions(self, side: int) -> tuple[Scalar | None, Scalar]:
         """Coefficient of the load-holding valve, and 1 / c^2 of the cushion."""
         holding, p, other = None, self.pressures[side], self.pressures[1 - side]
-        valve = self._counterbalance_constants[side]
+        valve = self._constants["counterbalance"][side]
         if (self._cylinder.counterbalance_a, self._cylinder.counterbalance_b)[side] is not None:
             opening_pressure = p + valve["pilot_ratio"] * other - valve["pressure"]
             holding = valve["coefficient"] * clip(opening_pressure * valve["per_range"], 0.0, 1.0)
@@ -360,7 +357,7 @@ def spool_equations(
     Args:
         name: Name of its signal.
         spool: Its description.
-        constants: Its constants, among them `SPOOL_CONSTANTS`.
+        constants: Its constants, among them `spool_constants`.
         states: States of the circuit by name.
         signal: Signal at the spool [V].
     """
@@ -377,38 +374,47 @@ def spool_equations(
     w, limited_speed = constants["bandwidth"], speed
     if spool.rate > 0:
         limited_speed = clip(speed, -1.0 * constants["rate"], constants["rate"])
-    acceleration = w * (w * (target - u) - 2.0 * constants["spool_damping"] * speed)
-    return u, [*rates, limited_speed, acceleration]
+    return u, [
+        *rates,
+        limited_speed,
+        w * (w * (target - u) - 2.0 * constants["spool_damping"] * speed),
+    ]
 
 
-def cylinder_constants(cylinder: Cylinder, valve: Valve, stroke: float) -> list[float]:
-    """Constants of a cylinder and its valve: `CYLINDER_CONSTANTS`, then counterbalance valves."""
+def cylinder_constants(cylinder: Cylinder, valve: Valve, stroke: float) -> dict[str, Any]:
+    """`CYLINDER_CONSTANTS` of a cylinder with its valve, and those of counterbalance valves."""
     values = {
         **vars(valve),
         **vars(cylinder),
         "cushion_resistance": cylinder.cushion_coefficient**-2,
         "stroke": stroke,
-        **dict(zip(SPOOL_CONSTANTS, spool_constants(valve), strict=True)),
+        **spool_constants(valve),
         "per_float": 1.0 / (1.0 - valve.float_from),
         "per_release": 1.0 / cylinder.brake_release,
     }
-    return [
-        *(float(values[name]) for name in CYLINDER_CONSTANTS),
-        *_counterbalance_constants(cylinder.counterbalance_a),
-        *_counterbalance_constants(cylinder.counterbalance_b),
+    valves = cylinder.counterbalance_a, cylinder.counterbalance_b
+    counterbalance = [
+        {
+            "pressure": x.pressure if x else 0.0,
+            "pilot_ratio": x.pilot_ratio if x else 0.0,
+            "per_range": 1.0 / x.range if x else 0.0,
+            "coefficient": x.coefficient if x else 0.0,
+        }
+        for x in valves
     ]
+    named = {name: float(values[name]) for name in CYLINDER_CONSTANTS}
+    return named | {"counterbalance": counterbalance}
 
 
-def spool_constants(spool: Valve | Spool) -> list[float]:
-    """Constants of a spool, see `SPOOL_CONSTANTS`."""
-    return [
-        spool.neutral, 1.0 / (spool.full - spool.neutral), spool.dead_band,
-        1.0 / (1.0 - spool.dead_band), spool.bandwidth, spool.damping, spool.rate,
-        spool.hysteresis,
-    ]  # fmt: skip
-
-
-def _counterbalance_constants(valve: CounterbalanceValve | None) -> list[float]:
-    if valve is None:
-        return [0.0] * len(_COUNTERBALANCE_CONSTANTS)
-    return [valve.pressure, valve.pilot_ratio, 1.0 / valve.range, valve.coefficient]
+def spool_constants(spool: Valve | Spool) -> dict[str, float]:
+    """Constants of a spool."""
+    return {
+        "neutral": spool.neutral,
+        "per_signal": 1.0 / (spool.full - spool.neutral),
+        "dead_band": spool.dead_band,
+        "per_stroke": 1.0 / (1.0 - spool.dead_band),
+        "bandwidth": spool.bandwidth,
+        "spool_damping": spool.damping,
+        "rate": spool.rate,
+        "hysteresis": spool.hysteresis,
+    }

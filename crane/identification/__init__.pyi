@@ -12,5 +12,5 @@ from .mechanics.identification_model import IdentificationModel as Identificatio
 from .mechanics.identification_result import Identification as Identification
 from .mechanics.identify import identify as identify
 from .mechanics.identify_payload import identify_payload as identify_payload
-from .mechanics.model_term import ModelTerm as ModelTerm
+from .mechanics.model_terms import ModelTerm as ModelTerm
 from .mechanics.write_identified import write_identified as write_identified

@@ -44,8 +44,9 @@ def find_wrong_axis(
     data = model.createData()
     # at zero coordinates a wrong axis has not moved anything out of the plane
     coordinates = equations.coordinates
-    at = coordinates.configuration(np.zeros(model.nv))
-    jacobian = pin.computeJointJacobians(model, data, at).reshape(6, -1)
+    jacobian = pin.computeJointJacobians(
+        model, data, coordinates.configuration(np.zeros(model.nv))
+    ).reshape(6, -1)
     sliding, names = coordinates.is_translation, coordinates.names
     for index, loop in enumerate(loops):
         if loop.type not in (*_REVOLUTE_LOOP_TYPES, "prismatic"):
@@ -70,7 +71,8 @@ def find_wrong_axis(
             if column is None:
                 changed_loops[index] = dataclasses.replace(loop, axis=corrected_axis)
             else:
-                changed = _replace_joint_axis(spec, names[column], corrected_axis)
+                joint = dataclasses.replace(spec.tree.joints[names[column]], axis=corrected_axis)
+                changed = dataclasses.replace(spec, tree=spec.tree.with_parts(joint))
             try:
                 close_loops(changed, changed_loops)
             except CraneError:
@@ -89,8 +91,7 @@ def _axis_frame(model: pin.Model, data: pin.Data, element: LoopSpec | str) -> Ar
         frame: Array = data.oMi[link.parentJoint].rotation @ link.placement.rotation
     else:
         joint = model.getJointId(element)
-        above = data.oMi[model.parents[joint]].rotation
-        frame = above @ model.jointPlacements[joint].rotation
+        frame = data.oMi[model.parents[joint]].rotation @ model.jointPlacements[joint].rotation
     return frame
 
 
@@ -141,13 +142,6 @@ def _corrected_axis(axis: Array, normal: Array, is_rotation: bool) -> tuple[floa
         corrected = -corrected
     x, y, z = (float(value) + 0.0 for value in corrected)
     return x, y, z
-
-
-def _replace_joint_axis(
-    spec: MachineSpec, name: str, axis: tuple[float, float, float]
-) -> MachineSpec:
-    joint = dataclasses.replace(spec.tree.joints[name], axis=axis)
-    return dataclasses.replace(spec, tree=spec.tree.with_parts(joint))
 
 
 def _wrong_axis_error(

@@ -1,6 +1,5 @@
 """Selection of active and free joints, and of redundant drives, from a description."""
 
-import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -9,15 +8,13 @@ import pinocchio as pin
 from crane.closure.active_joint_selection import (
     DEAD_CENTRE_TOLERANCE,
     ActiveJointSelection,
-    format_selections,
-    motion_scales,
     null_space_basis,
     propose_active_joints,
     select_columns,
 )
 from crane.closure.coordinates import Coordinates
 from crane.closure.loop_equations import LoopEquations
-from crane.common.errors import CraneWarning
+from crane.common.one_line_repr import format_count
 from crane.common.samples import Array
 from crane.description.floating_bases import floating_series
 from crane.description.specification import Drive, MachineSpec
@@ -31,8 +28,11 @@ _SECTIONS_OF_ACTIVE_JOINTS = {
 
 def specified_driven_joints(spec: MachineSpec) -> tuple[str, ...]:
     """Joints that the file specifies as driven, each once, in its order."""
-    named = [joint for drive in spec.drives for joint in drive.factors] or list(spec.active or ())
-    return tuple(dict.fromkeys(named))
+    return tuple(
+        dict.fromkeys(
+            [joint for drive in spec.drives for joint in drive.factors] or list(spec.active or ())
+        )
+    )
 
 
 def specified_active_joints(spec: MachineSpec, model: pin.Model) -> tuple[str, ...]:
@@ -48,8 +48,11 @@ def specified_active_joints(spec: MachineSpec, model: pin.Model) -> tuple[str, .
 
 def specified_free_joints(spec: MachineSpec) -> tuple[str, ...]:
     """Coordinates that the file names as free, and those of floating bases."""
-    floating = (joint for series in floating_series(spec).values() for joint in series)
-    return tuple(dict.fromkeys((*spec.free, *floating)))
+    return tuple(
+        dict.fromkeys(
+            (*spec.free, *(joint for series in floating_series(spec).values() for joint in series))
+        )
+    )
 
 
 def select_free_joints(spec: MachineSpec, active: Sequence[str]) -> tuple[str, ...]:
@@ -70,7 +73,7 @@ def select_motors(spec: MachineSpec, active: Sequence[str]) -> tuple[Drive, ...]
 
 
 def complete_active_joints(
-    spec: MachineSpec, model: pin.Model, equations: LoopEquations, jacobian: Array
+    spec: MachineSpec, equations: LoopEquations, jacobian: Array
 ) -> tuple[tuple[str, ...], str] | None:
     """Active joints where the file names too few, too many or none.
 
@@ -80,16 +83,15 @@ def complete_active_joints(
 
     Args:
         spec: The machine as read.
-        model: Its tree.
         equations: Its loop equations.
         jacobian: (m, nv) of all loop equations at a closed configuration.
 
     Returns:
         Names, and a text about the completion; None if there is no selection.
     """
-    basis = null_space_basis(jacobian, motion_scales(model), DEAD_CENTRE_TOLERANCE)
+    basis = null_space_basis(jacobian, equations.motion_scales, DEAD_CENTRE_TOLERANCE)
     names = equations.coordinates.names
-    coupled = [int(i) for i in np.flatnonzero((equations.coupling_factors != 0).any(axis=0))]
+    is_coupled = (equations.coupling_factors != 0).any(axis=0)
     driven = spec.active or specified_driven_joints(spec)
     undriven = specified_free_joints(spec)
     specified = tuple(dict.fromkeys((*driven, *undriven)))
@@ -100,23 +102,26 @@ def complete_active_joints(
     )  # the right number, but not independent
     if not mobility or is_undecided or (is_dependent and not spec.drives):
         return None
+    mobility_text = format_count(mobility, "degree of freedom", "degrees of freedom")
     if not driven:
-        free = [names.index(name) for name in undriven]
-        found = propose_active_joints(model, jacobian, coupled, required=free)
+        found = propose_active_joints(
+            equations, jacobian, required=[names.index(name) for name in undriven]
+        )
         if not found:
             return None
-        driven_selections = [
-            ActiveJointSelection(
-                tuple(x for x in one.joints if x not in undriven), one.condition_number
+        driven_selections = ", or ".join(
+            str(
+                ActiveJointSelection(
+                    tuple(x for x in one.joints if x not in undriven), one.condition_number
+                )
             )
             for one in found
-        ]
-        text = f"no active joints named, taken as driven: {format_selections(driven_selections)}"
-        return found[0].joints, f"{_format_mobility(mobility)} and {text}"
+        )
+        text = f"no active joints named, taken as driven: {driven_selections}"
+        return found[0].joints, f"{mobility_text} and {text}"
     independent = _independent_columns(basis, [names.index(name) for name in specified])
     redundant = [name for name in specified if names.index(name) not in independent]
-    others = [i for i in range(len(names)) if i not in coupled]
-    chosen = select_columns(basis, others, independent)
+    chosen = select_columns(basis, np.flatnonzero(~is_coupled).tolist(), independent)
     if chosen is None:
         chosen = select_columns(basis, range(len(names)), independent)
     if chosen is None:
@@ -131,11 +136,13 @@ def complete_active_joints(
         remarks.append(
             f"nothing drives {', '.join(added)}, free but for friction, springs and stops"
         )
-    count = f"{len(driven)} active joint{'s' * (len(driven) != 1)}"
+    count = format_count(len(driven), "active joint")
     if undriven:
         count += f" and {len(undriven)} free"
-    head = f"{count} for {_format_mobility(mobility)}"
-    return (*(names[i] for i in independent), *added), f"{head}: {'; '.join(remarks)}"
+    return (
+        (*(names[i] for i in independent), *added),
+        f"{count} for {mobility_text}: {'; '.join(remarks)}",
+    )
 
 
 def _independent_columns(basis: Array, columns: Sequence[int]) -> list[int]:
@@ -146,13 +153,3 @@ def _independent_columns(basis: Array, columns: Sequence[int]) -> list[int]:
         if len(independent) < basis.shape[1] and values.min() > DEAD_CENTRE_TOLERANCE:
             independent.append(column)
     return independent
-
-
-def _format_mobility(count: int) -> str:
-    return f"{count} degree{'s' * (count != 1)} of freedom"
-
-
-def warn_about_completion(spec: MachineSpec, text: str) -> None:
-    """Warn of the completed active joints."""
-    where = spec.source_locations.get("active", spec.path.name)
-    warnings.warn(f"{where}: {text}; name them as active and free", CraneWarning, stacklevel=4)

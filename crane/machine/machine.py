@@ -314,8 +314,9 @@ class Machine(OneLineRepr):
         Raises:
             InputError: A joint or frame is unknown or does not fit the element.
         """
-        elements: list[AnyForceElement] = [*(forces or ()), *(gas_springs or ()), *(ropes or ())]
-        check_force_elements(self.closure, elements, self.frame)
+        check_force_elements(
+            self.closure, [*(forces or ()), *(gas_springs or ()), *(ropes or ())], self.frame
+        )
         for joint in friction or {}:
             self.column(joint)
         for stop in end_stops or ():
@@ -452,5 +453,6 @@ class Machine(OneLineRepr):
         load = payload.rigid_body()
         model = pin.Model(self.model)
         model.appendBodyToJoint(frame.parentJoint, load, frame.placement)
-        tree = add_rigid_load(self.tree, payload.frame, load)
-        return dataclasses.replace(self, model=model, tree=tree)
+        return dataclasses.replace(
+            self, model=model, tree=add_rigid_load(self.tree, payload.frame, load)
+        )

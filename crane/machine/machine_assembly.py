@@ -1,6 +1,7 @@
 """Assembly of the spanning tree and the closure from a description."""
 
 import dataclasses
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
@@ -10,7 +11,7 @@ from crane.closure.closure import Closure
 from crane.closure.constraint_structure import ActiveJointError, OpenLoopError
 from crane.closure.coordinates import Coordinates
 from crane.closure.loop_equations import LoopEquations, frame_id
-from crane.common.errors import DescriptionError, MechanismError, prefix_location
+from crane.common.errors import CraneWarning, DescriptionError, MechanismError, prefix_location
 from crane.common.samples import Array
 from crane.description.findings import error_recovery, is_strict, report_error
 from crane.description.floating_bases import floating_bases
@@ -23,7 +24,6 @@ from crane.machine.drive_selection import (
     complete_active_joints,
     select_free_joints,
     specified_active_joints,
-    warn_about_completion,
 )
 
 _MAX_MOVING_JOINTS = 1000  # closing takes time in proportion to its cube
@@ -87,8 +87,13 @@ def build_closure(
         error = refused
 
     def close(changed: MachineSpec, some: Sequence[LoopSpec]) -> object:
-        tree = model if changed.tree is spec.tree else assemble_tree(changed)
-        return Closure(tree, some, names, initial_guess, present_couplings)
+        return Closure(
+            model if changed.tree is spec.tree else assemble_tree(changed),
+            some,
+            names,
+            initial_guess,
+            present_couplings,
+        )
 
     if names and (error.subject == "active" or error.subject.startswith("loop ")):
         axis_error = find_wrong_axis(spec, model, loops, close)
@@ -112,8 +117,15 @@ def _create_closure(
     loops: Sequence[LoopSpec],
 ) -> Closure:
     """The closure; joints whose home the file does not specify may move in the home search."""
-    movable = set(select_free_joints(spec, names)) - spec.home.keys()
-    return Closure(model, loops, names, initial_guess, spec.couplings, spec.home, movable)
+    return Closure(
+        model,
+        loops,
+        names,
+        initial_guess,
+        spec.couplings,
+        spec.home,
+        set(select_free_joints(spec, names)) - spec.home.keys(),
+    )
 
 
 def _closure_with_completed_joints(
@@ -125,7 +137,7 @@ def _closure_with_completed_joints(
 ) -> Closure | None:
     """The closure with completed active joints, None if there is no selection."""
     equations = LoopEquations(model, loops, spec.couplings)
-    choice = complete_active_joints(spec, model, equations, active_joint_error.jacobian)
+    choice = complete_active_joints(spec, equations, active_joint_error.jacobian)
     if choice is None:
         return None
     names, text = choice
@@ -139,12 +151,16 @@ def _closure_with_completed_joints(
         except MechanismError:
             return None
     if closure.home_search is not None:  # home is far from where they were selected
-        jacobian = equations.evaluate(closure.home)[1][closure.structure.independent_rows]
-        improved = complete_active_joints(spec, model, equations, jacobian)
+        improved = complete_active_joints(
+            spec,
+            equations,
+            equations.evaluate(closure.home)[1][closure.structure.independent_rows],
+        )
         if improved is not None and improved[0] != names:
             text = improved[1]
             closure = _closure_by_other_joints(closure, improved[0])
-    warn_about_completion(spec, text)
+    where = spec.source_locations.get("active", spec.path.name)
+    warnings.warn(f"{where}: {text}; name them as active and free", CraneWarning, stacklevel=3)
     return closure
 
 
@@ -195,8 +211,10 @@ def assemble_tree(spec: MachineSpec) -> pin.Model:
     while pending:
         joint = pending.pop()
         if joint.name in floating_series:
-            last = _add_floating_base(model, frames, *floating_series[joint.name], tree)
-            pending += _joints_in_reverse_order(joints_by_parent, last)
+            pending += _joints_in_reverse_order(
+                joints_by_parent,
+                _add_floating_base(model, frames, *floating_series[joint.name], tree),
+            )
             continue
         mass = inertia_from_inertial(tree.links[joint.child].inertial)
         try:
@@ -235,8 +253,9 @@ def _add_joint(model: pin.Model, parent: int, joint: Joint, mass: pin.Inertia) -
         parent_frame.placement * se3_from_xyz_rpy(joint.xyz, joint.rpy),
     )
     if not joint.is_movable:
-        fixed = pin.FrameType.FIXED_JOINT
-        frame = model.addFrame(pin.Frame(joint.name, parent_joint, parent, placement, fixed, mass))
+        frame = model.addFrame(
+            pin.Frame(joint.name, parent_joint, parent, placement, pin.FrameType.FIXED_JOINT, mass)
+        )
         return int(model.addBodyFrame(joint.child, parent_joint, placement, frame))
     limits = (
         np.array([getattr(joint.limits, key)]) for key in ("effort", "velocity", "lower", "upper")
@@ -259,8 +278,9 @@ def _add_floating_base(
     index = model.addJoint(parent_frame.parentJoint, pin.JointModelFreeFlyer(), placement, name)
     model.addJointFrame(index, frames[joints[0].parent])
     last = joints[-1].child
-    mass = inertia_from_inertial(tree.links[last].inertial)
-    model.appendBodyToJoint(index, mass, pin.SE3.Identity())
+    model.appendBodyToJoint(
+        index, inertia_from_inertial(tree.links[last].inertial), pin.SE3.Identity()
+    )
     for joint in joints:
         frames[joint.child] = int(model.addBodyFrame(joint.child, index, pin.SE3.Identity(), -1))
     return last
@@ -289,23 +309,20 @@ def _check_body_inertias(spec: MachineSpec, model: pin.Model) -> None:
     floating = floating_bases(spec)
     for index in range(1, model.njoints):
         name = model.names[index]
-        joint = spec.tree.joints[floating[name][-1] if name in floating else name]
-        link = links[joint.child]
+        link = links[spec.tree.joints[floating[name][-1] if name in floating else name].child]
         if link.composite_joint is not None or index in refused_joints:
             continue
+        problem = inertia_problem(model.inertias[index].mass, model.inertias[index].inertia)
+        # formal problems that were already reported are accepted
+        is_accepted = index in joints_with_findings and (
+            _has_inertia_finding(link) or not is_strict()
+        )
+        if problem is None or (is_accepted and problem.is_formal):
+            continue
         with error_recovery(harmless=True):
-            _check_body_inertia(link, model.inertias[index], index in joints_with_findings)
+            text = f"link '{link.name}' with what is fixed to it has {problem}"
+            raise DescriptionError(f"{link.source_location}: {text}")
 
 
 def _has_inertia_finding(link: Link) -> bool:
     return link.inertial is not None and bool(link.inertial.finding_location)
-
-
-def _check_body_inertia(link: Link, inertia: pin.Inertia, has_finding: bool) -> None:
-    """Refuse an infeasible inertia; formal problems that were already reported are accepted."""
-    problem = inertia_problem(inertia.mass, inertia.inertia)
-    is_accepted = has_finding and (_has_inertia_finding(link) or not is_strict())
-    if problem is not None and not (is_accepted and problem.is_formal):
-        raise DescriptionError(
-            f"{link.source_location}: link '{link.name}' with what is fixed to it has {problem}"
-        )

@@ -75,8 +75,11 @@ def _replace_by_nearest_feasible(
     for link in links:
         assert link.inertial is not None
         tensor = nearest_inertia(link.inertial.inertia_matrix)[np.triu_indices(3)]
-        body = dataclasses.replace(link.inertial, tensor=tuple(tensor.tolist()))
-        made.append(dataclasses.replace(link, inertial=body))
+        made.append(
+            dataclasses.replace(
+                link, inertial=dataclasses.replace(link.inertial, tensor=tuple(tensor.tolist()))
+            )
+        )
     spec = dataclasses.replace(spec, tree=spec.tree.with_parts(*made))
     return spec, assemble_tree(spec)
 
@@ -89,8 +92,11 @@ def _warn_about_inertia(link: Link, problem: InertiaProblem, is_replaced: bool) 
         remark = f"computed with as it stands, the nearest possible is {nearest}"
     if not link.inertial.inertia_matrix.any():
         remark = "taken as a point mass"
-    text = f"{link.inertial.finding_location}: link '{link.name}' has {problem.problem}; {remark}"
-    warnings.warn(text, CraneWarning, stacklevel=4)
+    warnings.warn(
+        f"{link.inertial.finding_location}: link '{link.name}' has {problem.problem}; {remark}",
+        CraneWarning,
+        stacklevel=4,
+    )
 
 
 def check_masses(spec: MachineSpec, model: pin.Model, closure: Closure) -> None:
@@ -170,8 +176,11 @@ def _massless_motions(model: pin.Model, closure: Closure) -> Array:
     gamma = closure.gamma_velocity_drift(closure.home, np.zeros(closure.degrees_of_freedom))[
         0
     ]  # uncompiled
-    coordinates = closure.equations.coordinates
-    upper = np.triu(pin.crba(model, model.createData(), coordinates.configuration(closure.home)))
+    upper = np.triu(
+        pin.crba(
+            model, model.createData(), closure.equations.coordinates.configuration(closure.home)
+        )
+    )
     mass: Array = gamma.T @ (upper + np.triu(upper, 1).T) @ gamma
     largest = np.sqrt(np.diag(mass))
     scale = 1 / np.where(largest > 0, largest, 1.0)
@@ -244,8 +253,9 @@ def frame_element_problems(closure: Closure, items: Iterable[AnyForceElement]) -
             continue
         if data is None:
             data = model.createData()
-            coordinates = closure.equations.coordinates
-            pin.framesForwardKinematics(model, data, coordinates.configuration(closure.home))
+            pin.framesForwardKinematics(
+                model, data, closure.equations.coordinates.configuration(closure.home)
+            )
         one, two = (frame_id(model, link) for link in item.between)
         if model.frames[one].parentJoint == model.frames[two].parentJoint:
             yield f"the {element_name(item)} is within one body, choose frames of two"

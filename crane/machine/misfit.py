@@ -20,8 +20,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from crane.closure.constraint_structure import Indices
 from crane.closure.constraint_tolerances import FILE_PRECISION
+from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
 from crane.common.samples import Array
 from crane.description.machine_parameters import tree_parameters, value_at

@@ -9,7 +9,6 @@ from crane.common.samples import Array
 from crane.machine.machine import Machine
 from crane.motion.trajectory import AttitudeTrajectory, via_points
 
-ROLL_PITCH_YAW = ("roll", "pitch", "yaw")
 INCLINATION = "inclination"
 _AXIS_TOLERANCE = 1e-6  # between the axis of a joint and an axis of the frame [rad]
 _MAX_AXIS_TILT = 0.5  # sine of the angle between the axis and the horizontal at home
@@ -22,7 +21,7 @@ class RotationCoordinates:
     The error is the rotation vector log(R_target R^T) in the world frame. Targets are R (9,).
     """
 
-    names: tuple[str, ...] = ROLL_PITCH_YAW
+    names: tuple[str, ...] = ("roll", "pitch", "yaw")
 
     def error(self, target: Array, rotation: Array) -> Array:
         """Error (k,) [rad] from R (3, 3) to a target, which is a flat array."""
@@ -92,24 +91,23 @@ class InclinationCoordinate:
                 f"{message_prefix}the joint that turns it is along neither its y axis nor its z "
                 "axis, give roll, pitch and yaw, or a frame that is so"
             )
-        self._rotation_axis, self._k = axis_candidates[0], 3 - axis_candidates[0]
-        if abs(rotation[2, self._rotation_axis]) > _MAX_AXIS_TILT:
+        self._k = 3 - axis_candidates[0]
+        rotation_axis = rotation[:, axis_candidates[0]]
+        if abs(rotation_axis[2]) > _MAX_AXIS_TILT:
             raise InputError(
                 f"{message_prefix}the joint that turns it is upright at home, not level, give "
                 "roll, pitch and yaw"
             )
-        configuration = machine.coordinates.configuration(machine.home)
-        pin.computeJointJacobians(model, data, configuration)
+        pin.computeJointJacobians(model, data, machine.coordinates.configuration(machine.home))
         tree_jacobian = pin.getFrameJacobian(
             model, data, machine.frame(frame), pin.LOCAL_WORLD_ALIGNED
         )
         angular_velocities = (
             tree_jacobian.reshape(6, -1)[3:] @ machine.closure.gamma(machine.home)
         )[:, machine.is_driven]
-        axis_tilts = np.cross(angular_velocities, rotation[:, self._rotation_axis], axisa=0)[:, 2]
-        if (
-            np.abs(axis_tilts) > _MAX_AXIS_TILT * np.linalg.norm(angular_velocities, axis=0)
-        ).any():
+        axis_tilts = np.cross(angular_velocities, rotation_axis, axisa=0)[:, 2]
+        speeds = np.linalg.norm(angular_velocities, axis=0)
+        if (np.abs(axis_tilts) > _MAX_AXIS_TILT * speeds).any():
             raise InputError(
                 f"{message_prefix}its drives tilt the joint that turns it, give roll, pitch and "
                 f"yaw"
@@ -128,9 +126,7 @@ class InclinationCoordinate:
         """See `RotationCoordinates`."""
         u = rotation[2]
         vertical_rates = -np.cross(rotation.T @ angular_velocities, u, axisa=0, axisc=0)
-        return np.asarray(self._angle_derivative(u, vertical_rates[0], vertical_rates[self._k]))[
-            None
-        ]
+        return self._angle_derivative(u, vertical_rates)[None]
 
     def accelerations(
         self, rotation: Array, angular_velocity: Array, angular_acceleration: Array
@@ -145,13 +141,13 @@ class InclinationCoordinate:
         log_length_rate = (
             2.0 * (u[0] * vertical_rate[0] + u[k] * vertical_rate[k]) / squared_length
         )
-        acceleration = self._angle_derivative(
-            u, vertical_acceleration[0], vertical_acceleration[k]
-        ) - log_length_rate * self._angle_derivative(u, vertical_rate[0], vertical_rate[k])
-        return np.array([acceleration])
+        acceleration = self._angle_derivative(u, vertical_acceleration)
+        rate = self._angle_derivative(u, vertical_rate)
+        return np.array([acceleration - log_length_rate * rate])
 
-    def _angle_derivative(self, u: Array, x: Array, k: Array) -> Array:
-        return np.asarray((u[self._k] * x - u[0] * k) / (u[0] ** 2 + u[self._k] ** 2))
+    def _angle_derivative(self, u: Array, u_rate: Array) -> Array:
+        k = self._k
+        return np.asarray((u[k] * u_rate[0] - u[0] * u_rate[k]) / (u[0] ** 2 + u[k] ** 2))
 
     def format_target(self, target: Array) -> str:
         """See `RotationCoordinates`."""
@@ -215,28 +211,21 @@ def via_attitudes(
     previous_vector, initial_rotation = np.zeros(3), roll_pitch_yaw(np.nan_to_num(given_angles[0]))
     for i in np.flatnonzero(np.isfinite(given_angles).all(axis=1)):
         rotation = roll_pitch_yaw(given_angles[i])
-        previous_vector = vectors[i] = _nearest_rotation_vector(
-            np.asarray(pin.log3(initial_rotation.T @ rotation)), previous_vector
-        )
+        vector = np.asarray(pin.log3(initial_rotation.T @ rotation))
+        angle = float(np.linalg.norm(vector))
+        previous_angle = float(np.linalg.norm(previous_vector))
+        axis = vector / angle if angle > 1e-9 else previous_vector / (previous_angle or 1.0)
+        # the equivalent vector that is nearest to the previous one
+        revolutions = round((float(axis @ previous_vector) - angle) / (2 * np.pi))
+        previous_vector = vectors[i] = vector + 2 * np.pi * revolutions * axis
         if np.linalg.norm(previous_vector) > _MAX_ROTATION_ANGLE:
             raise InputError(
                 f"the attitude at {times[i]:g} s is {np.linalg.norm(previous_vector):.3g} rad "
                 f"from the first one, give at most {_MAX_ROTATION_ANGLE:g}"
             )
         if np.isfinite(given_rates[i]).all():
-            angular_velocity = (
-                pin.rpy.computeRpyJacobian(given_angles[i], pin.LOCAL_WORLD_ALIGNED)
-                @ given_rates[i]
-            )
+            rate_jacobian = pin.rpy.computeRpyJacobian(given_angles[i], pin.LOCAL_WORLD_ALIGNED)
             vector_rates[i] = np.linalg.solve(
-                pin.Jexp3(previous_vector), rotation.T @ angular_velocity
+                pin.Jexp3(previous_vector), rotation.T @ (rate_jacobian @ given_rates[i])
             )
     return AttitudeTrajectory(initial_rotation, via_points(time, vectors, vector_rates))
-
-
-def _nearest_rotation_vector(vector: Array, reference: Array) -> Array:
-    """Equivalent rotation vector (3,) that is nearest to a reference vector."""
-    angle = float(np.linalg.norm(vector))
-    axis = vector / angle if angle > 1e-9 else reference / (np.linalg.norm(reference) or 1.0)
-    revolutions = round((float(axis @ reference) - angle) / (2 * np.pi))
-    return np.asarray(vector + 2 * np.pi * revolutions * axis)

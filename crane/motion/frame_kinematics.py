@@ -1,4 +1,7 @@
-"""Forward kinematics of a frame in the active coordinates: position, Jacobian and bias."""
+"""Forward kinematics of a frame in the active coordinates: position, Jacobian and bias.
+
+In Python with Pinocchio, and compiled.
+"""
 
 import math
 from functools import cached_property
@@ -7,7 +10,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from crane.codegen import FormulaTooLongError
+from crane.closure.kinematics_formulas import FormulaConstants, PositionKinematics, folding_pattern
+from crane.closure.loop_formulas import LoopFormulas, VelocityKinematics
+from crane.codegen import FormulaTooLongError, Program, Scalar, Tape
+from crane.codegen.symbolic import add_vectors, cross, dot, matvec, scale_vector, subtract_vectors
 from crane.common.errors import ClosureError, InputError, suggest_names
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, apply_per_sample, as_samples
@@ -19,12 +25,111 @@ from crane.motion.attitude import (
     InclinationCoordinate,
     RotationCoordinates,
 )
-from crane.motion.compiled_frame import CompiledFrame, CompiledPoint
 
 # of the characteristic length per stroke, that counts as motion of the frame
 _RANK_TOLERANCE = 1e-6
 _MAX_GRID_SIZE = 243  # start configurations
+_BLOCK_SAMPLES = 1000  # samples of a stack at once
 ATTITUDE_NAMES = (INCLINATION, "rotation")
+
+
+class CompiledPoint:
+    """Position of a frame, compiled.
+
+    Args:
+        machine: The machine.
+        frame: Index of the frame in the Pinocchio model.
+
+    Raises:
+        FormulaTooLongError: The formulas are too long to be compiled.
+    """
+
+    def __init__(self, machine: Machine, frame: int):
+        compiled_closure = self._compiled_closure = machine.closure.compiled_closure
+        model_frame = machine.model.frames[frame]
+        self._body = machine.coordinates.body_of_joint[model_frame.parentJoint]
+        self._frame_offset = (
+            compiled_closure.geometry.body_rotations[self._body].T
+            @ model_frame.placement.translation
+        )
+        self._nq, self._n = machine.model.nv, len(machine.active)
+        name = ("frame", type(self).__name__, self._body, folding_pattern(self._frame_offset))
+        if name not in compiled_closure.programs:
+            compiled_closure.programs[name] = compiled_closure.cached_program(
+                name, self._build_program
+            )
+        self._program = compiled_closure.programs[name]
+
+    def evaluate(self, q: Array, v_a: Array | None = None) -> Array:
+        """Rows of `_output_expressions` for configurations (N, nq) and velocities (N, n)."""
+        v_a = np.zeros((len(q), self._n)) if v_a is None else v_a
+        out = np.empty((len(q), self._program.formula_outputs("formula").size))
+        constants = self._compiled_closure.geometry.constants, self._frame_offset
+        for i in range(
+            0, len(q), _BLOCK_SAMPLES
+        ):  # copies of this size stay in the processor's cache
+            blocks = (np.ascontiguousarray(x[i : i + _BLOCK_SAMPLES]) for x in (q, v_a, out))
+            self._program.call("rows", min(_BLOCK_SAMPLES, len(q) - i), *constants, *blocks)
+        return out
+
+    def _output_expressions(self, tape: Tape) -> list[Scalar]:
+        """Expressions of an output row: x (3)."""
+        bodies, _, point = self._trace_point(tape)
+        return self._rotate_to_world(bodies, subtract_vectors(point, bodies.origin[0]))
+
+    def _trace_point(self, tape: Tape) -> tuple[PositionKinematics, LoopFormulas, list[Scalar]]:
+        """Bodies, loops, and the position of the frame in the reference body."""
+        _, bodies, loops = self._compiled_closure.trace_kinematics(tape, 0, 2)
+        frame_offset = FormulaConstants(tape, 1, self._frame_offset).vector(0)
+        point = add_vectors(
+            bodies.origin[self._body], matvec(bodies.rotation[self._body], frame_offset)
+        )
+        return bodies, loops, point
+
+    def _rotate_to_world(self, bodies: PositionKinematics, vector: list[Scalar]) -> list[Scalar]:
+        """Components in the world frame of a vector of the reference body."""
+        return matvec([list(axis) for axis in zip(*bodies.rotation[0], strict=True)], vector)
+
+    def _build_program(self, program: Program) -> None:
+        nq, n = self._nq, self._n
+        size = program.add_formula("formula", 4, self._output_expressions(Tape())).size
+        arrays = ("geometry", "place", "q", "v", "out")
+        with program.add_routine("rows", counts=("count",), arrays=arrays) as r:
+            with r.loop(r.count) as i:
+                rows = r.q.row_pointer(i, nq), r.v.row_pointer(i, n), r.out.row_pointer(i, size)
+                r.call("formula", r.geometry, r.place, *rows)
+            r.return_value(r.count)
+
+
+class CompiledFrame(CompiledPoint):
+    """Position, reduced Jacobian and bias of a frame, compiled."""
+
+    def _output_expressions(self, tape: Tape) -> list[Scalar]:
+        """Expressions of an output row: x (3), J gamma (3 n), bias (3)."""
+        n, body = self._n, self._body
+        bodies, loops, point = self._trace_point(tape)
+        v_a, parents = tape.load_vector(3, 0, n), bodies.geometry.parents
+        joint_rates: list[Scalar] = [0.0]
+        joint_rates += [dot(loops.gamma[i], v_a) for i in range(1, len(parents))]
+        motion = VelocityKinematics(bodies, loops, joint_rates, [0.0] * 3, parents)
+        columns: list[list[Scalar]] = [[0.0] * 3 for _ in range(n)]
+        (v, w), (a, e) = motion.velocities[body], motion.bias_accelerations[body]
+        i = body
+        while i > 0:  # motion of the point by each joint that carries it
+            linear, angular = bodies.joint_axes[i]
+            point_velocity = add_vectors(linear, cross(angular, point))
+            columns = [
+                add_vectors(column, scale_vector(factor, point_velocity))
+                for column, factor in zip(columns, loops.gamma[i], strict=True)
+            ]
+            a = add_vectors(a, scale_vector(motion.drift[i], linear))
+            e = add_vectors(e, scale_vector(motion.drift[i], angular))
+            i = parents[i]
+        acceleration = add_vectors(a, cross(e, point), cross(w, add_vectors(v, cross(w, point))))
+        jacobian = [self._rotate_to_world(bodies, column) for column in columns]
+        outputs = self._rotate_to_world(bodies, subtract_vectors(point, bodies.origin[0]))
+        outputs += [column[row] for row in range(3) for column in jacobian]
+        return [*outputs, *self._rotate_to_world(bodies, acceleration)]
 
 
 class FrameKinematics(OneLineRepr):
@@ -45,29 +150,23 @@ class FrameKinematics(OneLineRepr):
     """
 
     def __init__(self, machine: Machine, frame: str | None = None):
+        frame = machine.tip if frame is None else frame
         if frame is None:
-            if machine.tip is None:
-                raise InputError(
-                    f"machine '{machine.name}' has no tip, name a frame: a link here, or as 'tip' "
-                    "in the machine file"
-                )
-            frame = machine.tip
+            raise InputError(
+                f"machine '{machine.name}' has no tip, name a frame: a link here, or as 'tip' "
+                "in the machine file"
+            )
         self.machine, self.frame = machine, frame
-        self._model = machine.model
-        self._frame = machine.frame(frame)
+        self._model, self._frame = machine.model, machine.frame(frame)
         stroke_lengths = machine.upper - machine.lower
-        # free joints do not move
-        coordinate_units = machine.closure.units[machine.closure.active]
-        self._stroke_scales = (
-            np.where(np.isfinite(stroke_lengths), stroke_lengths, coordinate_units)
-            * machine.is_driven
-        )
+        units = machine.closure.units[machine.closure.active]
+        scales = np.where(np.isfinite(stroke_lengths), stroke_lengths, units)
+        self._stroke_scales = scales * machine.is_driven  # free joints do not move
         self._characteristic_length = machine.closure.characteristic_length
         self._attitudes: dict[str, AttitudeCoordinates] = {}
         self._thread_local_data = ThreadLocal(self._model.createData)
 
     def _one_line(self) -> str:
-        """Frame and machine."""
         return f"{type(self).__name__} of '{self.frame}' of '{self.machine.name}'"
 
     def position(self, q_a: ArrayLike) -> Array:
@@ -79,7 +178,7 @@ class FrameKinematics(OneLineRepr):
         Returns:
             (3,) or (N, 3) [m].
         """
-        return self._stacked_positions(self.machine.closure.solve(q_a))
+        return self.positions_at_configurations(self.machine.closure.solve(q_a))
 
     def positions_at_configurations(self, q: ArrayLike) -> Array:
         """Position in the world at closed configurations.
@@ -90,18 +189,14 @@ class FrameKinematics(OneLineRepr):
         Returns:
             (3,) or (N, 3) [m].
         """
-        return self._stacked_positions(as_samples(q, self._model.nv, "q", self.machine.joints))
-
-    def _stacked_positions(self, q: Array) -> Array:
-        if q.ndim == 2 and self._compiled_point is not None:
-            return self._compiled_point.evaluate(q)
-        return apply_per_sample(self.position_at_configuration, q)
+        samples = as_samples(q, self._model.nv, "q", self.machine.joints)
+        if samples.ndim == 2 and self._compiled_point is not None:
+            return self._compiled_point.evaluate(samples)
+        return apply_per_sample(self.position_at_configuration, samples)
 
     def position_at_configuration(self, q: Array) -> Array:
         """Position (3,) [m] at one configuration (nq,)."""
-        pin.forwardKinematics(self._model, self._data, self.machine.coordinates.configuration(q))
-        placement = pin.updateFramePlacement(self._model, self._data, self._frame)
-        return np.array(placement.translation)
+        return self._pose(q)[0]
 
     def rotation(self, q_a: ArrayLike) -> Array:
         """Rotation matrix of the frame in the world.
@@ -112,8 +207,7 @@ class FrameKinematics(OneLineRepr):
         Returns:
             (3, 3) or (N, 3, 3).
         """
-        configurations = self.machine.closure.solve(q_a)
-        return apply_per_sample(lambda one: self._pose(one)[1], configurations)
+        return apply_per_sample(lambda q: self._pose(q)[1], self.machine.closure.solve(q_a))
 
     def inclination(self, q_a: ArrayLike) -> Array:
         """Inclination of the frame: elevation of its x axis above the horizontal.
@@ -140,14 +234,10 @@ class FrameKinematics(OneLineRepr):
             (3, n) or (N, 3, n); 3 + k in place of 3 with the k coordinates of an attitude.
         """
         q = self.machine.closure.solve(q_a)
-        if attitude is not None:
-            attitude_coordinates = self._attitude_coordinates(attitude)
-            return apply_per_sample(
-                lambda one: self._attitude_jacobian(one, attitude_coordinates), q
-            )
-        if q.ndim == 2 and self._compiled_frame is not None:
+        coordinates = None if attitude is None else self._attitude_coordinates(attitude)
+        if coordinates is None and q.ndim == 2 and self._compiled_frame is not None:
             return self._compiled_frame.evaluate(q)[:, 3:-3].reshape(len(q), 3, -1)
-        return apply_per_sample(self._reduced_jacobian, q)
+        return apply_per_sample(lambda one: self._attitude_jacobian(one, coordinates), q)
 
     def bias(self, q_a: ArrayLike, v_a: ArrayLike, attitude: str | None = None) -> Array:
         """Acceleration of the frame for a_A = 0.
@@ -195,37 +285,30 @@ class FrameKinematics(OneLineRepr):
             raise InputError(
                 f"attitude '{name}' is unknown, {suggest_names(ATTITUDE_NAMES, name)}"
             )
-        if name not in self._attitudes:
-            machine = self.machine
-            coordinates: AttitudeCoordinates
-            coordinates = (
-                RotationCoordinates()
-                if name == "rotation"
-                else InclinationCoordinate(machine, self.frame)
-            )
-            jacobians = [
+        if name in self._attitudes:
+            return self._attitudes[name]
+        coordinates: AttitudeCoordinates = RotationCoordinates()
+        if name == INCLINATION:
+            coordinates = InclinationCoordinate(self.machine, self.frame)
+        starts = self._start_configurations
+        jacobians = np.array(
+            [
                 self._attitude_jacobian(q, coordinates) * self._stroke_scales
-                for q in self._sample_configurations
+                for q, _ in starts[:: max(1, len(starts) // 6)]
             ]
-            position_rank, total_rank = (
-                max(
-                    int(
-                        np.linalg.matrix_rank(
-                            row, tol=_RANK_TOLERANCE * self._characteristic_length
-                        )
-                    )
-                    for row in jacobian_list
-                )
-                for jacobian_list in ([row[:3] for row in jacobians], jacobians)
+        )
+        position_rank, total_rank = (
+            int(np.linalg.matrix_rank(x, tol=_RANK_TOLERANCE * self._characteristic_length).max())
+            for x in (jacobians[:, :3], jacobians)
+        )
+        if total_rank < position_rank + len(coordinates.names):
+            raise InputError(
+                f"'{self.machine.name}' has too few drives for {', '.join(coordinates.names)} of "
+                f"'{self.frame}': they move it in {position_rank} directions and rotate it "
+                f"in {total_rank - position_rank} further ones"
             )
-            if total_rank < position_rank + len(coordinates.names):
-                raise InputError(
-                    f"'{machine.name}' has too few drives for {', '.join(coordinates.names)} of "
-                    f"'{self.frame}': they move it in {position_rank} directions and rotate it "
-                    f"in {total_rank - position_rank} further ones"
-                )
-            self._attitudes[name] = coordinates
-        return self._attitudes[name]
+        self._attitudes[name] = coordinates
+        return coordinates
 
     @property
     def _data(self) -> pin.Data:
@@ -259,11 +342,10 @@ class FrameKinematics(OneLineRepr):
         )
         return jacobian.reshape(6, -1)  # Pinocchio returns a vector for a single joint
 
-    def _reduced_jacobian(self, q: Array) -> Array:
-        return self.tree_jacobian(q) @ self.machine.closure.gamma(q)
-
-    def _attitude_jacobian(self, q: Array, attitude: AttitudeCoordinates) -> Array:
-        """Reduced Jacobian (3 + k, n) of position and attitude."""
+    def _attitude_jacobian(self, q: Array, attitude: AttitudeCoordinates | None) -> Array:
+        """Reduced Jacobian (3, n) of the position, or (3 + k, n) of position and attitude."""
+        if attitude is None:
+            return self.tree_jacobian(q) @ self.machine.closure.gamma(q)
         jacobian = self._spatial_tree_jacobian(q) @ self.machine.closure.gamma(q)
         return np.vstack([jacobian[:3], attitude.rates(self._pose(q)[1], jacobian[3:])])
 
@@ -274,28 +356,13 @@ class FrameKinematics(OneLineRepr):
         return np.array(placement.translation), np.array(placement.rotation)
 
     @cached_property
-    def _sample_configurations(self) -> list[Array]:
-        """Some of the start configurations (nq,)."""
-        return [
-            q
-            for q, _ in self._start_configurations[:: max(1, len(self._start_configurations) // 6)]
-        ]
-
-    @cached_property
     def _start_configurations(self) -> list[tuple[Array, Array]]:
         """Start configurations (q, position) over the whole range of the strokes."""
         machine = self.machine
-        home = machine.home[machine.closure.active]
-        stroke_values = [
-            (
-                low + span * np.array([0.2, 0.5, 0.8])
-                if driven and np.isfinite(span)
-                else [home_value]
-            )
-            for low, span, home_value, driven in zip(
-                machine.lower, machine.upper - machine.lower, home, machine.is_driven, strict=True
-            )
-        ]
+        stroke_values = [[value] for value in machine.home[machine.closure.active]]
+        spans = machine.upper - machine.lower
+        for i in np.flatnonzero(machine.is_driven & np.isfinite(spans)):
+            stroke_values[i] = list(machine.lower[i] + spans[i] * np.array([0.2, 0.5, 0.8]))
         configurations = [(np.array(machine.home), self.position_at_configuration(machine.home))]
         shape = tuple(len(axis) for axis in stroke_values)
         if math.prod(shape) <= _MAX_GRID_SIZE:

@@ -1,6 +1,7 @@
 """Kinematics of a frame in the active coordinates, with inverse kinematics."""
 
 import numpy as np
+from numpy.linalg import norm
 from numpy.typing import ArrayLike
 
 from crane.common.errors import ClosureError, InputError, UnreachableTipError
@@ -20,11 +21,6 @@ _ATTITUDE_STARTS = 40  # start configurations if an attitude is given
 _KNOT_STRIDE = 16  # samples of a path per sample that is solved by a search
 # share of the strokes between a sample and the curve through these samples
 _INTERPOLATION_TOLERANCE = 0.02
-
-
-def norm(vector: Array) -> float:
-    """Euclidean norm."""
-    return float(np.linalg.norm(vector))
 
 
 class Kinematics(FrameKinematics):
@@ -178,25 +174,14 @@ class Kinematics(FrameKinematics):
                 q_a = np.clip(q_a + step[:, :, 0], machine.lower, machine.upper)
         except (ClosureError, np.linalg.LinAlgError):
             return None
-        is_near_curve = (
-            np.abs(best_solution - curve) <= _INTERPOLATION_TOLERANCE * self._stroke_scales
-        )
+        deviation = np.abs(best_solution - curve)
+        is_near_curve = (deviation <= _INTERPOLATION_TOLERANCE * self._stroke_scales).all()
         tolerance = 1e-2 * _POSITION_TOLERANCE * reference_distance
-        return (
-            best_solution if is_near_curve.all() and smallest_distance.max() <= tolerance else None
-        )
+        return best_solution if is_near_curve and smallest_distance.max() <= tolerance else None
 
     def _reference_distance(self, targets: Array) -> float:
         """Length [m] that distances to targets are relative to."""
         return max(self.machine.closure.characteristic_length, float(np.abs(targets).max()))
-
-    def _error_jacobian(self, q: Array, attitude: AttitudeCoordinates | None) -> Array:
-        """Jacobian of position and attitude, attitudes times the characteristic length."""
-        if attitude is None:
-            return self._reduced_jacobian(q)
-        jacobian = self._attitude_jacobian(q, attitude)
-        jacobian[3:] *= self._characteristic_length
-        return jacobian
 
     def _error(self, target: Array, q: Array, attitude: AttitudeCoordinates | None) -> Array:
         """Error (3,) or (3 + k,) [m] to a target, attitudes times the characteristic length."""
@@ -218,42 +203,33 @@ class Kinematics(FrameKinematics):
         if start is not None:
             best_solution = self._levenberg_marquardt(target, closure.solve(start), attitude)
         tolerance = _POSITION_TOLERANCE * self._reference_distance(target[:3])
-        if best_solution[0] > tolerance:
-            if attitude is None:
-                errors = [
-                    float(np.sum((tip - target) ** 2)) for _, tip in self._start_configurations
-                ]
-            else:
-                errors = [
-                    norm(self._error(target, q, attitude)) for q, _ in self._start_configurations
-                ]
-            for i in np.argsort(errors, kind="stable")[
-                : 5 if attitude is None else _ATTITUDE_STARTS
-            ]:
-                solution = self._levenberg_marquardt(
-                    target, self._start_configurations[i][0], attitude
-                )
-                best_solution = min(best_solution, solution, key=lambda item: item[0])
-                if best_solution[0] <= tolerance:
-                    break
-        distance, q = best_solution
-        q_a: Array = q[closure.active]
-        if distance > tolerance:
-            target_text = ", ".join(f"{value:.4g}" for value in target[:3]) + ") m"
-            error = self._error(target, q, attitude)
-            distance_text = f"{norm(error[:3]):.3g} m"
-            if attitude is not None:
-                target_text += f" with {attitude.format_target(target[3:])}"
-                distance_text += f" and {norm(error[3:]) / self._characteristic_length:.3g} rad"
-            stroke_text = ", ".join(
-                f"{name} = {value:.4g}"
-                for name, value in zip(self.machine.active, q_a, strict=True)
-            )
-            raise UnreachableTipError(
-                f"'{self.frame}' cannot reach ({target_text}{sample_label}: it stays "
-                f"{distance_text} away, nearest at {stroke_text}; choose a point within reach"
-            )
-        return q_a
+        if best_solution[0] <= tolerance:
+            return np.asarray(best_solution[1][closure.active])
+        starts, count = self._start_configurations, 5
+        errors = [float(np.sum((tip - target[:3]) ** 2)) for _, tip in starts]
+        if attitude is not None:
+            count = _ATTITUDE_STARTS
+            errors = [float(norm(self._error(target, q, attitude))) for q, _ in starts]
+        for i in np.argsort(errors, kind="stable")[:count]:
+            solution = self._levenberg_marquardt(target, starts[i][0], attitude)
+            best_solution = min(best_solution, solution, key=lambda item: item[0])
+            if best_solution[0] <= tolerance:
+                return np.asarray(best_solution[1][closure.active])
+        q = best_solution[1]
+        target_text = ", ".join(f"{value:.4g}" for value in target[:3]) + ") m"
+        error = self._error(target, q, attitude)
+        distance_text = f"{norm(error[:3]):.3g} m"
+        if attitude is not None:
+            target_text += f" with {attitude.format_target(target[3:])}"
+            distance_text += f" and {norm(error[3:]) / self._characteristic_length:.3g} rad"
+        stroke_text = ", ".join(
+            f"{name} = {value:.4g}"
+            for name, value in zip(self.machine.active, q[closure.active], strict=True)
+        )
+        raise UnreachableTipError(
+            f"'{self.frame}' cannot reach ({target_text}{sample_label}: it stays "
+            f"{distance_text} away, nearest at {stroke_text}; choose a point within reach"
+        )
 
     def _levenberg_marquardt(
         self, target: Array, q: Array, attitude: AttitudeCoordinates | None
@@ -261,13 +237,15 @@ class Kinematics(FrameKinematics):
         """Distance and configuration at the end of a bounded Levenberg-Marquardt iteration."""
         closure, machine = self.machine.closure, self.machine
         error = self._error(target, q, attitude)
-        distance = norm(error)
+        distance = float(norm(error))
         damping, reference_distance = 1e-6, self._reference_distance(target[:3])
         for _ in range(100):
             if distance < _ROUNDING_TOLERANCE * reference_distance:
                 break
             q_a = q[closure.active]
-            jacobian = self._error_jacobian(q, attitude) * self._stroke_scales
+            jacobian = self._attitude_jacobian(q, attitude)
+            jacobian[3:] *= self._characteristic_length  # as the error
+            jacobian *= self._stroke_scales
             gradient = jacobian.T @ error
             is_at_limit = ((q_a <= machine.lower) & (gradient < 0)) | (
                 (q_a >= machine.upper) & (gradient > 0)
@@ -284,7 +262,7 @@ class Kinematics(FrameKinematics):
                 damping = max(10 * damping, 1e-4)
                 continue
             error_new = self._error(target, q_new, attitude)
-            new_distance = norm(error_new)
+            new_distance = float(norm(error_new))
             if new_distance < distance:
                 is_stalled = new_distance > 0.999 * distance and damping < 1e-9
                 q, error, distance = q_new, error_new, new_distance

@@ -7,6 +7,7 @@ import numpy as np
 
 from crane.common.errors import ClosureError
 from crane.common.samples import Array
+from crane.description.kinematic_tree import Limits
 from crane.machine.machine import Machine
 from crane.motion.trajectory import Trajectory
 
@@ -51,10 +52,10 @@ def limit_violation_message(
     )
     if violation is None:
         return ""
-    joint, others_text = machine.active[violation.joint_index], _others_text(violation.other_count)
+    joint = machine.active[violation.joint_index]
     return (
-        f"the reference of {_violation_text(machine, joint, violation)}{others_text}: keep it "
-        "within, or widen the limits"
+        f"the reference of '{joint}' goes to {_violation_text(machine, joint, violation)}: keep "
+        "it within, or widen the limits"
     )
 
 
@@ -95,25 +96,14 @@ def passive_limit_violation_message(
         return ""  # a dead centre or an unreachable position: the simulation reports it
     if violation is not None:
         joint = machine.joints[passive[violation.joint_index]]
-        text = _violation_text(machine, joint, violation, "to")
         return (
-            f"the reference takes {text}{_others_text(violation.other_count)}: keep it within, or "
-            "widen the limits"
+            f"the reference takes '{joint}' to {_violation_text(machine, joint, violation)}: keep "
+            "it within, or widen the limits"
         )
-    velocity_limits = np.array(
-        [
-            machine.tree.joints[joint].limits.velocity if joint in machine.tree.joints else np.inf
-            for joint in machine.joints
-        ]
-    )
-    velocity_limits[velocity_limits <= 0] = np.inf
-    violation = _LimitViolation.find(
-        times,
-        joint_velocities,
-        -velocity_limits,
-        velocity_limits,
-        _VELOCITY_LIMIT_TOLERANCE * np.where(np.isfinite(velocity_limits), velocity_limits, 0),
-    )
+    limits = [_joint_limits(machine, joint).velocity for joint in machine.joints]
+    maximum = np.array([x if x > 0 else np.inf for x in limits])
+    tolerances = _VELOCITY_LIMIT_TOLERANCE * np.where(np.isfinite(maximum), maximum, 0)
+    violation = _LimitViolation.find(times, joint_velocities, -maximum, maximum, tolerances)
     if violation is None:
         return ""
     joint = machine.joints[violation.joint_index]
@@ -121,8 +111,7 @@ def passive_limit_violation_message(
     return (
         f"the reference moves '{joint}' with up to {abs(violation.value):.4g} {unit} at t = "
         f"{violation.time:.4g} s, its limit is {abs(violation.limit):.6g} "
-        f"{unit}{_limit_location(machine, joint)}, "
-        f"{violation.interval_text}{_others_text(violation.other_count)}: move slower, or raise "
+        f"{unit}{_limit_location(machine, joint)}, {violation.extent_text}: move slower, or raise "
         f"the limit"
     )
 
@@ -134,8 +123,7 @@ class _LimitViolation(NamedTuple):
     value: float
     limit: float
     time: float
-    interval_text: str
-    other_count: int
+    extent_text: str
 
     @classmethod
     def find(
@@ -146,6 +134,8 @@ class _LimitViolation(NamedTuple):
         excess = np.maximum(lower - q, q - upper)
         if not q.shape[1] or not (excess > tolerances).any():
             return None
+        from scipy.optimize import brentq, minimize_scalar  # slow to import
+
         span = upper - lower
         scale = np.where(np.isfinite(span) & (span > 0), span, 1.0)
         relative_excess = np.where(excess > tolerances, excess / scale, -np.inf)
@@ -154,71 +144,47 @@ class _LimitViolation(NamedTuple):
         )
         is_below = bool(q[k, i] < lower[i])
         limit, sign = float(lower[i] if is_below else upper[i]), -1.0 if is_below else 1.0
-        other_count = int((excess > tolerances).any(axis=0).sum()) - 1
 
         def excess_at(time: float) -> float:
             return float(sign * (evaluate(np.array([time]))[0, i] - limit))
 
-        interval_text = _violation_interval(times, excess[:, i], k, excess_at)
-        time, largest_excess = _largest_excess(times, excess[:, i], k, excess_at)
-        return cls(i, limit + sign * largest_excess, limit, time, interval_text, other_count)
+        within_indices = np.flatnonzero(~(excess[:, i] > 0))
+        before, after = within_indices[within_indices < k], within_indices[within_indices > k]
+        start_time, end_text = times[0], " s on"
+        if len(before):
+            start, end = times[before[-1]], times[before[-1] + 1]
+            start_time = brentq(excess_at, start, end, xtol=_TIME_TOLERANCE)
+        if len(after):
+            start, end = times[after[0] - 1], times[after[0]]
+            end_text = f" to {brentq(excess_at, start, end, xtol=_TIME_TOLERANCE):.4g} s"
+        extent_text = f"from t = {start_time:.4g}{end_text}"
+        if others := int((excess > tolerances).any(axis=0).sum()) - 1:
+            extent_text += f" ({others} other joint{'s' * (others > 1)} likewise)"
+        bounds = times[max(k - 1, 0)], times[min(k + 1, len(times) - 1)]
+        optimum = minimize_scalar(lambda t: -excess_at(t), bounds=bounds, method="bounded")
+        time, largest = float(times[k]), float(excess[k, i])
+        if -optimum.fun > largest:
+            time, largest = float(optimum.x), float(-optimum.fun)
+        return cls(i, limit + sign * largest, limit, time, extent_text)
 
 
-def _largest_excess(
-    times: Array, excess: Array, k: int, evaluate: Callable[[float], float]
-) -> tuple[float, float]:
-    """Time [s] and size of the largest excess near sample k."""
-    from scipy.optimize import minimize_scalar
-
-    interval = times[max(k - 1, 0)], times[min(k + 1, len(times) - 1)]
-    optimum = minimize_scalar(lambda t: -evaluate(t), bounds=interval, method="bounded")
-    if -optimum.fun > excess[k]:
-        return float(optimum.x), float(-optimum.fun)
-    return float(times[k]), float(excess[k])
-
-
-def _violation_interval(
-    times: Array, excess: Array, k: int, evaluate: Callable[[float], float]
-) -> str:
-    """Text of the interval around sample k in which the limit is exceeded."""
-    from scipy.optimize import brentq
-
-    first = last = k
-    while first > 0 and excess[first - 1] > 0:
-        first -= 1
-    while last < len(times) - 1 and excess[last + 1] > 0:
-        last += 1
-    start_time = times[first]
-    if first > 0:
-        start_time = brentq(evaluate, times[first - 1], start_time, xtol=_TIME_TOLERANCE)
-    if last == len(times) - 1:
-        return f"from t = {start_time:.4g} s on"
-    return (
-        f"from t = {start_time:.4g} to "
-        f"{brentq(evaluate, times[last], times[last + 1], xtol=_TIME_TOLERANCE):.4g} s"
-    )
-
-
-def _violation_text(
-    machine: Machine, joint: str, violation: _LimitViolation, verb: str = "goes to"
-) -> str:
+def _violation_text(machine: Machine, joint: str, violation: _LimitViolation) -> str:
     unit = machine.unit(joint)
     return (
-        f"'{joint}' {verb} {violation.value:.6g} {unit} at t = {violation.time:.4g} s, beyond "
+        f"{violation.value:.6g} {unit} at t = {violation.time:.4g} s, beyond "
         f"its limit {violation.limit:.6g} {unit}{_limit_location(machine, joint)} "
-        f"{violation.interval_text}"
+        f"{violation.extent_text}"
     )
+
+
+def _joint_limits(machine: Machine, joint: str) -> Limits:
+    """Limits of a joint of the tree, none for a coordinate of a floating base."""
+    return machine.tree.joints[joint].limits if joint in machine.tree.joints else Limits()
 
 
 def _limit_location(machine: Machine, joint: str) -> str:
-    location = (
-        machine.tree.joints[joint].limits.source_location if joint in machine.tree.joints else ""
-    )
+    location = _joint_limits(machine, joint).source_location
     return f" ({location})" if location else ""
-
-
-def _others_text(other_count: int) -> str:
-    return f" ({other_count} other joint{'s' * (other_count > 1)} likewise)" if other_count else ""
 
 
 def _sample_times(reference: Trajectory, end_time: float) -> Array:

@@ -91,16 +91,14 @@ def _quintic_basis() -> Array:
     return np.vstack([start, 10 * d - 4 * e + f / 2, -15 * d + 7 * e - f, 6 * d - 3 * e + f / 2])
 
 
-def _jerk_form() -> Array:
-    """Quadratic form (6, 6) of int (x''')^2 du over 0 <= u <= 1 in (x, x', x'') at both ends."""
-    scale = np.array([6.0, 24.0, 60.0])  # of u^3, u^4, u^5, differentiated three times
-    gram = np.outer(scale, scale) / np.add.outer(np.arange(3.0), np.arange(1.0, 4.0))
-    return _QUINTIC_BASIS[3:].T @ gram @ _QUINTIC_BASIS[3:]
-
-
 _QUINTIC_BASIS = _quintic_basis()
-
-_JERK_FORM = _jerk_form()
+_JERK_SCALES = np.array([6.0, 24.0, 60.0])  # of u^3, u^4, u^5, differentiated three times
+# quadratic form (6, 6) of int (x''')^2 du over 0 <= u <= 1 in (x, x', x'') at both ends
+_JERK_FORM = (
+    _QUINTIC_BASIS[3:].T
+    @ (np.outer(_JERK_SCALES, _JERK_SCALES) / np.add.outer(np.arange(3.0), np.arange(1.0, 4.0)))
+    @ _QUINTIC_BASIS[3:]
+)
 
 
 class _JerkQuadraticForm:
@@ -112,6 +110,13 @@ class _JerkQuadraticForm:
 
     Args:
         time: (N,) [s].
+
+    Attributes:
+        time: As given.
+        time_unit: Geometric mean of the intervals [s].
+        knot_scales: (N, 3) factors from values and rates to those of H.
+        interval_scales: (N - 1, 6) factors from values of H to those of an interval.
+        jerk: Lower diagonals (6, 3 N) of H.
     """
 
     def __init__(self, time: Array):
@@ -121,61 +126,27 @@ class _JerkQuadraticForm:
         h = h / self.time_unit
         adjacent_lengths = np.concatenate([h[:1], np.sqrt(h[1:] * h[:-1]), h[-1:]])
         knot_scales = adjacent_lengths[:, None] ** np.arange(_VALUES_PER_KNOT)
-        self._interval_scales = (
+        self.interval_scales = (
             h[:, None, None] ** np.arange(_VALUES_PER_KNOT)
             / np.stack([knot_scales[:-1], knot_scales[1:]], axis=1)
-        ).reshape(-1, 2 * _VALUES_PER_KNOT)  # from scaled values to those of an interval
-        self._knot_scales = knot_scales * self.time_unit ** np.arange(_VALUES_PER_KNOT)
-        all_intervals = np.arange(len(h))
-        self.jerk = self.assemble_banded(all_intervals, h[:, None, None] ** -5 * _JERK_FORM)
+        ).reshape(-1, 2 * _VALUES_PER_KNOT)
+        self.knot_scales = knot_scales * self.time_unit ** np.arange(_VALUES_PER_KNOT)
+        self.jerk = self.assemble_banded(np.arange(len(h)), h[:, None, None] ** -5 * _JERK_FORM)
 
     def assemble_banded(self, intervals: NDArray[np.intp], forms: Array) -> Array:
         """Lower diagonals (6, 3 N) of the sum of forms (k, 6, 6) on intervals (k,)."""
         size = 2 * _VALUES_PER_KNOT
         band = np.zeros((size, _VALUES_PER_KNOT * len(self.time)))
-        interval_scales = self._interval_scales[intervals]
+        interval_scales = self.interval_scales[intervals]
         for k in range(size):
             for a in range(size - k):
                 values = forms[:, a + k, a] * interval_scales[:, a + k] * interval_scales[:, a]
                 np.add.at(band[k], _VALUES_PER_KNOT * intervals + a, values)
         return band
 
-    def interpolation_rows(self, time: Array) -> tuple[NDArray[np.intp], Array]:
-        """Intervals (M,) of times (M,), and rows (M, 6) that interpolate the value there."""
-        interval = np.clip(np.searchsorted(self.time, time, "right") - 1, 0, len(self.time) - 2)
-        u = (time - self.time[interval]) / np.diff(self.time)[interval]
-        return interval, u[:, None] ** np.arange(2 * _VALUES_PER_KNOT) @ _QUINTIC_BASIS
-
-    def apply_transpose(self, intervals: NDArray[np.intp], rows: Array, values: Array) -> Array:
-        """Sum (3 N,) of rows (M, 6) times values (M,)."""
-        out = np.zeros(_VALUES_PER_KNOT * len(self.time))
-        indices = _VALUES_PER_KNOT * intervals[:, None] + np.arange(2 * _VALUES_PER_KNOT)
-        np.add.at(out, indices, rows * self._interval_scales[intervals] * values[:, None])
-        return out
-
-    def interpolate(self, intervals: NDArray[np.intp], rows: Array, y: Array) -> Array:
-        """Interpolated values (M,) by rows (M, 6) of scaled knot values (3 N,)."""
-        indices = _VALUES_PER_KNOT * intervals[:, None] + np.arange(2 * _VALUES_PER_KNOT)
-        return np.asarray(
-            np.einsum("ij,ij->i", rows * self._interval_scales[intervals], y[indices])
-        )
-
-    def scale_values(self, knot_values: Array) -> Array:
-        """Scaled knot values (3 N,), in the units of H, of values and rates (N, 3)."""
-        return np.asarray(knot_values * self._knot_scales).ravel()
-
     def unscale_values(self, y: Array) -> Array:
         """Values and rates (N, 3) of scaled knot values (3 N,)."""
-        return np.asarray(y.reshape(-1, _VALUES_PER_KNOT) / self._knot_scales)
-
-
-def _multiply_banded(band: Array, y: Array) -> Array:
-    """Product of a symmetric matrix, given by its lower diagonals, and a vector."""
-    out: Array = band[0] * y
-    for k in range(1, len(band)):
-        out[k:] += band[k, :-k] * y[:-k]
-        out[:-k] += band[k, :-k] * y[k:]
-    return out
+        return np.asarray(y.reshape(-1, _VALUES_PER_KNOT) / self.knot_scales)
 
 
 def least_jerk(time: Array, x: Array, v: Array) -> Array:
@@ -199,21 +170,22 @@ def least_jerk(time: Array, x: Array, v: Array) -> Array:
     """
     from scipy.linalg import solveh_banded  # slow to import
 
+    knots = _JerkQuadraticForm(time)
     # an offset keeps the digits of values far from zero
-    knots, offset = (
-        _JerkQuadraticForm(time),
-        x[0],
-    )
-    given_values = np.column_stack([x - offset, v, np.full(len(time), np.nan)])
+    given_values = np.column_stack([x - x[0], v, np.full(len(time), np.nan)])
     given_values[[0, -1], 2] = 0.0
-    y = knots.scale_values(given_values)
+    y = (given_values * knots.knot_scales).ravel()
     is_unknown = np.isnan(y)
     y[is_unknown] = 0.0
-    right_side = np.where(is_unknown, -_multiply_banded(knots.jerk, y), 0.0)
-    band = knots.jerk.copy()
+    band = knots.jerk
+    product = band[0] * y  # of the symmetric matrix and the given values
+    for k in range(1, len(band)):
+        product[k:] += band[k, :-k] * y[:-k]
+        product[:-k] += band[k, :-k] * y[k:]
     for k in range(1, len(band)):  # rows and columns of given values
         band[k, :-k] *= is_unknown[k:] & is_unknown[:-k]
     band[0] = np.where(is_unknown, band[0], 1.0)
+    right_side = np.where(is_unknown, -product, 0.0)
     knot_values = knots.unscale_values(y + solveh_banded(band, right_side, lower=True))
     knot_values[:, 0] = x
     return knot_values
@@ -256,34 +228,35 @@ def smooth_samples(time: Array, x: Array, noise_rms: float) -> tuple[Array, Arra
     """
     from scipy.linalg import solveh_banded  # slow to import
 
-    grid = np.arange(time[0], time[-1], _MIN_KNOT_SPACING)
-    first = np.searchsorted(time, grid)
+    first = np.searchsorted(time, np.arange(time[0], time[-1], _MIN_KNOT_SPACING))
     knots = _JerkQuadraticForm(time[np.unique(np.r_[first, len(time) - 1])])
-    intervals, rows = knots.interpolation_rows(time)
-    gram = knots.assemble_banded(intervals, rows[:, :, None] * rows[:, None, :])
+    interval = np.clip(np.searchsorted(knots.time, time, "right") - 1, 0, len(knots.time) - 2)
+    u = (time - knots.time[interval]) / np.diff(knots.time)[interval]
+    rows = u[:, None] ** np.arange(2 * _VALUES_PER_KNOT) @ _QUINTIC_BASIS
+    gram = knots.assemble_banded(interval, rows[:, :, None] * rows[:, None, :])
+    columns = _VALUES_PER_KNOT * interval[:, None] + np.arange(2 * _VALUES_PER_KNOT)
+    scaled_rows = rows * knots.interval_scales[interval]
     mean = float(x.mean())
-    centred = x - mean
-    right_side = knots.apply_transpose(intervals, rows, centred)
+    centred, right_side = x - mean, np.zeros(_VALUES_PER_KNOT * len(knots.time))
+    np.add.at(right_side, columns, scaled_rows * centred[:, None])
     step = float(np.ptp(time)) / (len(time) - 1) / knots.time_unit
-    lower_cutoff, upper_cutoff = 1.0 / float(np.ptp(time)), 0.5 / knots.time_unit
-    lower_cutoff = max(lower_cutoff, _MIN_CUTOFF_PER_KNOT / knots.time_unit)
+    lower_cutoff = max(1.0 / float(np.ptp(time)), _MIN_CUTOFF_PER_KNOT / knots.time_unit)
+    upper_cutoff = 0.5 / knots.time_unit
     while True:
         cutoff_frequency = float(np.sqrt(lower_cutoff * upper_cutoff))
         weight = step * (2 * np.pi * cutoff_frequency * knots.time_unit) ** 6
         y = solveh_banded(knots.jerk + weight * gram, weight * right_side, lower=True)
-        residual_rms = float(
-            np.sqrt(np.mean((knots.interpolate(intervals, rows, y) - centred) ** 2))
-        )
+        residuals = np.einsum("ij,ij->i", scaled_rows, y[columns]) - centred
+        residual_rms = float(np.sqrt(np.mean(residuals**2)))
         if (
             abs(residual_rms - noise_rms) < _RELATIVE_TOLERANCE * noise_rms
             or upper_cutoff < (1.0 + _RELATIVE_TOLERANCE) * lower_cutoff
         ):
             break
-        lower_cutoff, upper_cutoff = (
-            (cutoff_frequency, upper_cutoff)
-            if residual_rms > noise_rms
-            else (lower_cutoff, cutoff_frequency)
-        )
+        if residual_rms > noise_rms:
+            lower_cutoff = cutoff_frequency
+        else:
+            upper_cutoff = cutoff_frequency
     knot_values = knots.unscale_values(y)
     knot_values[:, 0] += mean
     return knots.time, knot_values, cutoff_frequency

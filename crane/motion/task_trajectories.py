@@ -1,22 +1,52 @@
-"""Trajectories of the active joints from trajectories of the tip and from tasks."""
+"""Trajectories of the active joints: from the tip, from tasks, from files of points or samples."""
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from crane.codegen import cached_result
-from crane.common.errors import InputError, LimitError, suggest_names
+from crane.common.errors import (
+    CraneWarning,
+    InputError,
+    LimitError,
+    RecordingError,
+    prefix_location,
+    suggest_names,
+)
 from crane.common.samples import Array
-from crane.description.specification import TIP_COORDINATES, Task, ViaPoint
+from crane.description.specification import ATTITUDE_COORDINATES, TIP_COORDINATES
 from crane.machine.machine import Machine
 from crane.motion.attitude import INCLINATION, via_attitudes
 from crane.motion.kinematics import Kinematics
 from crane.motion.limit_violations import limit_violation_message
-from crane.motion.quintic_splines import PiecewisePolynomial, quintic_polynomials
-from crane.motion.trajectory import AttitudeTrajectory, Trajectory, polynomial, via_points
+from crane.motion.quintic_splines import (
+    PiecewisePolynomial,
+    estimate_noise,
+    quintic_polynomials,
+    smooth_samples,
+)
+from crane.motion.trajectory import (
+    AdaptedTrajectory,
+    AttitudeTrajectory,
+    Trajectory,
+    polynomial,
+    via_points,
+)
+from crane.recordings.recording import FORCE_SUFFIX, VELOCITY_SUFFIX
+from crane.recordings.table_reader import read_table
+from crane.recordings.timeseries import TIME, Table, check_unit, table_column
 
 _KNOTS_PER_SECOND = 100
+_MIN_NOISY_SAMPLES = 50  # samples; fewer are taken as exact points
+_NOISE_THRESHOLD = 1e-7  # noise relative to the range of a column; less is rounding
+_TIP_PREFIX = "tip_"  # of columns of the tip in recordings
+_UNITS = {
+    **dict.fromkeys(TIP_COORDINATES, "m"),
+    **dict.fromkeys(ATTITUDE_COORDINATES[0] + ATTITUDE_COORDINATES[1], "rad"),
+}
 
 
 def tip_trajectory(
@@ -57,17 +87,12 @@ def tip_trajectory(
                 f"the tip takes {tip.duration:g} s and its attitude {attitude.duration:g} s, give "
                 "them the same time"
             )
-        name = "rotation" if isinstance(attitude, AttitudeTrajectory) else INCLINATION
         attitude_targets, rate, acceleration = attitude(time)
-        attitude_targets = (
-            attitude_targets
-            if isinstance(attitude, AttitudeTrajectory)
-            else attitude_targets[:, 0]
-        )
-        x_rate, x_acceleration = (
-            np.hstack([x_rate, rate]),
-            np.hstack([x_acceleration, acceleration]),
-        )
+        name = "rotation"
+        if not isinstance(attitude, AttitudeTrajectory):
+            name, attitude_targets = INCLINATION, attitude_targets[:, 0]
+        x_rate = np.hstack([x_rate, rate])
+        x_acceleration = np.hstack([x_acceleration, acceleration])
     q_a = kinematics.inverse_along_path(x, initial_guess, attitude_targets, time)
     if machine.is_driven.sum() > x_rate.shape[1]:
         from scipy.interpolate import make_interp_spline  # slow to import
@@ -79,42 +104,6 @@ def tip_trajectory(
         v_a = np.einsum("ijk,ik->ij", jacobian, x_rate)
         a_a = np.einsum("ijk,ik->ij", jacobian, x_acceleration - kinematics.bias(q_a, v_a, name))
     return Trajectory(quintic_polynomials(time, q_a, v_a, a_a), tip, attitude)
-
-
-class _FreeJointTrajectory(Trajectory):
-    """Trajectory of all active joints with the free joints at constant coordinates."""
-
-    def __init__(self, reference: Trajectory, driven: NDArray[np.bool_], start: Array):
-        self.duration = reference.duration
-        self.tip, self.attitude = reference.tip, reference.attitude
-        self._reference, self._driven, self._start = reference, driven, start
-
-    def position(self, time: ArrayLike) -> Array:
-        """See `Trajectory`."""
-        return self._insert_driven(self._reference.position(time), self._start)
-
-    def _derivative(self, order: int, time: ArrayLike) -> Array:
-        return self._insert_driven(
-            self._reference._derivative(order, time), np.zeros_like(self._start)
-        )
-
-    def bounds(self) -> tuple[Array, Array]:
-        """See `Trajectory`."""
-        lower, upper = self._reference.bounds()
-        return self._insert_driven(lower, self._start), self._insert_driven(upper, self._start)
-
-    def extremum_times(self) -> Array:
-        """See `Trajectory`."""
-        return self._reference.extremum_times()
-
-    def breaks(self) -> Array:
-        """See `Trajectory`."""
-        return self._reference.breaks()
-
-    def _insert_driven(self, x: Array, all_values: Array) -> Array:
-        out = np.tile(all_values, (*x.shape[:-1], 1) if x.ndim > 1 else 1)
-        out[..., self._driven] = x if x.shape[-1] < len(all_values) else x[..., self._driven]
-        return out
 
 
 def add_free_joints(machine: Machine, reference: Trajectory) -> Trajectory:
@@ -136,7 +125,7 @@ def add_free_joints(machine: Machine, reference: Trajectory) -> Trajectory:
         )
     if len(start) == len(driven_names):
         start = machine.home[machine.closure.active]
-    return _FreeJointTrajectory(reference, machine.is_driven, start)
+    return AdaptedTrajectory(reference, reference.duration, machine.is_driven, start)
 
 
 def task_trajectory(machine: Machine, task: str) -> Trajectory:
@@ -161,45 +150,200 @@ def task_trajectory(machine: Machine, task: str) -> Trajectory:
         tuple((name, tuple(row)) for name, row in task_spec.coefficients.items()),
         tuple((x.time, tuple(x.point.items()), tuple(x.rates.items())) for x in task_spec.via),
     )  # fmt: skip
-    classes = Trajectory, _FreeJointTrajectory, AttitudeTrajectory, PiecewisePolynomial
-    return cached_result(
-        ("task", dependencies),
-        lambda: _build_task_trajectory(machine, task_spec),
-        "scipy.interpolate",
-        classes,
-    )
+
+    def curve(names: Sequence[str]) -> Trajectory:
+        if task_spec.via:
+            return via_points(*via_point_table(names))
+        coefficients = [task_spec.coefficients[name] for name in names]
+        return polynomial(coefficients, task_spec.duration)
+
+    def via_point_table(names: Sequence[str]) -> tuple[Array, Array, Array]:
+        """Times (N,), coordinates and rates (N, n) of via points, NaN where none is given."""
+        points, rates = (
+            np.array([[values.get(name, np.nan) for name in names] for values in rows])
+            for rows in ([x.point for x in task_spec.via], [x.rates for x in task_spec.via])
+        )
+        return np.array([x.time for x in task_spec.via]), points, rates
+
+    def compute() -> Trajectory:
+        if task_spec.space != "tip":
+            trajectory = curve(machine.driven_joints)
+            return _joint_trajectory(machine, trajectory, f"task '{task}': ")
+        names = [name for name in task_spec.coordinates if name not in TIP_COORDINATES]
+        return _pose_trajectory(machine, names, curve, lambda: via_point_table(names))
+
+    classes = Trajectory, AdaptedTrajectory, AttitudeTrajectory, PiecewisePolynomial
+    return cached_result(("task", dependencies), compute, "scipy.interpolate", classes)
 
 
-def _build_task_trajectory(machine: Machine, task: Task) -> Trajectory:
-    if task.space == "tip":
-        tip = _coordinate_trajectory(task, TIP_COORDINATES)
-        attitude: Trajectory | AttitudeTrajectory | None = None
-        names = [name for name in task.coordinates if name not in TIP_COORDINATES]
-        if names == [INCLINATION]:
-            attitude = _coordinate_trajectory(task, names)
-        elif names:
-            attitude = via_attitudes(*_via_point_table(task.via, names))
-        return tip_trajectory(machine, tip, None, attitude)
-    trajectory = add_free_joints(machine, _coordinate_trajectory(task, machine.driven_joints))
+def _joint_trajectory(machine: Machine, reference: Trajectory, label: str) -> Trajectory:
+    """Trajectory of the active joints from one of the driven joints, within their limits."""
+    trajectory = add_free_joints(machine, reference)
     if text := limit_violation_message(machine, trajectory):
-        raise LimitError(f"task '{task.name}': {text}")
+        raise LimitError(f"{label}{text}")
     return trajectory
 
 
-def _coordinate_trajectory(task: Task, names: Sequence[str]) -> Trajectory:
-    """Trajectory of some of the coordinates of a task."""
-    if task.via:
-        return via_points(*_via_point_table(task.via, names))
-    return polynomial([task.coefficients[name] for name in names], task.duration)
+def _pose_trajectory(
+    machine: Machine,
+    attitude_names: Sequence[str],
+    curve: Callable[[Sequence[str]], Trajectory],
+    attitudes: Callable[[], tuple[Array, ...]],
+) -> Trajectory:
+    """Trajectory of the active joints from the curves of the tip's position and attitude.
+
+    Args:
+        machine: The machine.
+        attitude_names: Coordinates of the attitude, none if it is free.
+        curve: Function that returns the trajectory of coordinates.
+        attitudes: Function that returns the arguments of `via_attitudes`.
+    """
+    attitude: Trajectory | AttitudeTrajectory | None = None
+    if list(attitude_names) == [INCLINATION]:
+        attitude = curve(attitude_names)
+    elif attitude_names:
+        attitude = via_attitudes(*attitudes())
+    return tip_trajectory(machine, curve(TIP_COORDINATES), None, attitude)
 
 
-def _via_point_table(via: Sequence[ViaPoint], names: Sequence[str]) -> tuple[Array, Array, Array]:
-    """Times (N,), coordinates and rates (N, n) of via points, NaN where none is given."""
-    time = np.array([via_point.time for via_point in via])
-    points, rates = (
-        np.array(
-            [[coordinates.get(name, np.nan) for name in names] for coordinates in point_values]
+def read_path(machine: Machine, path: str | Path) -> Trajectory:
+    """Read a trajectory from the points in a CSV or npz file.
+
+    Its columns are time [s] and all driven joints [m], [rad], as in a recording; or x, y, z [m] of
+    the tip, and optionally `inclination` or `roll`, `pitch`, `yaw` [rad] of its frame. The
+    trajectory passes the points with least jerk (`via_points`), from rest to rest. Columns of many
+    noisy samples are smoothed (`crane.motion.quintic_splines`); a warning gives their noise and
+    the cut-off frequency.
+
+    Args:
+        machine: The machine.
+        path: The file. Its time may start at any value.
+
+    Returns:
+        Trajectory of the active joints.
+
+    Raises:
+        RecordingError: The file cannot be read, or a unit is wrong.
+        InputError: Columns are missing or unknown, times do not increase, or there are too few
+            points.
+        UnreachableTipError: The path of the tip is not reachable.
+        LimitError: The trajectory leaves the limits of a driven joint.
+    """
+    table = read_table(path)
+    try:
+        columns = _path_columns(machine, table)
+        time, names = _path_times(table), list(columns)
+        units = [_UNITS.get(name) or machine.unit(name) for name in names]
+        for name, unit in zip(columns.values(), units, strict=True):
+            check_unit(name, table.units[name], [unit])
+        points = np.column_stack([table_column(table, name) for name in columns.values()])
+        knots, derivatives = _fit_curve(time, points, names, units, path)
+
+        def curve(coordinates: Sequence[str]) -> Trajectory:
+            some = derivatives[:, :, [names.index(name) for name in coordinates]]
+            return Trajectory(quintic_polynomials(knots, some[0], some[1], some[2]))
+
+        if names[: len(TIP_COORDINATES)] != list(TIP_COORDINATES):
+            return _joint_trajectory(machine, curve(names), "")
+        others = names[len(TIP_COORDINATES) :]
+        return _pose_trajectory(
+            machine, others, curve, lambda: (knots, derivatives[0][:, len(TIP_COORDINATES) :])
         )
-        for point_values in ([one.point for one in via], [one.rates for one in via])
-    )
-    return time, points, rates
+    except (InputError, LimitError, RecordingError) as error:
+        raise type(error)(prefix_location(str(path), error)) from None
+
+
+def _path_columns(machine: Machine, table: Table) -> dict[str, str]:
+    """Columns of a path by coordinate: driven joints, or the tip and its attitude."""
+    joints, headings = machine.driven_joints, list(table.units)
+    present_joints = [joint for joint in joints if joint in headings]
+    is_recording = any(name.endswith((VELOCITY_SUFFIX, FORCE_SUFFIX)) for name in headings)
+    tip = {
+        axis: name
+        for axis in TIP_COORDINATES
+        for name in (axis, _TIP_PREFIX + axis)
+        if name in headings
+    }
+    if present_joints:
+        missing = [joint for joint in joints if joint not in headings]
+        if missing:
+            raise InputError(
+                f"column '{missing[0]}' is missing, a path of joints has all that are driven: "
+                f"{', '.join(joints)}"
+            )
+        columns = {joint: joint for joint in joints}
+    elif tip:
+        missing = [axis for axis in TIP_COORDINATES if axis not in tip]
+        if missing:
+            raise InputError(f"column '{missing[0]}' is missing, a path of the tip has x, y, z")
+        if machine.tip is None:
+            raise InputError(f"'{machine.name}' has no tip, name its frame under 'tip:'")
+        groups = [
+            group for group in ATTITUDE_COORDINATES if any(name in headings for name in group)
+        ]
+        if len(groups) > 1:
+            raise InputError("it has an inclination and roll, pitch, yaw, give one of both")
+        for name in groups[0] if groups else ():
+            if name not in headings:
+                raise InputError(f"column '{name}' is missing beside the others of the attitude")
+        columns = tip | {name: name for group in groups for name in group}
+    else:
+        raise InputError(
+            f"it has no column of a path, give time and {', '.join(joints)}, or time and x, y, z"
+        )
+    unknown = [name for name in headings if name not in (TIME, *columns.values())]
+    if unknown and not is_recording:
+        known_names = (
+            *joints,
+            *TIP_COORDINATES,
+            *(name for group in ATTITUDE_COORDINATES for name in group),
+        )
+        raise InputError(
+            f"column '{unknown[0]}' is unknown, {suggest_names(known_names, unknown[0])}"
+        )
+    return columns
+
+
+def _path_times(table: Table) -> Array:
+    time = table_column(table, TIME)
+    if len(time) < 2:
+        raise InputError(f"it has {len(time)} points, give two at least")
+    for row, (previous, following) in enumerate(zip(time, time[1:], strict=False), start=2):
+        if not following > previous:
+            raise InputError(
+                f"time goes from {previous:g} to {following:g} s at row {row} of its samples, "
+                "let it increase"
+            )
+    return time - time[0]
+
+
+def _fit_curve(
+    time: Array, points: Array, names: Sequence[str], units: Sequence[str], path: str | Path
+) -> tuple[Array, Array]:
+    """Interpolate points, or smooth noisy samples.
+
+    Returns:
+        Times (K,) of the knots, and values, velocities and accelerations (3, K, n) there.
+    """
+    messages, smoothed_columns = [], {}
+    knots = time
+    for i, (name, unit, x) in enumerate(zip(names, units, points.T, strict=True)):
+        if len(x) < _MIN_NOISY_SAMPLES or np.isnan(x).any():
+            continue
+        scatter = estimate_noise(time, x)
+        if scatter > _NOISE_THRESHOLD * float(np.ptp(x)):
+            knots, smoothed_columns[i], cutoff_frequency = smooth_samples(time, x, scatter)
+            messages.append(
+                f"'{name}' scatters by {scatter:.2g} {unit}, followed up to "
+                f"{cutoff_frequency:.2g} Hz"
+            )
+    if messages:
+        warnings.warn(f"{path}: {'; '.join(messages)}", CraneWarning, stacklevel=4)
+    derivatives = np.empty((3, len(knots), len(names)))
+    for i in range(len(names)):
+        if i in smoothed_columns:
+            derivatives[:, :, i] = smoothed_columns[i].T
+        else:
+            trajectory = via_points(time, points[:, [i]])
+            derivatives[:, :, i] = np.array(trajectory(knots))[:, :, 0]
+    return knots, derivatives

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from math import factorial
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from crane.common.errors import InputError
 from crane.common.one_line_repr import OneLineRepr, format_count
@@ -51,7 +51,6 @@ class Trajectory(OneLineRepr):
         self._polynomials = (curve, curve.derivative(), curve.derivative(2))
 
     def _one_line(self) -> str:
-        """Duration and number of coordinates."""
         count = np.size(self.position(0.0))
         summary = f"{self.duration:.6g} s of {format_count(count, 'coordinate')}"
         return f"{type(self).__name__}({summary}{', by its tip' * (self.tip is not None)})"
@@ -84,8 +83,7 @@ class Trajectory(OneLineRepr):
     def extremum_times(self) -> Array:
         """Times (k,) [s] at which a coordinate may be extremal: knots, and zeros of velocities."""
         curve, rate = self._polynomials[:2]
-        rest_times = [np.ravel(roots) for roots in np.ravel(rate.roots())]
-        times = np.concatenate([curve.x, *rest_times])
+        times = np.concatenate([curve.x, *map(np.ravel, np.ravel(rate.roots()))])
         return np.unique(times[np.isfinite(times)])
 
     def breaks(self) -> Array:
@@ -112,6 +110,72 @@ class Trajectory(OneLineRepr):
             Three arrays (n,) or (N, n).
         """
         return self.position(time), self._derivative(1, time), self._derivative(2, time)
+
+
+class AdaptedTrajectory(Trajectory):
+    """Trajectory with another duration, or with free joints at constant coordinates.
+
+    Args:
+        reference: The trajectory.
+        duration: [s].
+        driven: (n,) whether a joint is driven; None if the reference has all coordinates.
+        start: (n,) coordinates of the free joints.
+    """
+
+    def __init__(
+        self,
+        reference: Trajectory,
+        duration: float,
+        driven: NDArray[np.bool_] | None = None,
+        start: Array | float = 0.0,
+    ):
+        self.duration = duration
+        self._reference, self._driven, self._start = reference, driven, start
+        self._time_scale = reference.duration / duration
+        if driven is not None:
+            self.tip, self.attitude = reference.tip, reference.attitude
+
+    def position(self, time: ArrayLike) -> Array:
+        """See `Trajectory`."""
+        x = self._reference.position(np.asarray(time) * self._time_scale)
+        return self._insert_driven(x, self._start)
+
+    def _derivative(self, order: int, time: ArrayLike) -> Array:
+        x = self._reference._derivative(order, np.asarray(time) * self._time_scale)
+        return self._insert_driven(self._time_scale**order * x, np.zeros_like(self._start))
+
+    def bounds(self) -> tuple[Array, Array]:
+        """See `Trajectory`."""
+        lower, upper = self._reference.bounds()
+        return self._insert_driven(lower, self._start), self._insert_driven(upper, self._start)
+
+    def extremum_times(self) -> Array:
+        """See `Trajectory`."""
+        return self._reference.extremum_times() / self._time_scale
+
+    def breaks(self) -> Array:
+        """See `Trajectory`."""
+        return self._reference.breaks() / self._time_scale
+
+    def _insert_driven(self, x: Array, all_values: Array | float) -> Array:
+        if self._driven is None:
+            return x
+        out = np.tile(all_values, (*x.shape[:-1], 1) if x.ndim > 1 else 1)
+        out[..., self._driven] = x if x.shape[-1] < out.shape[-1] else x[..., self._driven]
+        return out
+
+
+def retime(reference: Trajectory, duration: float) -> Trajectory:
+    """Trajectory with the same path and another duration: q(t T / duration).
+
+    Args:
+        reference: Trajectory of duration T [s].
+        duration: [s].
+
+    Raises:
+        InputError: The duration is not positive.
+    """
+    return AdaptedTrajectory(reference, as_number(duration, "the duration", "s", greater_than=0))
 
 
 def polynomial(coefficients: Sequence[Sequence[float]], duration: float) -> Trajectory:

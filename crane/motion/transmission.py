@@ -67,10 +67,7 @@ class Transmission(OneLineRepr):
         }
         self.actuators = tuple(joint for joint in machine.active if joint not in floating_joints)
         self.joints = tuple(joint for joint in machine.joints if joint not in floating_joints)
-        self._actuator_indices = {joint: i for i, joint in enumerate(self.actuators)}
-        self._joint_columns = np.array(
-            [machine.column(joint) for joint in self.joints], dtype=np.intp
-        )
+        self._joint_columns = np.array([machine.column(x) for x in self.joints], dtype=np.intp)
         self._actuator_columns = np.array(
             [machine.active.index(x) for x in self.actuators], dtype=np.intp
         )
@@ -79,18 +76,14 @@ class Transmission(OneLineRepr):
         self._jacobians = FrameJacobians(machine)
 
     def _one_line(self) -> str:
-        """Machine, actuators, and number of joints."""
         actuators = ", ".join(self.actuators)
         return f"Transmission of '{self.machine.name}': {actuators} to {len(self.joints)} joints"
 
     @property
     def unknown_actuators(self) -> tuple[str, ...]:
         """Active joints whose position is not known yet."""
-        return tuple(
-            joint
-            for joint, i in self._actuator_indices.items()
-            if np.isnan(self._received_values[0, i])
-        )
+        is_unknown = np.isnan(self._received_values[0])
+        return tuple(np.array(self.actuators)[is_unknown].tolist())
 
     def update(
         self,
@@ -123,17 +116,15 @@ class Transmission(OneLineRepr):
         fields = zip((position, velocity, effort), _FIELD_NAMES, strict=True)
         field_arrays = [_field_array(values, len(name), what) for values, what in fields]
         index_pairs = [
-            (self._actuator_indices[joint], i)
+            (self.actuators.index(joint), i)
             for i, joint in enumerate(name)
-            if joint in self._actuator_indices
+            if joint in self.actuators
         ]
         if not index_pairs:
             return None
         columns, message_indices = np.array(index_pairs).T
-        received_values, message_values = (
-            self._received_values.copy(),
-            np.array(field_arrays)[:, message_indices],
-        )
+        received_values = self._received_values.copy()
+        message_values = np.array(field_arrays)[:, message_indices]
         received_values[1:, columns] = message_values[1:]
         is_measured = ~np.isnan(message_values[0])
         received_values[0, columns[is_measured]] = message_values[0, is_measured]
@@ -149,10 +140,12 @@ class Transmission(OneLineRepr):
         gamma = closure.gamma(q)[np.ix_(self._joint_columns, self._actuator_columns)]
         effort = np.zeros(len(q))
         effort[closure.active[self._actuator_columns]] = f_a
-        position, effort = q[self._joint_columns], effort[self._joint_columns]
+        velocity, effort = gamma @ v_a, effort[self._joint_columns]
         self._gamma, self._configuration = gamma, q
         self.state = JointState(
-            self.joints, position, _known_or_empty(gamma @ v_a), _known_or_empty(effort)
+            self.joints,
+            q[self._joint_columns],
+            *(np.empty(0) if np.isnan(x).any() else x for x in (velocity, effort)),
         )
         return self.state
 
@@ -173,7 +166,7 @@ class Transmission(OneLineRepr):
         gamma, tau = self._known_gamma(), np.zeros(len(self.joints))
         for joint, value in effort.items():
             tau[self._joint_index(joint)] = as_number(value, f"effort of {joint}", "")
-        return self._forces_by_actuator(gamma.T @ tau)
+        return dict(zip(self.actuators, (gamma.T @ tau).tolist(), strict=True))
 
     def actuator_to_joint(
         self, effort: Mapping[str, float], joints: Sequence[str]
@@ -194,13 +187,13 @@ class Transmission(OneLineRepr):
             InputError: Names are unknown, there is no state yet, or the joints do not determine
                 the motion of the machine in this configuration.
         """
-        gamma, f_a = self._known_gamma(), np.zeros(len(self._actuator_indices))
+        gamma, f_a = self._known_gamma(), np.zeros(len(self.actuators))
         for joint, value in effort.items():
-            if joint not in self._actuator_indices:
+            if joint not in self.actuators:
                 raise InputError(
-                    f"'{joint}' is not active, {suggest_names(self._actuator_indices, joint)}"
+                    f"'{joint}' is not active, {suggest_names(self.actuators, joint)}"
                 )
-            f_a[self._actuator_indices[joint]] = as_number(value, f"effort of {joint}", "")
+            f_a[self.actuators.index(joint)] = as_number(value, f"effort of {joint}", "")
         joint_indices = [self._joint_index(joint) for joint in joints]
         units = self.machine.closure.units
         joint_units = units[self._joint_columns[joint_indices]]
@@ -240,9 +233,8 @@ class Transmission(OneLineRepr):
         self.machine.frame(frame)
         wrench_array = as_sample(wrench, 6, f"the wrench on '{frame}'", WRENCH_COMPONENTS)
         self._jacobians.set_configuration(self._configuration)
-        return self._forces_by_actuator(
-            gamma.T @ (self._jacobians.jacobian(frame).T @ wrench_array)[self._joint_columns]
-        )
+        tau = (self._jacobians.jacobian(frame).T @ wrench_array)[self._joint_columns]
+        return dict(zip(self.actuators, (gamma.T @ tau).tolist(), strict=True))
 
     def _known_gamma(self) -> Array:
         if self._gamma is None:
@@ -254,9 +246,6 @@ class Transmission(OneLineRepr):
         if joint not in self.joints:
             raise InputError(f"joint '{joint}' is unknown, {suggest_names(self.joints, joint)}")
         return self.joints.index(joint)
-
-    def _forces_by_actuator(self, f_a: Array) -> dict[str, float]:
-        return dict(zip(self._actuator_indices, f_a.tolist(), strict=True))
 
 
 def _field_array(values: Sequence[float], count: int, label: str) -> Array:
@@ -271,8 +260,3 @@ def _field_array(values: Sequence[float], count: int, label: str) -> Array:
     if np.isinf(array).any():
         raise InputError(f"{label} has an infinite value, give NaN for what is not measured")
     return array
-
-
-def _known_or_empty(values: Array) -> Array:
-    """The values, or an empty array if one is unknown."""
-    return np.empty(0) if np.isnan(values).any() else values

@@ -1,6 +1,7 @@
 """Break-out forces of bucket and arm (ISO 6015, SAE J1179)."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -137,7 +138,6 @@ class Breakout(Result):
         return f"| {' | '.join(map(str, cells))} |"
 
     def _centre_text(self, force: BreakoutForce) -> str:
-        """Return the pin about which the frame turns, or the position of the centre."""
         if np.isinf(force.radius):
             return f"nothing: {force.joint} shifts it"
         if force.turn.offset <= _PIVOT_TOLERANCE * self.machine.closure.characteristic_length:
@@ -208,9 +208,12 @@ def breakout(
         start = machine.home
         if np.isfinite(bucket_force.isolated_force):
             held_coordinates[bucket_stroke], start = bucket_force.stroke, lever
-        others = [i for i in strokes.moving if i != bucket_stroke]
         arm_force, _ = _largest_breakout_force(
-            strokes, arm_stroke, (held_coordinates, start), others, weights
+            strokes,
+            arm_stroke,
+            (held_coordinates, start),
+            [i for i in strokes.moving if i != bucket_stroke],
+            weights,
         )
     return Breakout(
         machine, strokes.statics.frame, strokes.section, weights, bucket_force, arm_force
@@ -237,8 +240,9 @@ def _largest_breakout_force(
     machine, frame, active = strokes.machine, strokes.statics.frame, strokes.machine.closure.active
     joint, action = machine.active[stroke_index], tangent_action(strokes, stroke_index)
     rule, drives = find_rule("none"), drive_force_limits(machine, [joint])
-    own_drive = [x for x in drives if x.joint == joint]
-    own_limits = LoadLimits(strokes.statics, own_drive, rule, action, with_weight=False)
+    own_limits = LoadLimits(
+        strokes.statics, [x for x in drives if x.joint == joint], rule, action, with_weight=False
+    )
     grid = _start_configurations(strokes, stroke_index, held, moved)
     isolated_force, lever, tried = _maximize_over_starts(strokes, own_limits, grid, moved)
     for q in tried:
@@ -252,7 +256,7 @@ def _largest_breakout_force(
     forces = limits.max_magnitudes(strokes.statics.evaluate(best[None]))[0]
     smallest = int(np.nan_to_num(forces, nan=np.inf).argmin())
     home = own_limits.max_magnitudes(strokes.statics.evaluate(machine.home[None]))[0].min()
-    breakout_force = BreakoutForce(
+    return BreakoutForce(
         joint=joint,
         pivot=find_pivot(machine, frame, stroke_index),
         turn=instantaneous_rotation(machine, frame, stroke_index, best),
@@ -264,8 +268,7 @@ def _largest_breakout_force(
         limiting_factor=limits.factors[smallest] if np.isfinite(force) else None,
         forces_by_factor=dict(zip(limits.factors, forces.tolist(), strict=True)),
         q_a=best[active].copy(),
-    )
-    return breakout_force, lever
+    ), lever
 
 
 def _maximize_over_starts(
@@ -339,74 +342,55 @@ def maximize_force(strokes: Strokes, limits: LoadLimits, q: Array, moved: list[i
     Returns:
         (nq,) closed configuration; the start if no larger force is found.
     """
-    start = strokes.statics.evaluate(q[None])
-    force = float(limits.max_magnitudes(start)[0].min())
+    statics, active = strokes.statics, strokes.machine.closure.active
+    force = float(limits.max_magnitudes(statics.evaluate(q[None]))[0].min())
     if not 0 < force < np.inf:
         return q
-    problem = _ForceProblem(strokes, limits, q, moved, force)
-    constraints: Any = {
-        "type": "ineq", "fun": problem.constraint_values, "jac": problem.constraint_jacobian,
-    }  # fmt: skip
-    bounds: Any = [*[(0.0, 1.0)] * len(moved), (0.0, None)]
-    result = minimize(
-        problem.cost, problem.start, jac=True, bounds=bounds,
-        constraints=[constraints], method="SLSQP", options={"ftol": 1e-14, "maxiter": 200},
-    )  # fmt: skip
-    configuration, statics, _ = problem.evaluate(np.asarray(result.x))
-    return configuration if float(limits.max_magnitudes(statics)[0].min()) > force else q
+    lower, lengths = strokes.low[moved], (strokes.high - strokes.low)[moved]
 
-
-class _ForceProblem:
-    """Constraints of `maximize_force` in y: shares of the moved strokes, and the scaled force."""
-
-    def __init__(
-        self, strokes: Strokes, limits: LoadLimits, q: Array, moved: list[int], force: float
-    ):
-        self._strokes, self._limits, self._q, self._moved = strokes, limits, q, moved
-        self._force, self._lower = force, strokes.low[moved]
-        self._lengths = (strokes.high - strokes.low)[moved]
-        q_a = q[strokes.machine.closure.active]
-        self.start = np.r_[(q_a[moved] - self._lower) / self._lengths, 1.0]
-        self._cache: dict[bytes, tuple[Array, StaticQuantities, StaticQuantities]] = {}
-        coefficients = self._coefficients(strokes.statics.evaluate(q[None]))
-        self._scales = np.array([abs(a[0]) + abs(b[0]) * force for a, b, *_ in coefficients])
-
-    def evaluate(self, y: Array) -> tuple[Array, StaticQuantities, StaticQuantities]:
+    # the variables y are shares of the moved strokes, and the force over that of the start
+    @lru_cache(maxsize=1)
+    def evaluate(shares: tuple[float, ...]) -> tuple[Array, StaticQuantities, StaticQuantities]:
         """Return the configuration (nq,), its statics, and their derivatives by coordinates."""
-        key = y[:-1].tobytes()
-        if key not in self._cache:
-            self._cache.clear()
-            machine, statics = self._strokes.machine, self._strokes.statics
-            target = self._q[machine.closure.active].copy()
-            target[self._moved] = self._lower + np.clip(y[:-1], 0, 1) * self._lengths
-            q = last_closed_configuration(machine, self._q, target)[0]
-            derivatives = statics.coordinate_derivatives(q[None])
-            self._cache[key] = q, statics.evaluate(q[None]), derivatives
-        return self._cache[key]
+        target = q[active].copy()
+        target[moved] = lower + np.clip(shares, 0, 1) * lengths
+        found = last_closed_configuration(strokes.machine, q, target)[0]
+        return found, statics.evaluate(found[None]), statics.coordinate_derivatives(found[None])
 
-    def cost(self, y: Any) -> tuple[float, Any]:
-        """Return the negative force and its gradient."""
+    def coefficients(at_rest: StaticQuantities) -> list[tuple[Array, ...]]:
+        unit = limits.action.unit_vectors(at_rest, np.zeros(1))
+        return [limits.bound_coefficients(x, at_rest, unit) for x in limits.bounds]
+
+    def slacks(y: Any) -> Any:
+        """Return the slack of each bound over its scale."""
+        found = coefficients(evaluate(tuple(y[:-1]))[1])
+        return -np.array([a[0] + b[0] * force * y[-1] for a, b, *_ in found]) / scales
+
+    def jacobian(y: Any) -> Any:
+        """Return the derivatives of the slacks by y."""
+        _, at_rest, derivatives = evaluate(tuple(y[:-1]))
+        out = np.empty((len(limits.bounds), len(y)))
+        for k, i in enumerate(moved):
+            by_stroke = StaticQuantities(*(part[..., i] for part in derivatives))
+            for row, bound in zip(out, limits.bounds, strict=True):
+                a, b, *_ = limits.coefficient_derivatives(bound, at_rest, by_stroke)
+                row[k] = (a[0] + b[0] * force * y[-1]) * lengths[k]
+        out[:, -1] = [b[0] * force for _, b, *_ in coefficients(at_rest)]
+        return -out / scales[:, None]
+
+    at_start = coefficients(statics.evaluate(q[None]))
+    scales = np.array([abs(a[0]) + abs(b[0]) * force for a, b, *_ in at_start])
+    constraints: Any = {"type": "ineq", "fun": slacks, "jac": jacobian}
+    bounds: Any = [*[(0.0, 1.0)] * len(moved), (0.0, None)]
+
+    def cost(y: Any) -> tuple[float, Any]:
         return -float(y[-1]), -np.eye(len(y))[-1]
 
-    def constraint_values(self, y: Any) -> Any:
-        """Return the slack of each bound over its scale."""
-        coefficients = self._coefficients(self.evaluate(y)[1])
-        return -np.array([a[0] + b[0] * self._force * y[-1] for a, b, *_ in coefficients]) / (
-            self._scales
-        )
-
-    def constraint_jacobian(self, y: Any) -> Any:
-        """Return the derivatives of `constraint_values` by y."""
-        _, statics, derivatives = self.evaluate(y)
-        jacobian = np.empty((len(self._limits.bounds), len(y)))
-        for k, i in enumerate(self._moved):
-            by_stroke = StaticQuantities(*(part[..., i] for part in derivatives))
-            for row, bound in zip(jacobian, self._limits.bounds, strict=True):
-                a, b, *_ = self._limits.coefficient_derivatives(bound, statics, by_stroke)
-                row[k] = (a[0] + b[0] * self._force * y[-1]) * self._lengths[k]
-        jacobian[:, -1] = [b[0] * self._force for _, b, *_ in self._coefficients(statics)]
-        return -jacobian / self._scales[:, None]
-
-    def _coefficients(self, statics: StaticQuantities) -> list[tuple[Array, ...]]:
-        unit = self._limits.action.unit_vectors(statics, np.zeros(1))
-        return [self._limits.bound_coefficients(x, statics, unit) for x in self._limits.bounds]
+    result = minimize(
+        cost,
+        np.r_[(q[active][moved] - lower) / lengths, 1.0],
+        jac=True, bounds=bounds, constraints=[constraints], method="SLSQP",
+        options={"ftol": 1e-14, "maxiter": 200},
+    )  # fmt: skip
+    configuration, at_rest, _ = evaluate(tuple(result.x[:-1]))
+    return configuration if float(limits.max_magnitudes(at_rest)[0].min()) > force else q

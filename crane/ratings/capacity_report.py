@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,10 @@ from crane.common.errors import SingularConfigurationError
 from crane.common.samples import Array
 from crane.common.units import format_quantity
 from crane.ratings.limiting_factors import PIN_FORCE, TIPPING
-from crane.ratings.load_effects import buckling_margins, pin_forces
 from crane.ratings.rating_chart import RatingChart
+
+if TYPE_CHECKING:
+    from crane.ratings.lifting_capacity import Capacity
 
 _ROUND_STEPS = (1.0, 1.5, 2.0, 2.5, 5.0)
 _MAX_ROWS, _MAX_COLUMNS = 12, 18  # columns over all slews
@@ -27,11 +29,10 @@ class LoadTable(NamedTuple):
     Attributes:
         heights: (h,) heights, descending [m].
         radii: (r,) radii [m].
-        loads: (s, h, r) loads [kg]; NaN out of reach, infinite where there is no limit.
-        limited_by_drives: (s, h, r) whether a drive limits the load.
+        loads: (s, h, r + 1) loads at these radii and at the largest one [kg]; NaN out of reach,
+            infinite where there is no limit.
+        limited_by_drives: (s, h, r + 1) whether a drive limits the load.
         max_radii: (h,) largest radius, rounded down to a 25th of the chart's step [m].
-        max_radius_loads: (s, h) loads at the largest radius [kg].
-        max_radius_limited_by_drives: (s, h) whether a drive limits that load.
         can_tip: Whether tipping is among the limiting factors.
     """
 
@@ -40,8 +41,6 @@ class LoadTable(NamedTuple):
     loads: Array
     limited_by_drives: NDArray[np.bool_]
     max_radii: Array
-    max_radius_loads: Array
-    max_radius_limited_by_drives: NDArray[np.bool_]
     can_tip: bool
 
     def format_load(self, load: float, limited_by_drive: bool) -> str:
@@ -53,7 +52,8 @@ class LoadTable(NamedTuple):
             return ""
         if math.isinf(load):
             return "∞"
-        largest_load = max(self.loads[np.isfinite(self.loads)].max(initial=0.0), 1e-9)
+        finite_loads = self.loads[..., :-1][np.isfinite(self.loads[..., :-1])]
+        largest_load = max(finite_loads.max(initial=0.0), 1e-9)
         digits = max(_SIGNIFICANT_DIGITS - 1 - math.floor(math.log10(largest_load)), 0)
         rounded_down = math.floor(load * 10**digits * (1 + 1e-12)) / 10**digits
         return f"{rounded_down:.{digits}f}{'*' if limited_by_drive and self.can_tip else ''}"
@@ -63,17 +63,14 @@ class LoadTable(NamedTuple):
 
         The loads at the largest radius precede that radius.
         """
-        loads = np.concatenate([self.loads, self.max_radius_loads[:, :, None]], axis=2)
-        limited = np.concatenate(
-            [self.limited_by_drives, self.max_radius_limited_by_drives[:, :, None]], axis=2
-        )
-        decimals = _decimal_places(self.max_radii)
+        largest_radius = max(np.abs(self.max_radii).max(), 1e-9)  # small machines need more places
+        decimals = max(2 - math.floor(math.log10(largest_radius)), 2)
         return [
             [
                 *(
-                    self.format_load(loads[k, i, j], limited[k, i, j])
-                    for j in range(loads.shape[2])
-                    for k in range(len(loads))
+                    self.format_load(self.loads[k, i, j], self.limited_by_drives[k, i, j])
+                    for j in range(self.loads.shape[2])
+                    for k in range(len(self.loads))
                 ),
                 f"{self.max_radii[i]:.{decimals}f}",
             ]
@@ -94,19 +91,14 @@ def load_table(chart: RatingChart) -> LoadTable:
     step = _round_step(chart.radii[a], chart.heights[b], columns)
     a = a[_select_indices(chart.radii[a], step, columns)]
     b = b[_select_indices(chart.heights[b], step, _MAX_ROWS)][::-1]
-    limited_by_drives = _is_drive_limited(chart)
     largest = [_at_largest_radius(chart, int(i), np.flatnonzero(is_reached[i])) for i in b]
-    max_radii, loads, limited = (list(column) for column in zip(*largest, strict=True))
-    return LoadTable(
-        chart.heights[b],
-        chart.radii[a],
-        chart.values[:, b][:, :, a],
-        limited_by_drives[:, b][:, :, a],
-        np.array(max_radii),
-        np.array(loads).T,
-        np.array(limited).T,
-        any(factor.reason == TIPPING for factor in chart.limiting_factors),
+    max_radii, *farthest = (np.array(column).T for column in zip(*largest, strict=True))
+    loads, is_limited = (
+        np.dstack([values[:, b][:, :, a], last])
+        for values, last in zip((chart.values, _is_drive_limited(chart)), farthest, strict=True)
     )
+    can_tip = any(factor.reason == TIPPING for factor in chart.limiting_factors)
+    return LoadTable(chart.heights[b], chart.radii[a], loads, is_limited, max_radii, can_tip)
 
 
 def _is_drive_limited(chart: RatingChart) -> NDArray[np.bool_]:
@@ -116,7 +108,6 @@ def _is_drive_limited(chart: RatingChart) -> NDArray[np.bool_]:
 
 
 def _round_step(radii: Array, heights: Array, columns: int) -> float:
-    """Return the smallest round step with no more than so many columns and rows."""
     min_step = max(np.ptp(radii) / columns, np.ptp(heights) / _MAX_ROWS)
     if not min_step:
         return 0.0
@@ -166,13 +157,11 @@ def _at_largest_radius(
         found = chart.places.find_all((radii, np.array([height])))
         chart = chart.at_positions([radii[found.position_index.max()]], [height])
         height_index = last = 0
-    is_limited = _is_drive_limited(chart)[:, height_index, last]
-    return float(chart.radii[last]), chart.values[:, height_index, last], is_limited
-
-
-def _decimal_places(values: Array) -> int:
-    """Return the number of decimal places for lengths: two, or more for small machines."""
-    return max(2 - math.floor(math.log10(max(np.abs(values).max(), 1e-9))), 2)
+    return (
+        float(chart.radii[last]),
+        chart.values[:, height_index, last],
+        _is_drive_limited(chart)[:, height_index, last],
+    )
 
 
 _SIDE_NAMES = {0: "front", 90: "side", -90: "side", 180: "rear", -180: "rear"}  # [deg]
@@ -205,8 +194,9 @@ def limit_texts(chart: RatingChart) -> list[str]:
             a, b = (format_quantity(pressure, "Pa", 4) for pressure in drive.chamber_pressures)
             value = a if a == b else f"A {a}, B {b}"
         else:
-            unit = "N" if chart.machine.unit(drive.joint) == "m" else "N m"
-            value = format_quantity(drive.max_force, unit, 4)
+            value = format_quantity(
+                drive.max_force, "N" if chart.machine.unit(drive.joint) == "m" else "N m", 4
+            )
         out.append(f"{drive.joint} {value} ({drive.limit_kind})")
     limited_pins = {x.element for x in chart.limiting_factors if x.reason == PIN_FORCE}
     return out + [
@@ -221,8 +211,10 @@ def slew_labels(chart: RatingChart) -> list[str]:
     slewing_joint = chart.section.slewing_joint
     if slewing_joint is None:
         return [""]
-    home = chart.machine.home[chart.machine.closure.active[slewing_joint]]
-    if len(chart.slews) == 1 and chart.slews[0] == home:
+    if (
+        len(chart.slews) == 1
+        and chart.slews[0] == chart.machine.home[chart.machine.closure.active[slewing_joint]]
+    ):
         return [""]
     degrees = [float(f"{x:.6g}") for x in np.rad2deg(chart.slews)]
     names = [_SIDE_NAMES.get(x, f"{x:.4g}°") for x in degrees]  # type: ignore[call-overload]
@@ -249,22 +241,19 @@ def factor_shares(chart: RatingChart) -> list[tuple[str, float, float]]:
     return sorted(rows, key=lambda row: -row[1])
 
 
-def table_headings(chart: RatingChart, table: LoadTable) -> list[str]:
-    """Return the headings of the columns of a load table."""
+def to_markdown(chart: "Capacity", table: LoadTable) -> str:
+    """Return the conditions of a load chart, its table and its limiting factors as Markdown."""
     names, labels = slew_labels(chart), [f"{radius:g} m" for radius in table.radii]
     columns = [f"{label} {name}".strip() for label in [*labels, "farthest"] for name in names]
-    return [f"{chart.section.coordinate_names[1]} [m]", *columns, "at [m]"]
-
-
-def to_markdown(chart: RatingChart, table: LoadTable) -> str:
-    """Return the conditions of a load chart, its table and its limiting factors as Markdown."""
-    cells = zip(table.heights, table.format_rows(), strict=True)
-    rows = [[f"{height:g}", *row] for height, row in cells]
+    rows = [
+        [f"{height:g}", *row]
+        for height, row in zip(table.heights, table.format_rows(), strict=True)
+    ]
     lines = [
         f"# Lifting capacity of {chart.machine.name}\n",
         *(f"- {name}: {text}" for name, text in capacity_facts(chart)),
         "",
-        *_markdown_table(table_headings(chart, table), rows),
+        *_markdown_table([f"{chart.section.coordinate_names[1]} [m]", *columns, "at [m]"], rows),
         "",
         table_note(chart, table),
         "\n| limited by | of all positions | of all, with another |",
@@ -274,50 +263,42 @@ def to_markdown(chart: RatingChart, table: LoadTable) -> str:
             for factor, share, both in factor_shares(chart)
         ),
     ]
-    if rows := structural_rows(chart):
+    if rows := _structural_rows(chart):
         heading = ["under these loads", "", *chart.section.coordinate_names, "slew"]
         lines += ["", *_markdown_table(heading, rows)]
     return "\n".join(lines) + "\n"
 
 
-def structural_rows(chart: RatingChart) -> list[list[str]]:
+def _structural_rows(chart: "Capacity") -> list[list[str]]:
     """Return the largest force in a pin and the smallest margin to buckling, with positions.
 
     Pins are left out on sloping ground, and if the passive joints are not determined.
     """
-    machine, rows = chart.machine, []
+    machine, found = chart.machine, []
     if not np.isfinite(chart.values).any():
         return []
-    prismatic_joints = [
-        joint.name for joint in machine.tree.moving_joints if joint.kind == "prismatic"
-    ]
-    prismatic_joints += [
-        loop.name for loop in machine.closure.equations.loops if loop.type == "prismatic"
-    ]
+    slides = {x.name for x in machine.tree.moving_joints if x.kind == "prismatic"}
+    slides |= {x.name for x in machine.closure.equations.loops if x.type == "prismatic"}
     try:
-        forces = {} if chart.ground_slope else pin_forces(chart)
+        forces = {} if chart.ground_slope else chart.pin_forces()
     except SingularConfigurationError:
         forces = {}
-    pins = {name: x for name, x in forces.items() if name not in prismatic_joints}
-    if pins:
+    if pins := {name: x for name, x in forces.items() if name not in slides}:
         name = max(pins, key=lambda pin: np.nanmax(pins[pin]))
         index = int(np.nanargmax(pins[name]))
         force = format_quantity(float(pins[name].flat[index]), "N", 4)
-        rows.append([f"largest force in a pin: {name}", force, *_position_cells(chart, index)])
-    margins = {name: x for name, x in buckling_margins(chart).items() if np.isfinite(x).any()}
-    if margins:
+        found.append((f"largest force in a pin: {name}", force, index))
+    if margins := {name: x for name, x in chart.buckling().items() if np.isfinite(x).any()}:
         name = min(margins, key=lambda joint: np.nanmin(margins[joint]))
         index = int(np.nanargmin(margins[name]))
         margin = f"{margins[name].flat[index]:.3g} times its force"
-        rows.append([f"first to buckle: {name}", margin, *_position_cells(chart, index)])
+        found.append((f"first to buckle: {name}", margin, index))
+    rows = []
+    for title, value, index in found:
+        s, b, a = np.unravel_index(index, chart.values.shape)
+        position = f"{chart.radii[a]:.4g} m", f"{chart.heights[b]:.4g} m"
+        rows.append([title, value, *position, f"{np.rad2deg(chart.slews[s]):.4g}°"])
     return rows
-
-
-def _position_cells(chart: RatingChart, index: int) -> list[str]:
-    """Return radius, height and slew angle of a position of the chart as texts."""
-    s, b, a = np.unravel_index(index, chart.values.shape)
-    slew_text = f"{np.rad2deg(chart.slews[s]):.4g}°"
-    return [f"{chart.radii[a]:.4g} m", f"{chart.heights[b]:.4g} m", slew_text]
 
 
 def table_note(chart: RatingChart, table: LoadTable) -> str:
@@ -337,7 +318,6 @@ def table_note(chart: RatingChart, table: LoadTable) -> str:
 
 
 def _markdown_table(heading: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return the lines of a Markdown table with aligned columns."""
     width = [max(map(len, column)) for column in zip(heading, *rows, strict=True)]
     separator = ["-" * (w - 1) + ":" for w in width]
     cells = [

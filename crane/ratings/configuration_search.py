@@ -98,7 +98,20 @@ class ConfigurationSearch(Strokes):
                 f"{lock_hint}"
             )
         self.position_strokes, self.free_strokes = (moving[0], moving[1]), moving[2:]
-        self._patches = list(self._fill_patches())
+        home = machine.home[machine.closure.active]
+        count = _LEVELS_BY_COUNT[len(self.free_strokes)]
+        levels = [np.linspace(self.low[i], self.high[i], count) for i in self.free_strokes]
+        axes = tuple(
+            np.linspace(self.low[i], self.high[i], _PATCH_VALUES) for i in self.position_strokes
+        )
+        self._patches: list[WorkspacePatch] = []  # at levels of the free strokes
+        for values in itertools.product(*levels):
+            held_coordinates = home.copy()
+            held_coordinates[self.free_strokes] = values
+            patch = fill_patch(
+                machine, held_coordinates, self.position_strokes, (axes[0], axes[1])
+            )
+            self._patches += [] if patch is None else [patch]
         if not self._patches:
             raise InputError(f"no posture of '{machine.name}' closes on the way from home")
         self.configurations = np.concatenate(
@@ -107,25 +120,6 @@ class ConfigurationSearch(Strokes):
         self.section_positions = self.section.coordinates(
             statics.evaluate(self.configurations).tip_positions
         )
-
-    def _fill_patches(self) -> list[WorkspacePatch]:
-        """Return patches over the two strokes, at levels of the free strokes."""
-        home = self.machine.home[self.machine.closure.active]
-        count = _LEVELS_BY_COUNT[len(self.free_strokes)]
-        levels = [np.linspace(self.low[i], self.high[i], count) for i in self.free_strokes]
-        axes = tuple(
-            np.linspace(self.low[i], self.high[i], _PATCH_VALUES) for i in self.position_strokes
-        )
-        out = []
-        for values in itertools.product(*levels):
-            held_coordinates = home.copy()
-            held_coordinates[self.free_strokes] = values
-            patch = fill_patch(
-                self.machine, held_coordinates, self.position_strokes, (axes[0], axes[1])
-            )
-            if patch is not None:
-                out.append(patch)
-        return out
 
     def find_all(self, axes: tuple[Array, Array]) -> ConfigurationSet:
         """Find configurations at all positions of a grid, at levels of the free strokes.
@@ -140,10 +134,9 @@ class ConfigurationSearch(Strokes):
         start_sets, position_sets = [], []
         for patch in self._patches:
             node_positions = np.full((*patch.is_closed.shape, 2), np.nan)
-            tip_positions = self.statics.evaluate(
-                patch.configurations[patch.is_closed]
-            ).tip_positions
-            node_positions[patch.is_closed] = self.section.coordinates(tip_positions)
+            node_positions[patch.is_closed] = self.section.coordinates(
+                self.statics.evaluate(patch.configurations[patch.is_closed]).tip_positions
+            )
             position_index, q = grid_points_in_patch(patch, node_positions, axes)
             position_sets.append(position_index)
             start_sets.append(q)
@@ -192,8 +185,9 @@ class ConfigurationSearch(Strokes):
             values = evaluate(configurations.q, configurations.statics)
         indices = self._separated_maxima(configurations, values)
         configurations, values = configurations.select(indices), values[indices]
-        targets = _grid_positions(axes, configurations.position_index)
-        configurations, values = self._improve(configurations, values, targets, evaluate)
+        configurations, values = self._improve(
+            configurations, values, _grid_positions(axes, configurations.position_index), evaluate
+        )
         indices = _largest_per_position(configurations.position_index, values)
         return self._improve_from_neighbours(
             configurations.select(indices), values[indices], axes, evaluate
@@ -222,8 +216,7 @@ class ConfigurationSearch(Strokes):
         improved: NDArray[np.intp] = np.arange(len(values))
         while len(improved):
             index = configurations.position_index[improved]
-            cells = np.column_stack([index % shape[0], index // shape[0]])
-            neighbours = cells + offsets[:, None]
+            neighbours = np.column_stack([index % shape[0], index // shape[0]]) + offsets[:, None]
             offset, source = np.nonzero(((neighbours >= 0) & (neighbours < shape)).all(axis=2))
             first, second = neighbours[offset, source].T
             position = second * shape[0] + first
@@ -260,8 +253,9 @@ class ConfigurationSearch(Strokes):
             q = configurations.q.copy()
             q[:, self.machine.closure.active[i]] += change * self.span[i]
             moved, statics, is_valid = self.move_to_targets(q, targets, self.position_strokes)
-            found = ConfigurationSet(configurations.position_index, moved, statics)
-            sets.append(found.select(is_valid))
+            sets.append(
+                ConfigurationSet(configurations.position_index, moved, statics).select(is_valid)
+            )
         refined = ConfigurationSet.concatenate(sets)
         return refined.select(self._unique_indices(refined))
 
@@ -390,7 +384,6 @@ class ConfigurationSearch(Strokes):
         return q, statics_values, is_valid & is_within_limits
 
     def _unique_indices(self, configurations: ConfigurationSet) -> NDArray[np.intp]:
-        """Return the indices of distinct configurations at each position."""
         q_a = configurations.q[:, self.machine.closure.active] / (_DUPLICATE_TOLERANCE * self.span)
         keys = np.column_stack([configurations.position_index, np.round(q_a[:, self.moving])])
         return np.asarray(np.sort(np.unique(keys, axis=0, return_index=True)[1]))

@@ -4,9 +4,8 @@ from collections.abc import Collection, Iterable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.common.samples import Array
 from crane.dynamics.reactions import Reactions
 from crane.hydraulics.components import Cylinder
@@ -59,10 +58,7 @@ def drive_force_limits(
         InputError: A joint is not driven, or no drive has a limit.
     """
     for joint in raising_joints:
-        if joint not in machine.driven_joints:
-            raise InputError(
-                f"'{joint}' drives nothing, {suggest_names(machine.driven_joints, joint)}"
-            )
+        check_name(joint, machine.driven_joints, f"'{joint}' drives nothing")
     limits, circuit = [], machine.hydraulics
     for joint in machine.driven_joints:
         column, is_raising = machine.active.index(joint), joint in raising_joints
@@ -98,7 +94,6 @@ def drive_force_limits(
 
 
 def _max_pressure(circuit: Hydraulics, cylinder: Cylinder, side: str, is_raising: bool) -> float:
-    """Return the largest pressure of chamber "a" or "b" under load [Pa]."""
     supply, tank = circuit.pumps[circuit.valves[cylinder.joint].supply], circuit.supply.tank
     supply_pressures = [supply.pressure, *([supply.relief] if supply.relief else [])]
     valve_pressures = [cylinder.relief] if cylinder.relief else []
@@ -135,22 +130,16 @@ class PinForces:
         self._reactions = reactions = Reactions(machine)
         self._frame = frame
         determined = reactions.statically_determined(machine.home)[:, :3]
-        if pin_names is None:
-            indices = np.flatnonzero(determined.any(axis=1)).tolist()
-        else:
-            indices = [self._index(name, determined) for name in pin_names]
-        self.names = tuple(reactions.names[k] for k in indices)
-        self._pin_indices, self._is_determined = indices, determined[indices]
-
-    def _index(self, name: str, determined: NDArray[np.bool_]) -> int:
-        pin_names = self._reactions.names
-        if name not in pin_names:
-            raise InputError(f"pin '{name}' is no joint or loop, {suggest_names(pin_names, name)}")
-        if not determined[pin_names.index(name)].any():
-            raise InputError(
-                f"statics does not determine the force in pin '{name}', leave it out of 'pins'"
-            )
-        return pin_names.index(name)
+        known = [reactions.names[k] for k in np.flatnonzero(determined.any(axis=1))]
+        self.names = tuple(known if pin_names is None else pin_names)
+        for name in self.names:
+            check_name(name, reactions.names, f"pin '{name}' is no joint or loop")
+            if name not in known:
+                raise InputError(
+                    f"statics does not determine the force in pin '{name}', leave it out of 'pins'"
+                )
+        self._pin_indices = [reactions.names.index(name) for name in self.names]
+        self._is_determined = determined[self._pin_indices]
 
     def load_forces(self, q: Array, unit_forces: Array) -> tuple[Array, Array]:
         """Return the pin forces without load, and their increase by a force at the frame.

@@ -12,18 +12,18 @@ from crane.common import one_line_repr
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_number
 from crane.common.units import format_quantity
+from crane.dynamics.buckling import Buckling
 from crane.dynamics.statics import StaticsEvaluator
 from crane.machine.machine import Machine
-from crane.motion.workspaces.workspace_section import find_slewing_joint
+from crane.motion.workspaces.workspace_section import find_slewing_joint, up_direction
 from crane.ratings.capacity_report import LoadTable, load_table, to_markdown
 from crane.ratings.configuration_search import ConfigurationSearch
-from crane.ratings.drive_force_limits import DriveForceLimits, drive_force_limits
-from crane.ratings.load_effects import buckling_margins, chamber_pressures, pin_forces
+from crane.ratings.drive_force_limits import DriveForceLimits, PinForces, drive_force_limits
+from crane.ratings.limiting_factors import RatingConditions
 from crane.ratings.rating_chart import (
     RatingChart,
     compute_chart,
     configuration_search,
-    rating_conditions,
 )
 from crane.ratings.rating_rules import MAX_GROUND_SLOPE, Rule, find_rule, gravity_action
 from crane.ratings.strokes import find_pivot
@@ -32,7 +32,7 @@ _STROKE_STEPS = 200  # steps of the stroke over which the gross torque is sample
 _HEIGHT_TOLERANCE = 1e-3  # share of the reach
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Capacity(RatingChart):
     """Rated loads over radius and height [kg], see `RatingChart`."""
 
@@ -61,33 +61,112 @@ class Capacity(RatingChart):
         return {"rule": self.rule.description}
 
     def pressures(self) -> dict[str, Array]:
-        """Compute the pressures that hold the rated loads.
+        """Compute the pressures of the chambers that hold the rated loads at rest.
+
+        A force F of a cylinder comes from one chamber; the other one has the tank's pressure p_T:
+
+            p_A = max(p_T, (F + p_T B) / A),    p_B = max(p_T, (p_T A - F) / B).
+
+        On sloping ground each pressure is that for the worst direction of the slope. With
+        friction, the pressure of a drive that raises is the one that starts its motion.
 
         Returns:
-            By joint (s, b, a, 2) for chambers A and B [Pa], see
-            `crane.ratings.load_effects.chamber_pressures`.
+            By joint, an array (s, b, a, 2) for chambers A and B [Pa]; NaN where there is no finite
+            load. Empty without a circuit.
         """
-        return chamber_pressures(self)
+        if self.machine.hydraulics is None:
+            return {}
+        tank, (forces, slope_forces) = self.machine.hydraulics.supply.tank, self._holding_forces()
+        out = {}
+        for drive in self.drive_limits():
+            if not drive.chamber_pressures:
+                continue
+            force, slope_force = forces[:, drive.active_index], slope_forces[:, drive.active_index]
+            differences = (
+                force + slope_force - drive.max_force, drive.min_force - force + slope_force,
+            )  # fmt: skip
+            pressures = [
+                np.maximum(limit + difference / area, tank)
+                for limit, difference, area in zip(
+                    drive.chamber_pressures, differences, drive.chamber_areas, strict=True
+                )
+            ]
+            out[drive.joint] = self._on_grid(np.column_stack(pressures))
+        return out
 
     def pin_forces(self) -> dict[str, Array]:
-        """Compute the forces in the pins under the rated loads.
+        """Compute the forces in the pins at rest under the rated loads, on level ground.
 
         Returns:
-            By joint and loop (s, b, a) [N], see `crane.ratings.load_effects.pin_forces`.
+            By joint and loop, an array (s, b, a) [N] of the magnitude of the components that
+            statics determines, see `PinForces`; NaN where there is no finite load.
 
         Raises:
-            InputError: The ground slopes.
+            InputError: The ground of the chart slopes.
+            SingularConfigurationError: The passive joints are not determined at a position.
         """
-        return pin_forces(self)
+        if self.ground_slope:
+            raise InputError(
+                f"forces in pins are those on level ground, but the chart's ground slopes by "
+                f"{np.rad2deg(self.ground_slope):.3g} degrees: rate without slope"
+            )
+        machine, has_load = self.machine, np.isfinite(self.values)
+        pins = PinForces(machine, self.frame)
+        q = machine.closure.solve(np.ascontiguousarray(self.q_a[has_load]))
+        unloaded, increments = pins.load_forces(
+            q, np.broadcast_to(machine.model.gravity.linear, (len(q), 3))
+        )
+        forces = unloaded + self.values[has_load][:, None, None] * increments
+        rows = np.linalg.norm(forces, axis=2).T
+        return {x: self._on_grid(row) for x, row in zip(pins.names, rows, strict=True)}
 
     def buckling(self) -> dict[str, Array]:
         """Compute the margins to buckling of the cylinders under the rated loads.
 
         Returns:
-            By cylinder (s, b, a), the buckling force over the pressing force; infinite where the
-            cylinder is pulled, see `crane.ratings.load_effects.buckling_margins`.
+            By cylinder that `crane.dynamics.Buckling` evaluates, an array (s, b, a): the buckling
+            force over the pressing force, on sloping ground for the worst direction of the slope;
+            infinite where the cylinder is pulled, NaN where there is no finite load. Empty without
+            a circuit.
         """
-        return buckling_margins(self)
+        machine = self.machine
+        if machine.hydraulics is None:
+            return {}
+        buckling = Buckling(machine)
+        forces, slope_forces = self._holding_forces()
+        for joint, column in buckling.columns.items():
+            i = machine.active.index(joint)
+            forces[:, i] += column.compression_sign * slope_forces[:, i]
+        rows = buckling.buckling_margins(self.q_a[np.isfinite(self.values)], forces).T
+        return {x: self._on_grid(row) for x, row in zip(buckling.columns, rows, strict=True)}
+
+    def _holding_forces(self) -> tuple[Array, Array]:
+        """Compute the forces of the active joints at rest under the rated loads.
+
+        Returns:
+            Two arrays (N, n) over the N positions with a finite load [N], [N m]: the forces
+            without the lateral part of gravity on a slope, and the largest change by it over all
+            directions of the slope.
+        """
+        machine, up, has_load = self.machine, up_direction(self.machine), np.isfinite(self.values)
+        statics = StaticsEvaluator(machine, self.frame).evaluate(
+            machine.closure.solve(np.ascontiguousarray(self.q_a[has_load]))
+        )
+        gravity = float(np.linalg.norm(machine.model.gravity.linear))
+        loads = self.values[has_load][:, None, None]
+        moment_jacobian = statics.moment_jacobian + loads * statics.tip_jacobian
+        vertical_parts = np.einsum("nix,i->nx", moment_jacobian, up)
+        lateral_parts = moment_jacobian - vertical_parts[:, None] * up[:, None]
+        return (
+            gravity * np.cos(self.ground_slope) * vertical_parts - statics.passive_forces,
+            gravity * np.sin(self.ground_slope) * np.linalg.norm(lateral_parts, axis=1),
+        )
+
+    def _on_grid(self, values: Array) -> Array:
+        """Return values (N, ...) of positions with a finite load on the grid; NaN elsewhere."""
+        out = np.full((*self.values.shape, *values.shape[1:]), np.nan)
+        out[np.isfinite(self.values)] = values
+        return out
 
     @cached_property
     def table(self) -> LoadTable:
@@ -150,9 +229,10 @@ def capacity(
         raising = (
             [find_raising_joint(search)] if rule.only_raising_drive else machine.driven_joints
         )
-    conditions = rating_conditions(
-        search, gravity_action(machine), rule, raising, ground_slope=slope, with_friction=friction
-    )
+    conditions = RatingConditions(
+        machine=machine, places=search, action=gravity_action(machine), rule=rule,
+        working_joints=tuple(raising), ground_slope=slope, with_friction=friction,
+    )  # fmt: skip
     return compute_chart(
         Capacity, conditions, slews=slews, step=step, radii=radii, heights=heights
     )
@@ -161,8 +241,9 @@ def capacity(
 def find_raising_joint(search: ConfigurationSearch) -> str:
     """Return the joint whose stroke changes the machine's first moment most."""
     machine = search.machine
-    statics = search.statics.evaluate(machine.home[None])
-    changes = np.linalg.norm(statics.moment_jacobian[0], axis=0) * (search.high - search.low)
+    changes = np.linalg.norm(
+        search.statics.evaluate(machine.home[None]).moment_jacobian[0], axis=0
+    ) * (search.high - search.low)
     return machine.active[max(search.moving, key=lambda i: changes[i])]
 
 
@@ -265,12 +346,10 @@ def torques(
     if slewing is not None and machine.active[slewing[0]] in limits:
         drive = limits[machine.active[slewing[0]]]
         slewing_torque = min(drive.max_force, -drive.min_force)
-    options = {
-        "rule": rule, "raising": raising, "slews": slews, "slope": slope, "friction": friction,
-    }  # fmt: skip
     load, height = _largest_load_at_radius(
-        machine, statics.frame, radius, options, search.section_positions
-    )
+        machine, statics.frame, radius, search.section_positions,
+        rule=rule, raising=raising, slews=slews, slope=slope, friction=friction,
+    )  # fmt: skip
     weight = float(np.linalg.norm(machine.model.gravity.linear))
     return Torques(
         joint, pivot_joint, gross_torque, stroke, radius, load, height, load * weight * radius,
@@ -297,14 +376,15 @@ def _gross_torque(
     values = np.array([torque(x) for x in strokes])
     best = int(values.argmax())
     interval = strokes[max(best - 1, 0)], strokes[min(best + 1, _STROKE_STEPS)]
-    optimum = minimize_scalar(lambda x: -torque(x), bounds=interval, method="bounded",
-                              options={"xatol": 1e-9})  # fmt: skip
+    optimum = minimize_scalar(
+        lambda x: -torque(x), bounds=interval, method="bounded", options={"xatol": 1e-9}
+    )
     grid_optimum = float(values[best]), float(strokes[best])
     return max(grid_optimum, (-float(optimum.fun), float(optimum.x)))
 
 
 def _largest_load_at_radius(
-    machine: Machine, frame: str, radius: float, options: dict[str, Any], reach: Array
+    machine: Machine, frame: str, radius: float, reach: Array, **options: Any
 ) -> tuple[float, float]:
     """Return the largest load at a radius [kg], and its height [m]."""
     lower, upper = reach.min(axis=0), reach.max(axis=0)

@@ -150,8 +150,9 @@ class LoadLimits:
             statics, np.zeros(len(statics.total_mass)) if angles is None else angles
         )
         for bound in self.bounds:
-            coefficients = self.bound_coefficients(bound, statics, unit, pin_forces)
-            magnitude = self.bound_magnitude(bound, coefficients)
+            magnitude = self.bound_magnitude(
+                bound, self.bound_coefficients(bound, statics, unit, pin_forces)
+            )
             out[:, bound.factor_index] = np.minimum(out[:, bound.factor_index], magnitude)
         return np.asarray(out * self.rated_shares)
 
@@ -188,8 +189,11 @@ class LoadLimits:
         if bound.pin_index is not None:
             assert pin_forces is not None
             zeros = np.zeros(len(statics.total_mass))
-            capacity = self._pin_capacities[bound.pin_index]
-            return zeros - capacity, zeros, *(x[:, bound.pin_index] for x in pin_forces)
+            return (
+                zeros - self._pin_capacities[bound.pin_index],
+                zeros,
+                *(x[:, bound.pin_index] for x in pin_forces),
+            )
         weight_lever, action_lever, constant_part = self._lever_arms(bound, statics, 1.0)
         return self._sum_coefficients(bound, weight_lever, constant_part, [(action_lever, unit)])
 
@@ -205,11 +209,15 @@ class LoadLimits:
         unit = self.action.unit_vectors(statics, angles)
         unit_derivatives = self.action.unit_derivatives(statics, derivatives, angles)
         weight_lever, action_lever, constant_part = self._lever_arms(bound, derivatives, 0.0)
-        pairs = [
-            (action_lever, unit),
-            (self._lever_arms(bound, statics, 1.0)[1], unit_derivatives),
-        ]
-        return self._sum_coefficients(bound, weight_lever, constant_part, pairs)
+        return self._sum_coefficients(
+            bound,
+            weight_lever,
+            constant_part,
+            [
+                (action_lever, unit),
+                (self._lever_arms(bound, statics, 1.0)[1], unit_derivatives),
+            ],
+        )
 
     def _sum_coefficients(
         self,
@@ -258,7 +266,7 @@ class LoadLimits:
         )
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class RatingConditions(Result):
     """Conditions of a rating: all that its load limits depend on.
 
@@ -278,9 +286,9 @@ class RatingConditions(Result):
     action: UnitAction
     rule: Rule
     working_joints: tuple[str, ...]
-    ground_slope: float
-    with_friction: bool
-    with_weight: bool
+    ground_slope: float = 0.0
+    with_friction: bool = False
+    with_weight: bool = True
 
     @property
     def frame(self) -> str:

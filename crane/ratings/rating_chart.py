@@ -1,9 +1,9 @@
 """Rating charts: the largest load or force over radius and height, and its limiting factors."""
 
 import dataclasses
-import itertools
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar
 
@@ -14,7 +14,7 @@ from crane.common.errors import InputError
 from crane.common.samples import Array, as_number, as_sample
 from crane.dynamics.statics import StaticQuantities, StaticsEvaluator
 from crane.machine.machine import Machine
-from crane.ratings.configuration_search import ConfigurationSearch
+from crane.ratings.configuration_search import ConfigurationSearch, ValueFunction
 from crane.ratings.limiting_factors import (
     TIPPING,
     LimitingFactor,
@@ -23,10 +23,9 @@ from crane.ratings.limiting_factors import (
 )
 from crane.ratings.rating_derivatives import (
     SIMULTANEOUS_TOLERANCE,
-    RatedConfigurations,
     rating_derivatives,
 )
-from crane.ratings.rating_rules import Rule, UnitAction, slew_angles
+from crane.ratings.rating_rules import slew_angles
 from crane.ratings.strokes import check_drives
 from crane.recordings.timeseries import Table, write_table
 
@@ -37,7 +36,7 @@ _DIGITS = 12  # decimal places of positions
 _MAX_CELLS = 400  # cells along one axis
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class RatingChart(RatingConditions):
     """The largest load or force over radius and height.
 
@@ -94,8 +93,9 @@ class RatingChart(RatingConditions):
         """
         out = np.full((*self.values.shape, len(parameter_names)), np.nan)
         s, b, a = np.nonzero(np.isfinite(self.values) & (self.values > 0))
-        rated = RatedConfigurations(self.q_a[s, b, a], self.slews[s], self.values[s, b, a])
-        out[s, b, a] = rating_derivatives(self, rated, parameter_names)
+        out[s, b, a] = rating_derivatives(
+            self, self.q_a[s, b, a], self.slews[s], self.values[s, b, a], parameter_names
+        )
         return out
 
     def at_positions(self, radii: Sequence[float], heights: Sequence[float]) -> Self:
@@ -114,7 +114,10 @@ class RatingChart(RatingConditions):
         machine, (name, unit) = self.machine, self.quantity
         units = {
             "cause": "1",
-            **{f"{name}_{_column_suffix(factor)}": unit for factor in self.limiting_factors},
+            **{
+                "_".join([name, *factor.reason.split(), *factor.element.split()]): unit
+                for factor in self.limiting_factors
+            },
             **{joint: machine.unit(joint) for joint in machine.active},
         }
         s, b, a = np.nonzero(np.isfinite(self.values) | (self.limiting_factor_index >= 0))
@@ -132,8 +135,7 @@ class RatingChart(RatingConditions):
         name, unit = self.quantity
         units = {f"{name}_by_{parameter}": f"{unit}/SI" for parameter in parameter_names}
         indices = np.nonzero(np.isfinite(self.values))
-        derivatives = self.derivatives(parameter_names)[indices]
-        self._write_rows(path, indices, units, [derivatives], {})
+        self._write_rows(path, indices, units, [self.derivatives(parameter_names)[indices]], {})
 
     def file_notes(self) -> dict[str, str]:
         """Return further notes for the head of a file."""
@@ -159,23 +161,6 @@ class RatingChart(RatingConditions):
 
 
 ChartType = TypeVar("ChartType", bound=RatingChart)
-
-
-def rating_conditions(
-    search: ConfigurationSearch,
-    action: UnitAction,
-    rule: Rule,
-    working_joints: Collection[str],
-    *,
-    ground_slope: float = 0.0,
-    with_friction: bool = False,
-    with_weight: bool = True,
-) -> RatingConditions:
-    """Return `RatingConditions` with their defaults."""
-    return RatingConditions(
-        search.machine, search, action, rule, tuple(working_joints), ground_slope, with_friction,
-        with_weight,
-    )  # fmt: skip
 
 
 def configuration_search(machine: Machine, frame: str | None) -> ConfigurationSearch:
@@ -225,9 +210,9 @@ def compute_chart(
     slewing_joint, active = search.section.slewing_joint, machine.closure.active
     angles = slew_angles(machine, conditions.frame, search.section, slew_coordinates)
     for k, slew_coordinate in enumerate(slew_coordinates):
-        values = _FactorValues(conditions, limits, slew_coordinate, angles[k])
-        best, _ = search.select_best(configurations, axes, values.smallest)
-        values_by_factor[k, best.position_index] = values.by_factor(best.q, best.statics)
+        evaluate = partial(_values_by_factor, conditions, limits, slew_coordinate, angles[k])
+        best, _ = search.select_best(configurations, axes, partial(_smallest_values, evaluate))
+        values_by_factor[k, best.position_index] = evaluate(best.q, best.statics)
         q_a[k, best.position_index] = best.q[:, active]
         if slewing_joint is not None:
             q_a[k, best.position_index, slewing_joint] = slew_coordinate
@@ -249,29 +234,27 @@ def compute_chart(
     )
 
 
-@dataclass(frozen=True)
-class _FactorValues:
-    """Loads or forces by limiting factor, with the machine slewed."""
+def _values_by_factor(
+    conditions: RatingConditions,
+    limits: LoadLimits,
+    slew_coordinate: float,
+    angle: float,
+    q: Array,
+    statics: StaticQuantities,
+) -> Array:
+    """Return the values (N, K) at configurations (N, nq) found with the slew at home."""
+    machine, slewing_joint = conditions.machine, conditions.section.slewing_joint
+    if slewing_joint is not None:
+        column = machine.closure.active[slewing_joint]
+        if slew_coordinate != machine.home[column]:
+            q = q.copy()
+            q[:, column] = slew_coordinate
+            statics = conditions.places.statics.evaluate(q)
+    return limits.max_magnitudes(statics, np.full(len(q), angle), q)
 
-    conditions: RatingConditions
-    limits: LoadLimits
-    slew_coordinate: float
-    angle: float
 
-    def smallest(self, q: Array, statics: StaticQuantities) -> Array:
-        """Return the smallest values (N,) over all factors."""
-        return np.asarray(self.by_factor(q, statics).min(axis=1))
-
-    def by_factor(self, q: Array, statics: StaticQuantities) -> Array:
-        """Return the values (N, K) at configurations (N, nq) found with the slew at home."""
-        machine, slewing_joint = self.conditions.machine, self.conditions.section.slewing_joint
-        if slewing_joint is not None:
-            column = machine.closure.active[slewing_joint]
-            if self.slew_coordinate != machine.home[column]:
-                q = q.copy()
-                q[:, column] = self.slew_coordinate
-                statics = self.conditions.places.statics.evaluate(q)
-        return self.limits.max_magnitudes(statics, np.full(len(q), self.angle), q)
+def _smallest_values(evaluate: ValueFunction, q: Array, statics: StaticQuantities) -> Array:
+    return np.asarray(evaluate(q, statics).min(axis=1))
 
 
 def _simultaneous_factors(values_by_factor: Array, smallest: Array) -> NDArray[np.bool_]:
@@ -345,7 +328,3 @@ def _slew_coordinates(
                 f"{search.high[slewing_joint]:.4g} rad, not to {slew_coordinate:.4g}"
             )
     return slew_coordinates
-
-
-def _column_suffix(factor: LimitingFactor) -> str:
-    return "_".join(itertools.chain(factor.reason.split(), factor.element.split()))

@@ -1,16 +1,14 @@
 """Exact derivatives of rated loads and forces by parameters of the machine."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.dynamics.constant_derivatives import ConstantDerivatives
+from crane.dynamics.quantity_evaluator import ConstantDerivatives
 from crane.dynamics.statics import StaticQuantities
 from crane.machine.machine import Machine
 from crane.ratings.limiting_factors import (
@@ -20,38 +18,18 @@ from crane.ratings.limiting_factors import (
     tipping_lines,
 )
 from crane.ratings.rating_rules import slew_angles
+from crane.ratings.strokes import Strokes
 
 SIMULTANEOUS_TOLERANCE = 1e-6  # share of a load within which factors limit it simultaneously
 _LIMIT_TOLERANCE = 1e-6  # share of a stroke
 
 
-class RatedConfigurations(NamedTuple):
-    """Configurations of the largest load or force at N positions.
-
-    Attributes:
-        q_a: (N, n) active coordinates.
-        slews: (N,) coordinates of the slewing joint [rad].
-        magnitudes: (N,) rated loads or forces [kg], [N].
-    """
-
-    q_a: Array
-    slews: Array
-    magnitudes: Array
-
-
-class _BoundDerivatives(NamedTuple):
-    """Magnitudes (N, bounds) at which bounds are reached, and their derivatives by bound.
-
-    Derivatives by active coordinates (N, n) and by parameters (N, k) are absent for pins.
-    """
-
-    magnitudes: Array
-    by_coordinates: dict[int, Array]
-    by_parameters: dict[int, Array]
-
-
 def rating_derivatives(
-    conditions: RatingConditions, rated: RatedConfigurations, parameter_names: Sequence[str]
+    conditions: RatingConditions,
+    q_a: Array,
+    slews: Array,
+    magnitudes: Array,
+    parameter_names: Sequence[str],
 ) -> Array:
     """Compute the derivatives of rated loads or forces by parameters, at fixed positions.
 
@@ -69,7 +47,10 @@ def rating_derivatives(
 
     Args:
         conditions: Conditions of the rating.
-        rated: Configurations and their rated values.
+        q_a: (N, n) active coordinates of the configurations of the largest load or force at N
+            positions.
+        slews: (N,) coordinates of the slewing joint [rad].
+        magnitudes: (N,) rated loads or forces [kg], [N].
         parameter_names: Parameters of the machine, such as "boom_eye.x".
 
     Returns:
@@ -81,42 +62,51 @@ def rating_derivatives(
     """
     parameter_names = list(parameter_names)
     constants = ConstantDerivatives(conditions.machine)
-    by_drive = constants.jacobian(
-        parameter_names, lambda variant: _drive_force_values(variant, conditions)
-    )
-    if np.any(constants.jacobian(parameter_names, _tipping_line_values)):
+
+    def drive_forces(variant: Machine) -> Array:
+        limits = conditions.drive_limits(variant)
+        return np.array([[drive.max_force, drive.min_force] for drive in limits]).ravel()
+
+    def tipping_line_values(variant: Machine) -> Array:
+        return np.concatenate(
+            [[0.0], *(np.r_[x.point, x.direction] for x in tipping_lines(variant))]
+        )
+
+    by_drive = constants.jacobian(parameter_names, drive_forces)
+    if np.any(constants.jacobian(parameter_names, tipping_line_values)):
         raise InputError("a parameter that moves the supports cannot be varied here, leave it out")
-    out = np.full((len(rated.q_a), len(parameter_names)), np.nan)
-    if not len(rated.q_a) or not parameter_names:
+    out = np.full((len(q_a), len(parameter_names)), np.nan)
+    if not len(q_a) or not parameter_names:
         return out
     statics = conditions.places.statics
-    q = conditions.machine.closure.solve(np.ascontiguousarray(rated.q_a))
+    q = conditions.machine.closure.solve(np.ascontiguousarray(q_a))
     at_rest = statics.evaluate(q)
     by_coordinates = statics.coordinate_derivatives(q)
     by_parameters = statics.parameter_derivatives(q, parameter_names)
-    angles = slew_angles(conditions.machine, conditions.frame, conditions.section, rated.slews)
+    angles = slew_angles(conditions.machine, conditions.frame, conditions.section, slews)
     limits = conditions.load_limits()
-    bounds = _bound_derivatives(
+    bound_magnitudes, by_q, by_p = _bound_derivatives(
         limits, (at_rest, by_coordinates, by_parameters), limits.pin_loads(at_rest, angles, q),
         angles, by_drive,
     )  # fmt: skip
     jacobian, by_position = _position_derivatives(conditions, at_rest, by_parameters, angles)
-    for i, magnitude in enumerate(rated.magnitudes):
-        is_active = bounds.magnitudes[i] <= magnitude * (1 + SIMULTANEOUS_TOLERANCE)
-        active = np.flatnonzero(is_active).tolist()
-        if not all(j in bounds.by_coordinates for j in active):
+    for i, magnitude in enumerate(magnitudes):
+        active = np.flatnonzero(
+            bound_magnitudes[i] <= magnitude * (1 + SIMULTANEOUS_TOLERANCE)
+        ).tolist()
+        if not all(j in by_q for j in active):
             continue
         strokes = conditions.places.moving
-        gradients = np.array([bounds.by_coordinates[j][i, strokes] for j in active])
+        gradients = np.array([by_q[j][i, strokes] for j in active])
         if len(strokes) == 2:
             factor_multipliers = np.zeros(len(active))
-            factor_multipliers[np.argmin(bounds.magnitudes[i, active])] = 1.0
+            factor_multipliers[np.argmin(bound_magnitudes[i, active])] = 1.0
             position_multipliers = -np.linalg.solve(jacobian[i].T, factor_multipliers @ gradients)
         else:
             factor_multipliers, position_multipliers = _lagrange_multipliers(
-                gradients, jacobian[i], *_stroke_limits(conditions, rated.q_a[i])
+                gradients, jacobian[i], conditions.places, q_a[i]
             )
-        out[i] = factor_multipliers @ np.array([bounds.by_parameters[j][i] for j in active])
+        out[i] = factor_multipliers @ np.array([by_p[j][i] for j in active])
         out[i] += position_multipliers @ by_position[i]
     return out
 
@@ -127,8 +117,8 @@ def _bound_derivatives(
     pin_forces: tuple[Array, Array] | None,
     angles: Array,
     by_drive: Array,
-) -> _BoundDerivatives:
-    """Compute the rated magnitudes of all bounds and their derivatives.
+) -> tuple[Array, dict[int, Array], dict[int, Array]]:
+    """Compute the magnitudes at which bounds are reached, and their derivatives.
 
     Args:
         limits: Limits of the load.
@@ -136,15 +126,20 @@ def _bound_derivatives(
         pin_forces: Result of `LoadLimits.pin_loads`.
         angles: (N,) slew angles [rad].
         by_drive: (k, 2 d) derivatives of the drives' force limits by parameters.
+
+    Returns:
+        Rated magnitudes (N, bounds), and by bound, but for pins, their derivatives by active
+        coordinates (N, n) and by parameters (N, k).
     """
     at_rest, by_coordinates, by_parameters = statics
     unit = limits.action.unit_vectors(at_rest, angles)
-    out = _BoundDerivatives(np.empty((len(angles), len(limits.bounds))), {}, {})
+    magnitudes = np.empty((len(angles), len(limits.bounds)))
+    all_by_q, all_by_p = {}, {}
     for j, bound in enumerate(limits.bounds):
         coefficients = limits.bound_coefficients(bound, at_rest, unit, pin_forces)
         x = limits.bound_magnitude(bound, coefficients)
         share = limits.rated_shares[bound.factor_index]
-        out.magnitudes[:, j] = x * share
+        magnitudes[:, j] = x * share
         if bound.pin_index is not None:
             continue
         by_q, by_p = (
@@ -156,8 +151,8 @@ def _bound_derivatives(
             slope = _slope(x, coefficients)[:, None]
             with np.errstate(divide="ignore", invalid="ignore"):
                 by_p = by_p + bound.sign * by_drive[:, k] / slope
-        out.by_coordinates[j], out.by_parameters[j] = by_q * share, by_p * share
-    return out
+        all_by_q[j], all_by_p[j] = by_q * share, by_p * share
+    return magnitudes, all_by_q, all_by_p
 
 
 def _position_derivatives(
@@ -180,33 +175,21 @@ def _position_derivatives(
     )
 
 
-def _stroke_limits(
-    conditions: RatingConditions, q_a: Array
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Array]:
-    """Return which moving strokes (s,) are at the lower and upper limit, and their lengths."""
-    search, strokes = conditions.places, conditions.places.moving
-    span = search.high - search.low
-    at_low = q_a[strokes] <= (search.low + _LIMIT_TOLERANCE * span)[strokes]
-    at_high = q_a[strokes] >= (search.high - _LIMIT_TOLERANCE * span)[strokes]
-    return at_low, at_high, span[strokes]
-
-
 def _lagrange_multipliers(
-    gradients: Array,
-    jacobian: Array,
-    at_low: NDArray[np.bool_],
-    at_high: NDArray[np.bool_],
-    stroke_lengths: Array,
+    gradients: Array, jacobian: Array, strokes: Strokes, q_a: Array
 ) -> tuple[Array, Array]:
     """Return the multipliers mu (c,) and lambda (2,) of a configuration of the largest load.
 
     Args:
         gradients: (c, s) derivatives of the loads of the limiting factors by the strokes.
         jacobian: (2, s) derivatives of the position by the strokes.
-        at_low: (s,) which strokes are at their lower limit.
-        at_high: (s,) which strokes are at their upper limit.
-        stroke_lengths: (s,) lengths of the strokes.
+        strokes: The strokes with their limits.
+        q_a: (n,) active coordinates.
     """
+    moving, span = strokes.moving, strokes.high - strokes.low
+    stroke_lengths = span[moving]
+    at_low = q_a[moving] <= (strokes.low + _LIMIT_TOLERANCE * span)[moving]
+    at_high = q_a[moving] >= (strokes.high - _LIMIT_TOLERANCE * span)[moving]
     gradient_scale = np.abs(gradients * stroke_lengths).max() or 1.0
     position_scale = np.abs(jacobian * stroke_lengths).max()
     limits = np.vstack([np.diag(stroke_lengths)[at_low], -np.diag(stroke_lengths)[at_high]])
@@ -219,8 +202,7 @@ def _lagrange_multipliers(
         ]
     )
     count = len(gradients)
-    normalization = np.zeros((len(rows), 1))
-    normalization[:count] = 1.0
+    normalization = (np.arange(len(rows)) < count).astype(float)[:, None]
     solution = nnls(np.hstack([rows, normalization]).T, np.r_[np.zeros(rows.shape[1]), 1.0])[0]
     position_multipliers = (
         (solution[count : count + 2] - solution[count + 2 : count + 4])
@@ -262,16 +244,3 @@ def _magnitude_derivatives(
         with np.errstate(divide="ignore", invalid="ignore"):
             columns.append(-change / slope)
     return np.stack(columns, axis=-1)
-
-
-def _drive_force_values(machine: Machine, conditions: RatingConditions) -> Array:
-    """Return the force limits (2 d,) of all drives."""
-    limits = conditions.drive_limits(machine)
-    return np.array([x for drive in limits for x in (drive.max_force, drive.min_force)])
-
-
-def _tipping_line_values(machine: Machine) -> Array:
-    """Return the points and directions of all tipping lines in one vector."""
-    return np.concatenate(
-        [np.zeros(1), *(np.r_[x.point, x.direction] for x in tipping_lines(machine))]
-    )

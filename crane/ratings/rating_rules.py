@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.common.samples import Array, as_number
 from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.dynamics.statics import StaticQuantities
@@ -86,8 +86,7 @@ def find_rule(name: str | Rule) -> Rule:
     """
     if isinstance(name, Rule):
         return name
-    if not isinstance(name, str) or name not in RULES:
-        raise InputError(f"rule '{name}' is unknown, {suggest_names(RULES, str(name))}")
+    check_name(str(name), RULES, f"rule '{name}' is unknown")
     return RULES[name]
 
 

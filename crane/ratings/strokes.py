@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.common.samples import Array
 from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.dynamics.statics import StaticsEvaluator
@@ -167,8 +167,7 @@ def instantaneous_rotation(
     if rate * machine.closure.characteristic_length <= _ROTATION_TOLERANCE * speed:
         return InstantaneousRotation(np.full(3, np.inf), np.inf, np.inf)
     centre = np.asarray(position + np.cross(angular_velocity, velocity) / rate**2)
-    pivot_position = frames.frame_pose(pivot.child).translation
-    offset = np.cross(angular_velocity / rate, centre - pivot_position)
+    offset = np.cross(angular_velocity / rate, centre - frames.frame_pose(pivot.child).translation)
     return InstantaneousRotation(centre, speed / rate, float(np.linalg.norm(offset)))
 
 
@@ -262,9 +261,8 @@ def bucket_and_arm_strokes(
     machine, frame = strokes.machine, strokes.statics.frame
     pivots = turning_strokes(strokes)
     names = [machine.active[i] for i in pivots]
-    for name in (bucket, arm):
-        if name is not None and name not in names:
-            raise InputError(f"'{name}' does not turn '{frame}', {suggest_names(names, name)}")
+    for name in filter(None, (bucket, arm)):
+        check_name(name, names, f"'{name}' does not turn '{frame}'")
     if bucket is not None and bucket == arm:
         raise InputError(f"'{bucket}' is named as both bucket and arm, name two joints")
     cylinders = [i for i in pivots if machine.unit(machine.active[i]) == "m"]
@@ -278,5 +276,4 @@ def bucket_and_arm_strokes(
     bucket_stroke = cylinders[-1] if bucket is None else machine.active.index(bucket)
     if arm is not None:
         return bucket_stroke, machine.active.index(arm)
-    inner_strokes = order[: order.index(bucket_stroke)]
-    return bucket_stroke, inner_strokes[-1] if inner_strokes else None
+    return bucket_stroke, next(reversed(order[: order.index(bucket_stroke)]), None)

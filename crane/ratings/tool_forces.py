@@ -14,11 +14,11 @@ from crane.machine.machine import Machine
 from crane.motion.workspaces.workspace_section import up_direction
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.drive_force_limits import drive_force_limits
+from crane.ratings.limiting_factors import RatingConditions
 from crane.ratings.rating_chart import (
     RatingChart,
     compute_chart,
     configuration_search,
-    rating_conditions,
 )
 from crane.ratings.rating_rules import (
     FixedUnitAction,
@@ -33,7 +33,7 @@ from crane.ratings.strokes import Strokes, bucket_and_arm_strokes, frame_angular
 TOOL_DIRECTIONS = ("up", "down", "in", "out", "tangent", "-tangent", "normal", "-normal")
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class ToolForce(RatingChart):
     """Tool forces over radius and height [N], see `RatingChart`.
 
@@ -87,11 +87,11 @@ class ToolForce(RatingChart):
             )
         lines += ["", "| limited by | of all positions |", "| --- | --- |"]
         reached_count = np.isfinite(self.q_a[..., 0]).sum()
-        for k in self.active_factors:
-            lines.append(
-                f"| {self.limiting_factors[k]} | "
-                f"{100 * (self.limiting_factor_index == k).sum() / reached_count:.3g} % |"
-            )
+        lines += [
+            f"| {self.limiting_factors[k]} | "
+            f"{100 * (self.limiting_factor_index == k).sum() / reached_count:.3g} % |"
+            for k in self.active_factors
+        ]
         return "\n".join([*lines, ""])
 
     def section_directions(self) -> Array:
@@ -174,19 +174,18 @@ def tool_force(
     action, single_joint = _direction_action(search, direction, joint)
     if working is None:
         working = machine.driven_joints if single_joint is None else [single_joint]
-    conditions = rating_conditions(search, action, find_rule("none"), working, with_weight=weights)
+    conditions = RatingConditions(
+        machine=machine, places=search, action=action, rule=find_rule("none"),
+        working_joints=tuple(working), with_weight=weights,
+    )  # fmt: skip
+    if not isinstance(direction, str):
+        direction = "({:g}, {:g}, {:g})".format(*direction)
+    elif isinstance(action, PathUnitAction):
+        direction += f" of {machine.active[action.stroke]}"
     return compute_chart(
         ToolForce, conditions, slews=slews, step=step, radii=radii, heights=heights,
-        direction=_direction_text(direction, action, machine),
+        direction=direction,
     )  # fmt: skip
-
-
-def _direction_text(direction: str | Sequence[float], action: UnitAction, machine: Machine) -> str:
-    if not isinstance(direction, str):
-        return "({:g}, {:g}, {:g})".format(*direction)
-    return direction + (
-        f" of {machine.active[action.stroke]}" if isinstance(action, PathUnitAction) else ""
-    )
 
 
 def tangent_action(strokes: Strokes, stroke_index: int) -> PathUnitAction:
@@ -197,10 +196,10 @@ def tangent_action(strokes: Strokes, stroke_index: int) -> PathUnitAction:
     """
     machine = strokes.machine
     joint = machine.active[stroke_index]
-    limits_by_joint = {x.joint: x for x in drive_force_limits(machine, [joint])}
-    if joint not in limits_by_joint:
+    limits = next((x for x in drive_force_limits(machine, [joint]) if x.joint == joint), None)
+    if limits is None:
         raise InputError(f"nothing limits '{joint}', give it a cylinder, or an effort in <limit>")
-    pushes_harder = limits_by_joint[joint].max_force >= -limits_by_joint[joint].min_force
+    pushes_harder = limits.max_force >= -limits.min_force
     return PathUnitAction(stroke_index, -1.0 if pushes_harder else 1.0, up_direction(machine))
 
 
@@ -210,42 +209,36 @@ def _direction_action(
     """Return the unit action on the frame, and the joint for a tangent of a path."""
     machine, section = search.machine, search.section
     up = up_direction(machine)
-    if not isinstance(direction, str):
-        direction_vector = as_sample(direction, 3, "the direction", ("x", "y", "z"))
-        if not direction_vector.any():
+    if isinstance(direction, str):
+        if direction not in TOOL_DIRECTIONS:
+            raise InputError(
+                f"direction '{direction}' is unknown, "
+                f"{suggest_names(TOOL_DIRECTIONS, direction)}, or a vector"
+            )
+        if section.is_radial and direction not in ("up", "down", "tangent", "-tangent"):
+            raise InputError(
+                f"'{search.statics.frame}' stays in no plane through the slewing axis, "
+                f"'{direction}' is no direction there: give up, down, tangent or a vector"
+            )
+        if direction.endswith(("tangent", "normal")):
+            i = bucket_and_arm_strokes(search, joint)[0]
+            sign = -1.0 if direction.startswith("-") else 1.0
+            action = PathUnitAction(i, sign * tangent_action(search, i).sign, up)
+            is_tangent = direction.endswith("tangent")
+            normal = None if is_tangent else _normal_action(search, action, sign)
+            return normal or action, machine.active[i] if is_tangent else None
+        outward = section.first_direction
+        pushed = {"up": up, "down": -up, "in": -outward, "out": outward}[direction]
+    else:
+        pushed = as_sample(direction, 3, "the direction", ("x", "y", "z"))
+        if not pushed.any():
             raise InputError("the direction is zero, give a vector of any length")
-        return _fixed_action(-direction_vector / np.linalg.norm(direction_vector), up, joint)
-    if direction not in TOOL_DIRECTIONS:
-        raise InputError(
-            f"direction '{direction}' is unknown, {suggest_names(TOOL_DIRECTIONS, direction)}, "
-            f"or a vector"
-        )
-    sign = -1.0 if direction in ("down", "in") or direction.startswith("-") else 1.0
-    if direction in ("up", "down"):
-        return _fixed_action(-sign * up, up, joint)
-    if section.is_radial and direction.removeprefix("-") != "tangent":
-        raise InputError(
-            f"'{search.statics.frame}' stays in no plane through the slewing axis, "
-            f"'{direction}' is no direction there: give up, down, tangent or a vector"
-        )
-    if direction in ("in", "out"):
-        return _fixed_action(-sign * section.first_direction, up, joint)
-    i = bucket_and_arm_strokes(search, joint)[0]
-    path_action = tangent_action(search, i)
-    path_action = PathUnitAction(i, sign * path_action.sign, up)
-    if direction.endswith("tangent"):
-        return path_action, machine.active[i]
-    return _normal_action(search, path_action, sign), None
-
-
-def _fixed_action(
-    direction: Array, up_direction: Array, joint: str | None
-) -> tuple[UnitAction, None]:
+        pushed = pushed / np.linalg.norm(pushed)
     if joint is not None:
         raise InputError(
             f"'{joint}' is named, but only tangent and normal are of a joint's path: leave it out"
         )
-    return FixedUnitAction(direction, up_direction), None
+    return FixedUnitAction(-pushed, up), None
 
 
 def _normal_action(
@@ -254,8 +247,9 @@ def _normal_action(
     """Return the reaction to a force away from the pivot, or with sign -1 towards it."""
     machine, frame, section = search.machine, search.statics.frame, search.section
     normal = np.cross(section.first_direction, section.second_direction)
-    statics = search.statics.evaluate(machine.home[None])
-    tip_tangent = statics.tip_jacobian[0, :, path_action.stroke]
+    tip_tangent = search.statics.evaluate(machine.home[None]).tip_jacobian[
+        0, :, path_action.stroke
+    ]
     angular_rate = frame_angular_jacobian(machine, frame, machine.home)[:, path_action.stroke]
     outward = np.cross(tip_tangent, angular_rate)  # r w^2, from the centre of rotation
     orientation = np.sign(np.cross(normal, tip_tangent) @ outward)

@@ -32,76 +32,6 @@ _ROUNDING_DIGITS = 12  # decimal places; further ones are rounding errors
 Optimum = tuple[float, Array] | None
 
 
-class WorkspaceOptimizer:
-    """Optima over the configurations of a workspace.
-
-    The best configurations of the workspace that satisfy the constraints best are improved by
-    `maximize_on_branch`.
-
-    Args:
-        workspace: The workspace.
-
-    Attributes:
-        q: (N, nq) closed configurations of the workspace.
-    """
-
-    def __init__(self, workspace: Workspace):
-        self._workspace, self._machine = workspace, workspace.machine
-        self._strokes = [workspace.machine.active.index(joint) for joint in workspace.strokes]
-        self._size = workspace.machine.closure.characteristic_length
-        self.q = np.concatenate(
-            [patch.configurations[patch.is_closed] for patch in workspace.patches]
-        )
-        lengths = workspace.upper - workspace.lower
-        self._lengths = np.where(workspace.upper > workspace.lower, lengths, 1.0)
-
-    def maximize(
-        self,
-        objective: Objective,
-        values: Array,
-        constraints: Sequence[ObjectiveConstraint] = (),
-        violation: Array | None = None,
-    ) -> Optimum:
-        """Find the largest value of an objective.
-
-        Args:
-            objective: See `maximize_on_branch`.
-            values: (N,) values of the objective at the configurations `q`.
-            constraints: Constraints; lengths as shares of the characteristic length.
-            violation: (N,) violation of the constraints at `q`, 0 where they hold.
-
-        Returns:
-            The value and its configuration (nq,); None if no start satisfies the constraints.
-        """
-        weight = _CONSTRAINT_WEIGHT * self._size
-        score = values if violation is None else values - weight * violation
-        best: Optimum = None
-        limits = (self._workspace.lower, self._workspace.upper)
-        for start in self._select_starts(score):
-            value, configuration = maximize_on_branch(
-                self._machine, start, self._strokes, limits, objective, constraints
-            )
-            margin = _MIN_IMPROVEMENT * self._size
-            if np.isfinite(value) and (best is None or value > best[0] + margin):
-                best = value, configuration
-        return best
-
-    def _select_starts(self, score: Array) -> list[Array]:
-        """Return the configurations with the best scores that are not close to each other."""
-        columns = self._machine.closure.active[self._strokes]
-        out: list[Array] = []
-        for k in np.argsort(-score, kind="stable"):
-            q = self.q[k]
-            distances = [
-                np.abs((q - x)[columns] / self._lengths[self._strokes]).max() for x in out
-            ]
-            if not distances or min(distances) > _MIN_START_DISTANCE:
-                out.append(q)
-            if len(out) == _START_COUNT:
-                break
-        return out
-
-
 class FrameSectionCoordinates:
     """Coordinates (u, w) of a frame in the section of a workspace, with derivatives.
 
@@ -164,6 +94,9 @@ class Dimension(NamedTuple):
 class DimensionFinder:
     """Computes the dimensions of a working range.
 
+    Each is an optimum: the configurations of the workspace that are best, and satisfy the
+    constraints best, are improved by `maximize_on_branch`.
+
     Args:
         workspace: Workspace of the lip.
         ground_height: Height of the ground [m].
@@ -172,14 +105,18 @@ class DimensionFinder:
 
     def __init__(self, workspace: Workspace, ground_height: float, bucket_pivot: str | None):
         self._workspace, self._ground, self._machine = workspace, ground_height, workspace.machine
-        self._optimizer = WorkspaceOptimizer(workspace)
+        self._strokes = [workspace.machine.active.index(joint) for joint in workspace.strokes]
+        self._limits = lower, upper = workspace.lower, workspace.upper
+        self._lengths = np.where(upper > lower, upper - lower, 1.0)
+        self._q = np.concatenate([x.configurations[x.is_closed] for x in workspace.patches])
         self._lip = FrameSectionCoordinates(workspace, workspace.frame)
         self._size = workspace.machine.closure.characteristic_length
-        self._positions = self._lip.coordinates(self._optimizer.q)
+        self._positions = self._lip.coordinates(self._q)
         self._pivot = None
         if bucket_pivot is not None:
-            link = self._machine.tree.joints[bucket_pivot].child
-            self._pivot = FrameSectionCoordinates(workspace, link)
+            self._pivot = FrameSectionCoordinates(
+                workspace, self._machine.tree.joints[bucket_pivot].child
+            )
 
     def find_all(self, level_length: float) -> Iterator[Dimension]:
         """Yield the dimensions that exist, in the order of brochures.
@@ -208,16 +145,62 @@ class DimensionFinder:
             if pivot is not None:
                 dimensions.append(self._level_bottom_depth(level_length))
                 dimensions.append(self._vertical_wall_depth(pivot))
-        height = self._maximize_lip(1, 1.0, self._ground)
         dimensions.append(
             self._dimension(
-                "cutting height" if pivot else "height", height, "highest above the ground"
+                "cutting height" if pivot else "height",
+                self._maximize_lip(1, 1.0, self._ground),
+                "highest above the ground",
             )
         )
         if pivot is not None:
             dimensions.append(self._dump_height(pivot))
             dimensions.append(self._front_slewing_radius() if has_slewing_joint else None)
         yield from (dimension for dimension in dimensions if dimension is not None)
+
+    def _maximize(
+        self,
+        objective: Objective,
+        values: Array,
+        constraints: Sequence[ObjectiveConstraint] = (),
+        violation: Array | None = None,
+    ) -> Optimum:
+        """Find the largest value of an objective.
+
+        Args:
+            objective: See `maximize_on_branch`.
+            values: (N,) values of the objective at the configurations of the workspace.
+            constraints: Constraints; lengths as shares of the characteristic length.
+            violation: (N,) violation of the constraints there, 0 where they hold.
+
+        Returns:
+            The value and its configuration (nq,); None if no start satisfies the constraints.
+        """
+        score = (
+            values if violation is None else values - (_CONSTRAINT_WEIGHT * self._size) * violation
+        )
+        best: Optimum = None
+        for start in self._select_starts(score):
+            value, configuration = maximize_on_branch(
+                self._machine, start, self._strokes, self._limits, objective, constraints
+            )
+            margin = _MIN_IMPROVEMENT * self._size
+            if np.isfinite(value) and (best is None or value > best[0] + margin):
+                best = value, configuration
+        return best
+
+    def _select_starts(self, score: Array) -> list[Array]:
+        columns = self._machine.closure.active[self._strokes]
+        out: list[Array] = []
+        for k in np.argsort(-score, kind="stable"):
+            q = self._q[k]
+            distances = [
+                np.abs((q - x)[columns] / self._lengths[self._strokes]).max() for x in out
+            ]
+            if not distances or min(distances) > _MIN_START_DISTANCE:
+                out.append(q)
+            if len(out) == _START_COUNT:
+                break
+        return out
 
     def _maximize_lip(
         self,
@@ -227,30 +210,35 @@ class DimensionFinder:
         fixed: Mapping[int, float] | None = None,
     ) -> Optimum:
         """Maximize sign (x - offset) of coordinate x of the lip, with other coordinates fixed."""
-        values = sign * self._positions[:, axis]
         return self._maximize_fixed(
-            self._lip.coordinate_objective(axis, sign, offset), values, fixed or {}
+            self._lip.coordinate_objective(axis, sign, offset),
+            sign * self._positions[:, axis],
+            fixed or {},
         )
 
     def _maximize_fixed(
         self, objective: Objective, values: Array, fixed: Mapping[int, float]
     ) -> Optimum:
-        """Maximize an objective with some coordinates of the lip fixed."""
         if not fixed:
-            return self._optimizer.maximize(objective, values)
+            return self._maximize(objective, values)
         axes, targets = list(fixed), list(fixed.values())
         constraints: list[ObjectiveConstraint] = [
             ("eq", self._lip.coordinate_objective(k, 1.0, x, self._size)) for k, x in fixed.items()
         ]
         violation = np.abs(self._positions[:, axes] - targets).sum(axis=1) / self._size
-        return self._optimizer.maximize(objective, values, constraints, violation)
+        return self._maximize(objective, values, constraints, violation)
 
     def _dimension(self, name: str, optimum: Optimum, definition: str) -> Dimension | None:
         if optimum is None:
             return None
         value, q = optimum
-        q_a = np.round(q[self._machine.closure.active], _ROUNDING_DIGITS) + 0.0
-        return Dimension(name, value, self._rounded_position(self._lip, q), q_a, definition)
+        return Dimension(
+            name,
+            value,
+            self._rounded_position(self._lip, q),
+            np.round(q[self._machine.closure.active], _ROUNDING_DIGITS) + 0.0,
+            definition,
+        )
 
     def _rounded_position(self, coordinates: FrameSectionCoordinates, q: Array) -> Array:
         return np.asarray(np.round(coordinates.coordinates(q[None])[0], _ROUNDING_DIGITS) + 0.0)
@@ -277,8 +265,10 @@ class DimensionFinder:
             return None
         radius = float(brentq(height_difference, radii[k], radii[k + 1], xtol=_POSITION_TOLERANCE))
         bottom = self._lowest_height(radius)
-        inner_radii = np.linspace(radius, radius + level_length, _CHECKED_POINTS)[1:-1]
-        inner = [self._lowest_height(x) for x in inner_radii.tolist()]
+        inner = [
+            self._lowest_height(x)
+            for x in np.linspace(radius, radius + level_length, _CHECKED_POINTS)[1:-1].tolist()
+        ]
         if bottom is None or any(x is None or x[0] < bottom[0] - 1e-6 for x in inner):
             return None
         return self._dimension(
@@ -304,11 +294,11 @@ class DimensionFinder:
             self._lip.coordinate_objective(0, scale=size),
             pivot.coordinate_objective(0, scale=size),
         )
-        q, positions = self._optimizer.q, self._positions
+        q, positions = self._q, self._positions
         components = np.array([[inward(x)[0], upward(x)[0]] for x in q])
         violation = np.maximum(-components, 0.0).sum(axis=1)
         violation += np.maximum(pivot.coordinates(q) - positions, 0.0)[:, 0] / size
-        optimum = self._optimizer.maximize(
+        optimum = self._maximize(
             self._lip.coordinate_objective(1, -1.0, self._ground),
             -positions[:, 1],
             [("ineq", inward), ("ineq", upward), ("ineq", pivot_behind)],
@@ -353,8 +343,8 @@ class DimensionFinder:
         vertical = objective_difference(
             pivot.coordinate_objective(1, scale=size), lip.coordinate_objective(1, scale=size)
         )
-        offsets = self._positions - pivot.coordinates(self._optimizer.q)
-        optimum = self._optimizer.maximize(
+        offsets = self._positions - pivot.coordinates(self._q)
+        optimum = self._maximize(
             lip.coordinate_objective(1, 1.0, self._ground),
             self._positions[:, 1],
             [("eq", horizontal), ("ineq", vertical)],
@@ -369,7 +359,7 @@ class DimensionFinder:
 
         Each pin that is the outermost one in some configuration is tried.
         """
-        q, size = self._optimizer.q, self._size
+        q, size = self._q, self._size
         signed_pins = [
             (FrameSectionCoordinates(self._workspace, link), sign)
             for link in _front_pin_links(self._machine, self._workspace.frame)
@@ -386,7 +376,7 @@ class DimensionFinder:
                 if j != k
             ]
             violation = (distances.max(axis=1) - distances[:, k]) / size
-            optimum = self._optimizer.maximize(
+            optimum = self._maximize(
                 pin.coordinate_objective(0, -sign), -distances[:, k], constraints, violation
             )
             if optimum is not None and (best is None or -optimum[0] < best[1]):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.common.result import Result
 from crane.common.samples import as_number
 from crane.dynamics.statics import StaticsEvaluator
@@ -49,11 +49,9 @@ class WorkingRange(Result):
         return f"WorkingRange of '{self.machine.name}' at '{self.frame}': {dimension_texts}"
 
     def __getitem__(self, name: str) -> Dimension:
-        for dimension in self.dimensions:
-            if dimension.name == name:
-                return dimension
-        hint = suggest_names((one.name for one in self.dimensions), name)
-        raise InputError(f"'{name}' is no dimension of '{self.machine.name}', {hint}")
+        by_name = {dimension.name: dimension for dimension in self.dimensions}
+        check_name(name, by_name, f"'{name}' is no dimension of '{self.machine.name}'")
+        return by_name[name]
 
     def to_markdown(self) -> str:
         """Return a table of the dimensions with their positions and definitions."""
@@ -130,14 +128,18 @@ def working_range(
         if bucket is not None:
             raise
     ground_height = _ground_height(machine)
-    dimensions = tuple(DimensionFinder(reach, ground_height, pivot_joint).find_all(level))
-    return WorkingRange(machine, reach.frame, ground_height, reach, joint, level, dimensions)
+    return WorkingRange(
+        machine,
+        reach.frame,
+        ground_height,
+        reach,
+        joint,
+        level,
+        tuple(DimensionFinder(reach, ground_height, pivot_joint).find_all(level)),
+    )
 
 
 def _ground_height(machine: Machine) -> float:
     """Return the height of the ground under the machine [m]; 0 if nothing touches ground."""
-    for force in machine.external_forces:
-        ground = getattr(force, "ground", None)
-        if ground is not None and not ground.profile:
-            return float(ground.height)
-    return 0.0
+    grounds = (getattr(force, "ground", None) for force in machine.external_forces)
+    return next((float(x.height) for x in grounds if x is not None and not x.profile), 0.0)

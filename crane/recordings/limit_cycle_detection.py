@@ -61,10 +61,10 @@ def sustained_oscillation(
     found: LimitCycle | None = None
     width = _MIN_PERIOD_SAMPLES
     while width * _MIN_PERIODS <= 2.5 * len(values):
-        deviation = values - _moving_mean(values, width)
-        for first, last, period in _oscillation_spans(deviation, width, 0.5 * least):
-            swings = _peak_to_peak(values, first, last, period)
-            amplitude = 0.5 * float(np.median(swings))
+        for first, last, period in _oscillation_spans(
+            values - _moving_mean(values, width), width, 0.5 * least
+        ):
+            amplitude = 0.5 * float(np.median(_peak_to_peak(values, first, last, period)))
             if amplitude < max(least, 0.0 if found is None else found.amplitude):
                 continue
             cycles = (last - first) / period
@@ -92,18 +92,16 @@ def limit_cycles(recording: Recording) -> list[LimitCycle]:
     ]
     prefixes = _COMMAND_PREFIXES[:1] if references else _COMMAND_PREFIXES
     references += [x for x in channels if x.startswith(prefixes)]
+    commands = [channels[x] for x in references]
     found = []
     for name in names:
         release_pages()
-        cycle = sustained_oscillation(
-            recording.time,
-            channels[name],
-            _MIN_PRESSURE_AMPLITUDE,
-            [channels[x] for x in references],
-            name,
+        found.append(
+            sustained_oscillation(
+                recording.time, channels[name], _MIN_PRESSURE_AMPLITUDE, commands, name
+            )
         )
-        found += [cycle] if cycle is not None else []
-    return sorted(found, key=lambda one: -one.amplitude)
+    return sorted((x for x in found if x is not None), key=lambda one: -one.amplitude)
 
 
 def limit_cycle_message(recording: Recording) -> str:
@@ -170,7 +168,6 @@ def _peak_to_peak(values: Array, first: int, last: int, period: float) -> Array:
 
 
 def _reversal_count(command: Array) -> int:
-    """Number of reversals of a command."""
     steps = np.diff(command)
     steps = steps[np.abs(steps) > 1e-9 * max(float(np.ptp(command)), 1e-300)]
     return int(np.count_nonzero(np.signbit(steps[1:]) != np.signbit(steps[:-1])))

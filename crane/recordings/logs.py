@@ -100,12 +100,10 @@ def assemble_table(
         )
     found: dict[str, np.ndarray] = {}
     for line in lines:
-        try:
+        with timeseries.located_errors(line.source_location):
             if line.heading in found:
                 raise RecordingError(f"column '{line.heading}' is there twice, remove one")
             found[line.heading] = _evaluate_expression(line.expression, arrays)
-        except RecordingError as error:
-            raise RecordingError(f"{line.source_location}: {error}") from None
     count = max((len(x) for x in found.values() if x.ndim), default=1)
     for line in lines:
         if found[line.heading].shape not in ((), (count,)):
@@ -114,18 +112,16 @@ def assemble_table(
                 f"samples, others have {count}, choose a column of a table by its number, as in "
                 "a[0]"
             )
-    columns_by_heading = {
-        name: np.broadcast_to(values, (count,)) for name, values in found.items()
-    }
-    table = table_reader.table_from_columns(columns, columns_by_heading, notes)
-    for name, values in zip(table.units, table.values.T, strict=True):
-        bad = ~np.isfinite(values)
+    values = np.column_stack([np.broadcast_to(x, (count,)) for x in found.values()])
+    table = table_reader.build_table(columns, found, values, notes)
+    for name, column in zip(table.units, table.values.T, strict=True):
+        bad = ~np.isfinite(column)
         if name == TIME:
-            bad |= np.append(False, np.diff(values) <= 0)
+            bad |= np.append(False, np.diff(column) <= 0)
         if bad.any():
             at = int(bad.argmax())
             what = "strictly increasing times" if name == TIME else "finite numbers"
-            raise RecordingError(f"{path}: '{name}' is {values[at]} at sample {at}, give {what}")
+            raise RecordingError(f"{path}: '{name}' is {column[at]} at sample {at}, give {what}")
     return table
 
 
@@ -143,11 +139,7 @@ def expression_names(expression: str) -> list[str]:
     if any(isinstance(node, ast.Call | ast.Attribute) for node in nodes):
         return []
     names = [node.id for node in nodes if isinstance(node, ast.Name)]
-    names += [
-        str(node.value)
-        for node in nodes
-        if isinstance(node, ast.Constant) and type(node.value) is str
-    ]
+    names += [x.value for x in nodes if isinstance(x, ast.Constant) and isinstance(x.value, str)]
     return list(dict.fromkeys(names))
 
 
@@ -157,13 +149,8 @@ def read_log_columns(path: Path) -> tuple[dict[str, str], list[LogColumn]]:
     Raises:
         RecordingError: The file is missing or malformed.
     """
-    try:
+    with timeseries.located_errors(path, "a file of columns"):
         text = read_plain_file(path, _MAX_BYTES).decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise RecordingError(f"{path}: is not text, save it as UTF-8") from None
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise RecordingError(f"{path}: {reason}, give a file of columns") from None
     notes, found = {}, []
     for number, line in enumerate(text.splitlines(), start=1):
         if line.strip().startswith("#"):

@@ -5,20 +5,18 @@ by closing the loops, velocities by v_A = gamma_A v_B with the measured joints q
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 
 import numpy as np
 
-from crane.closure.closure import Closure
 from crane.common.errors import ClosureError, MechanismError, RecordingError
 from crane.common.samples import Array
 from crane.description.sensors import INCLINATION_PREFIX, VELOCITY_SUFFIX, VELOCITY_UNITS
 from crane.machine.machine import Machine
-from crane.recordings.missing_measurements import MissingMeasurementError
-from crane.recordings.recording_columns import time_derivative
 from crane.recordings.sensor_kinematics import ideal_readings, pin_derivatives
-from crane.recordings.timeseries import TIME, Table, table_column
+from crane.recordings.timeseries import TIME, Table, table_column, time_derivative
 
 _MIN_INDEPENDENT_SHARE = 1e-6  # least part of the motion of a joint that others do not determine
 _CONFIGURATION_TOLERANCE = 1e-6  # [rad], [characteristic length]
@@ -29,7 +27,22 @@ _SAMPLE_PATTERN = re.compile(r"\(sample (\d+)\)")  # in an error message of the 
 _LIMIT_TOLERANCE = 0.1  # of a range, for errors of sensors
 _MAX_ITERATIONS, _STEP_TOLERANCE = 12, 1e-11  # Newton iterations, and the last step [rad]
 _MIN_DERIVATIVE = 0.1  # least derivative of an inclination by the joint of its link
+AGREEMENT_TOLERANCE = {"rad": 5e-3, "m": 5e-4}  # between sensors of one quantity
+HELD_JOINT_TOLERANCE = {"rad": 0.02, "m": 2e-3}  # of a joint that is held
 UnknownAngles = list[tuple[str, str]]  # joint, inclination
+
+
+class MissingMeasurementError(RecordingError):
+    """Coordinates or forces of joints are not determined by a recording.
+
+    Args:
+        message: Message with the required columns.
+        joints: Joints that may have been held.
+    """
+
+    def __init__(self, message: str, joints: Iterable[str]):
+        super().__init__(message)
+        self.joints = tuple(joints)
 
 
 def determining_joints(machine: Machine, names: Sequence[str]) -> tuple[str, ...]:
@@ -49,8 +62,10 @@ def determining_joints(machine: Machine, names: Sequence[str]) -> tuple[str, ...
     it, are = ("it", "is") if len(missing) == 1 else ("them", "are")
     requested = ", ".join(repr(f"{x} [{machine.unit(x)}]") for x in missing)
     alternatives = f", or a joint that moves with {it} ({', '.join(others)})" if others else ""
-    text = f"{', '.join(map(repr, missing))} {are} not determined, give {requested}{alternatives}"
-    raise MissingMeasurementError(text, missing)
+    raise MissingMeasurementError(
+        f"{', '.join(map(repr, missing))} {are} not determined, give {requested}{alternatives}",
+        missing,
+    )
 
 
 def independent_joints(
@@ -105,10 +120,9 @@ class MeasuredConfigurations:
     @cached_property
     def machine(self) -> Machine:
         """The machine with the determining joints as active joints."""
-        same = set(self.drives) == set(self._recorded_machine.active)
         return (
             self._recorded_machine
-            if same
+            if (set(self.drives) == set(self._recorded_machine.active))
             else self._recorded_machine.with_active_joints(self.drives)
         )
 
@@ -141,11 +155,6 @@ class MeasuredConfigurations:
     def derivative_slice(self) -> slice:
         """Samples for derivatives, which are smooth."""
         return slice(None, None, max(1, len(self.time) // _DERIVATIVE_SAMPLES))
-
-    @cached_property
-    def link_positions(self) -> dict[str, tuple[float, float, float]]:
-        """Positions of links on the links that carry them [m]."""
-        return {joint.child: joint.xyz for joint in self.machine.tree.joints.values()}
 
     @cached_property
     def pin_derivatives(self) -> dict[str, Array]:
@@ -191,9 +200,11 @@ def motion_from_joints(
     for start in range(0, len(time), _BLOCK_SAMPLES):
         block = slice(start, start + _BLOCK_SAMPLES)
         try:
-            q_a[block], v_a[block], distance = _active_joint_motion(
-                machine, closure, q_b[block], v_b[block]
-            )
+            q = closure.solve(q_b[block])
+            gamma = closure.gamma(q)[:, machine.closure.active]
+            q_a[block] = q[:, machine.closure.active]
+            v_a[block] = np.einsum("nij,nj->ni", gamma, v_b[block])
+            distance = np.abs(machine.closure.solve(q_a[block]) - q).max(axis=1)
         except ClosureError as error:
             raise RecordingError(f"{_renumber_samples(start, error)}; {hint}") from None
         if (distance > _CONFIGURATION_TOLERANCE).any():
@@ -216,27 +227,6 @@ def motion_from_joints(
         if (recorded := recorded_velocity(machine, joint, table)) is not None:
             v[:] = recorded
     return q_a, v_a
-
-
-def _active_joint_motion(
-    machine: Machine, closure: Closure, q_b: Array, v_b: Array
-) -> tuple[Array, Array, Array]:
-    """q_A, v_A = gamma_A v_B, and distances (N,) to the configurations that q_A gives.
-
-    Args:
-        machine: The machine with the active joints q_A.
-        closure: Closure of the machine with the active joints q_B.
-        q_b: (N, n).
-        v_b: (N, n).
-
-    Raises:
-        ClosureError: No configuration has these coordinates.
-    """
-    q = closure.solve(q_b)
-    gamma = closure.gamma(q)[:, machine.closure.active]
-    q_a = q[:, machine.closure.active]
-    distance = np.abs(machine.closure.solve(q_a) - q).max(axis=1)
-    return q_a, np.einsum("nij,nj->ni", gamma, v_b), distance
 
 
 def _renumber_samples(start: int, error: ClosureError) -> str:
@@ -283,8 +273,11 @@ def add_inclination_angles(machine: Machine, table: Table) -> Table:
         listed = ", ".join(name for _, name in unknown_angles)
         hint = f"see that zero and sign of {listed} are the machine's"
         raise RecordingError(f"{error}; {hint}") from None
-    units = table.units | {joint: "rad" for joint, _ in unknown_angles}
-    return Table(units, np.column_stack([table.values, angles]), table.notes)
+    return Table(
+        table.units | {joint: "rad" for joint, _ in unknown_angles},
+        np.column_stack([table.values, angles]),
+        table.notes,
+    )
 
 
 def _find_unknown_angles(machine: Machine, table: Table) -> tuple[tuple[str, ...], UnknownAngles]:
@@ -338,6 +331,7 @@ def _solve_angles(driven: Machine, table: Table, unknown_angles: UnknownAngles) 
     count, joints = len(table.values), [joint for joint, _ in unknown_angles]
     indices = [driven.active.index(joint) for joint in joints]
     names = [name for _, name in unknown_angles]
+    rates = [name + VELOCITY_SUFFIX for name in names]
     q_b = np.tile(driven.home[driven.closure.active], (count, 1))
     for i, joint in enumerate(driven.active):
         if joint not in joints:
@@ -347,19 +341,73 @@ def _solve_angles(driven: Machine, table: Table, unknown_angles: UnknownAngles) 
         q = driven.closure.solve(q_b)
         computed = ideal_readings(driven, q, np.zeros_like(q), names)
         residual = measured - np.column_stack([computed[name] for name in names])
-        step = np.linalg.solve(
-            _inclination_jacobian(driven, q, names, indices), residual[:, :, None]
-        )[:, :, 0]
+        gamma = driven.closure.gamma(q)
+        by_joint = [ideal_readings(driven, q, gamma[:, :, i], rates) for i in indices]
+        jacobian = np.stack(
+            [np.column_stack([x[rate] for rate in rates]) for x in by_joint], axis=2
+        )
+        step = np.linalg.solve(jacobian, residual[:, :, None])[:, :, 0]
         q_b[:, indices] += step
         if np.abs(step).max() < _STEP_TOLERANCE:
             return q_b[:, indices]
     raise ClosureError(f"no configuration has the inclinations of {', '.join(names)}")
 
 
-def _inclination_jacobian(
-    driven: Machine, q: Array, names: list[str], indices: list[int]
-) -> Array:
-    """Derivatives (N, k, k) of inclinations by some of the active coordinates."""
-    gamma, rates = driven.closure.gamma(q), [name + VELOCITY_SUFFIX for name in names]
-    columns = [ideal_readings(driven, q, gamma[:, :, i], rates) for i in indices]
-    return np.stack([np.column_stack([x[rate] for rate in rates]) for x in columns], axis=2)
+class MissingMeasurements:
+    """Collector of errors about missing measurements, raised as one error.
+
+    Args:
+        machine: The recorded machine.
+        table: Table of quantities.
+    """
+
+    def __init__(self, machine: Machine, table: Table):
+        self._machine, self._table = machine, table
+        self._errors: list[RecordingError] = []
+
+    @contextmanager
+    def collect_errors(self) -> Iterator[None]:
+        """Collect a recording error of the block, to be raised later."""
+        try:
+            yield
+        except RecordingError as error:
+            self._errors.append(error)
+
+    def raise_collected(self) -> None:
+        """Raise all collected errors as one.
+
+        Raises:
+            RecordingError: There are collected errors.
+        """
+        if not self._errors:
+            return
+        joints = dict.fromkeys(
+            joint for error in self._errors if isinstance(error, MissingMeasurementError)
+            for joint in error.joints
+        )  # fmt: skip
+        message = "; ".join(map(str, self._errors))
+        lock_options = [
+            f"--lock {joint}={place}" for joint in joints if (place := self._held_position(joint))
+        ]
+        if lock_options:
+            message += f"; or lock what was held, where it was: {' '.join(lock_options)}"
+        raise RecordingError(message)
+
+    def _held_position(self, joint: str) -> str:
+        """Text of the coordinate at which a joint may have been held; "" if it moved."""
+        machine, unit = self._machine, self._machine.unit(joint)
+        if self._table.units.get(joint) != unit:
+            return f"{machine.home[machine.column(joint)]:.4g} (home)"
+        low, place, high = np.quantile(table_column(self._table, joint), [0.005, 0.5, 0.995])
+        return (
+            f"{place:.4g}"
+            if high - low <= 2 * tolerance(HELD_JOINT_TOLERANCE, machine, unit)
+            else ""
+        )
+
+
+def tolerance(tolerances: Mapping[str, float], machine: Machine, unit: str) -> float:
+    """Tolerance in a unit, scaled by the characteristic length for machines below 1 m."""
+    return tolerances[unit] * (
+        min(machine.closure.characteristic_length, 1.0) if unit == "m" else 1.0
+    )

@@ -19,19 +19,17 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from crane.common.errors import CraneWarning, RecordingError, prefix_location
+from crane.common.errors import CraneWarning, RecordingError
 from crane.common.samples import Array
 from crane.description.sensors import PRESSURE_PREFIX, SENSOR_PREFIX, Sensor
 from crane.machine.machine import Machine
 from crane.recordings.measured_configurations import (
-    add_inclination_angles,
-    determining_joints,
-    motion_from_joints,
-)
-from crane.recordings.missing_measurements import (
     HELD_JOINT_TOLERANCE,
     MissingMeasurementError,
     MissingMeasurements,
+    add_inclination_angles,
+    determining_joints,
+    motion_from_joints,
     tolerance,
 )
 from crane.recordings.recording import (
@@ -44,7 +42,6 @@ from crane.recordings.recording import (
     VELOCITY_UNITS,
     Recording,
 )
-from crane.recordings.recording_columns import check_finite, free_force_message
 from crane.recordings.recording_reader import (
     FULL_TIME_SPAN,
     TimeSpan,
@@ -52,7 +49,15 @@ from crane.recordings.recording_reader import (
     read_quantities,
 )
 from crane.recordings.sensor_discrepancy import noise_std, warn_discrepancies
-from crane.recordings.timeseries import TIME, Table, table_column
+from crane.recordings.timeseries import (
+    TIME,
+    Table,
+    check_columns_present,
+    check_finite,
+    free_force_message,
+    located_errors,
+    table_column,
+)
 
 _CHAMBER_PATTERN = re.compile("pressure_.+_[ab]")
 _NOISE_FACTOR = 6.0  # standard deviations, more than the extreme of a million samples
@@ -103,24 +108,20 @@ def complete_recording(
     Raises:
         RecordingError: As for `read_measured`.
     """
-    try:
+    with located_errors(path):
         table = _remove_free_forces(machine, table)
         # before computations, so that the message names a column of the file
         check_finite(dict(zip(table.units, table.values.T, strict=True)))
         check_strokes(machine, table)
         complete_table = add_inclination_angles(machine, table)
         missing = MissingMeasurements(machine, table)
-        missing.collect_missing_columns(required_columns)
-        is_complete = all(x in table.units for x in machine.active)
-        is_complete = is_complete and all(
-            x + FORCE_SUFFIX in table.units for x in machine.driven_joints
-        )
-        if not is_complete:
+        with missing.collect_errors():
+            check_columns_present(required_columns, table.units)
+        forces = [x + FORCE_SUFFIX for x in machine.driven_joints]
+        if not all(x in table.units for x in (*machine.active, *forces)):
             complete_table = _complete_table(machine, complete_table, missing)
         missing.raise_collected()
         warn_discrepancies(machine, table)  # of measured columns only
-    except RecordingError as error:
-        raise RecordingError(prefix_location(str(path), error)) from None
     notes = complete_table.notes | (
         {SENSORS_NOTE: IDEAL_SENSORS} if known_sensors(table, machine) else {}
     )
@@ -166,20 +167,15 @@ def _complete_table(machine: Machine, table: Table, missing: MissingMeasurements
             forces.append(_joint_force(machine, joint, table))
     missing.raise_collected()
     q, v = motion_from_joints(machine, drives, table)
-    columns = {TIME: table_column(table, TIME)} | dict(zip(machine.active, q.T, strict=True))
-    columns |= {x + VELOCITY_SUFFIX: v[:, i] for i, x in enumerate(machine.active)}
-    columns |= {
-        x + FORCE_SUFFIX: force for x, force in zip(machine.driven_joints, forces, strict=True)
-    }
     joint_units = {x: machine.unit(x) for x in machine.active}
     units = {TIME: "s"} | joint_units
     units |= {x + VELOCITY_SUFFIX: VELOCITY_UNITS[kind] for x, kind in joint_units.items()}
     units |= {x + FORCE_SUFFIX: FORCE_UNITS[joint_units[x]] for x in machine.driven_joints}
-    for name, unit in table.units.items():
-        if name not in units:
-            units[name], columns[name] = unit, table_column(table, name)
+    others = {name: unit for name, unit in table.units.items() if name not in units}
+    columns = [table_column(table, TIME), *q.T, *v.T, *forces]
+    columns += [table_column(table, name) for name in others]
     notes = table.notes | {"machine": machine.load_expression}
-    return Table(units, np.column_stack([columns[name] for name in units]), notes)
+    return Table(units | others, np.column_stack(columns), notes)
 
 
 def check_pressures(machine: Machine, table: Table) -> None:
@@ -310,8 +306,7 @@ def dead_length(machine: Machine, joint: str) -> float | None:
     slide = machine.tree.joints[joint]
     model = machine.model
     data = model.createData()
-    place = machine.coordinates.configuration(machine.home)
-    pin.framesForwardKinematics(model, data, place)
+    pin.framesForwardKinematics(model, data, machine.coordinates.configuration(machine.home))
     axis = data.oMf[machine.frame(slide.child)].rotation @ np.array(slide.axis)
     bodies = machine.tree.bodies_by_link()
     smallest_deviation, length = _MAX_AXIS_DEVIATION, None
@@ -334,7 +329,6 @@ def _pin_positions(machine: Machine, data: pin.Data, body: str, slide: str) -> l
         and joint.kind == "revolute"
         and body in (joint.child, bodies[joint.parent])
     ]
-    loops = machine.closure.equations.loops
-    ends = [end for loop in loops for end in (loop.predecessor, loop.successor)]
-    frames += [end for end in ends if bodies[end] == body]
+    for loop in machine.closure.equations.loops:
+        frames += [end for end in (loop.predecessor, loop.successor) if bodies[end] == body]
     return [data.oMf[machine.frame(frame)].translation.copy() for frame in frames]

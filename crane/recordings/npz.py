@@ -9,9 +9,10 @@ import lzma
 import math
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TypeVar
+from typing import IO
 
 import numpy as np
 
@@ -24,7 +25,7 @@ MAX_COLUMNS = 4096
 NUMERIC_KINDS = "biuf"  # kinds of numpy's types
 _BLOCK_NUMBERS = 1 << 20  # numbers
 _MAX_COMMENT_BYTES = 65535  # largest comment of a zip archive
-T = TypeVar("T")
+_Header = tuple[tuple[int, ...], bool, np.dtype]  # shape, whether in Fortran order, type
 _DAMAGE_ERRORS = (
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, RuntimeError, ValueError,
 )  # fmt: skip
@@ -59,7 +60,29 @@ def read_columns(path: Path) -> tuple[list[str], Array, str]:
         RecordingError: The file is no npz file, is damaged or encrypted, or holds other than
             columns of equal length, or too many numbers. The message does not name the file.
     """
-    return _read_archive(path, _archive_columns)
+    with _open_archive(path) as archive:
+        types = _declared_types(archive)
+        count = max((shape[0] for shape, *_ in types.values() if len(shape) == 1), default=0)
+        others = [
+            f"'{name}' has the shape {shape} of {str(dtype)[:40]}"
+            for name, (shape, _, dtype) in types.items()
+            if shape != (count,) or dtype.kind not in NUMERIC_KINDS
+        ]
+        if others:
+            raise RecordingError(f"{others[0]}, give ({count},) numbers per column")
+        if not count:
+            raise RecordingError("holds no samples, give an array per column")
+        if count * len(types) > MAX_NUMBERS:
+            raise RecordingError(
+                f"declares {count} samples of {len(types)} columns, give at most {MAX_NUMBERS} "
+                "numbers"
+            )
+        _check_sizes(archive, types)
+        values = scratch_arrays.empty_array(count, len(types))
+        for column, entry in zip(values.T, archive.infolist(), strict=True):
+            _read_array(archive, entry, column)
+            scratch_arrays.release_pages()
+        return list(types), values, archive.comment.decode(errors="replace")
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -70,13 +93,26 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         RecordingError: The file is no npz file, is damaged or encrypted, or holds too many
             numbers. The message does not name the file.
     """
-    return _read_archive(path, _archive_arrays)
+    with _open_archive(path) as archive:
+        types = _declared_types(archive)
+        numeric = {name: x for name, x in types.items() if x[2].kind in NUMERIC_KINDS}
+        if (count := sum(math.prod(shape) for shape, *_ in numeric.values())) > MAX_NUMBERS:
+            raise RecordingError(f"declares {count} numbers, give at most {MAX_NUMBERS}")
+        _check_sizes(archive, numeric)
+        found: dict[str, np.ndarray] = {name: np.empty(0, x[2]) for name, x in types.items()}
+        entries = dict(zip(types, archive.infolist(), strict=True))
+        for name, (shape, is_fortran, _) in numeric.items():
+            values = scratch_arrays.empty_array(math.prod(shape), 1)[:, 0]
+            _read_array(archive, entries[name], values)
+            found[name] = values.reshape(shape, order="F" if is_fortran else "C")
+        return found
 
 
-def _read_archive(path: Path, read: Callable[[zipfile.ZipFile], T]) -> T:
+@contextmanager
+def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
     try:
         with zipfile.ZipFile(path) as archive:
-            return read(archive)
+            yield archive
     except _DAMAGE_ERRORS as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0][:80]
         raise RecordingError(
@@ -84,12 +120,11 @@ def _read_archive(path: Path, read: Callable[[zipfile.ZipFile], T]) -> T:
         ) from None
 
 
-def _declared_types(archive: zipfile.ZipFile) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
-    """Shape and type of each array."""
+def _declared_types(archive: zipfile.ZipFile) -> dict[str, _Header]:
     entries = archive.infolist()
     if len(entries) > MAX_COLUMNS:
         raise RecordingError(f"holds {len(entries)} arrays, give at most {MAX_COLUMNS}")
-    types: dict[str, tuple[tuple[int, ...], np.dtype]] = {}
+    types: dict[str, _Header] = {}
     for entry in entries:
         name = _entry_name(entry)
         if name in types:
@@ -101,92 +136,22 @@ def _declared_types(archive: zipfile.ZipFile) -> dict[str, tuple[tuple[int, ...]
     return types
 
 
-def _archive_columns(archive: zipfile.ZipFile) -> tuple[list[str], Array, str]:
-    types = _declared_types(archive)
-    count = max((shape[0] for shape, _ in types.values() if len(shape) == 1), default=0)
-    for name, (shape, dtype) in types.items():
-        if shape != (count,) or dtype.kind not in NUMERIC_KINDS:
-            raise RecordingError(
-                f"'{name}' has the shape {shape} of {str(dtype)[:40]}, give ({count},) numbers "
-                "per column"
-            )
-    if not count:
-        raise RecordingError("holds no samples, give an array per column")
-    if count * len(types) > MAX_NUMBERS:
-        raise RecordingError(
-            f"declares {count} samples of {len(types)} columns, give at most {MAX_NUMBERS} numbers"
-        )
-    _check_sizes(archive, types)
-    values = scratch_arrays.empty_array(count, len(types))
-    for column, entry in enumerate(archive.infolist()):
-        _read_array(archive, entry, types, values[:, column])
-        scratch_arrays.release_pages()
-    return list(types), values, archive.comment.decode(errors="replace")
-
-
-def _archive_arrays(archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
-    types = _declared_types(archive)
-    numbers = {name for name, (_, dtype) in types.items() if dtype.kind in NUMERIC_KINDS}
-    if (count := sum(math.prod(types[name][0]) for name in numbers)) > MAX_NUMBERS:
-        raise RecordingError(f"declares {count} numbers, give at most {MAX_NUMBERS}")
-    _check_sizes(archive, {name: types[name] for name in numbers})
-    found: dict[str, np.ndarray] = {}
-    for entry in archive.infolist():
-        name = _entry_name(entry)
-        shape, dtype = types[name]
-        found[name] = np.empty(0, dtype)
-        if name in numbers:
-            values = scratch_arrays.empty_array(math.prod(shape), 1)[:, 0]
-            fortran = _read_array(archive, entry, types, values)
-            found[name] = values.reshape(shape, order="F" if fortran else "C")
-    return found
-
-
-def _check_sizes(
-    archive: zipfile.ZipFile, types: Mapping[str, tuple[tuple[int, ...], np.dtype]]
-) -> None:
+def _check_sizes(archive: zipfile.ZipFile, types: Mapping[str, _Header]) -> None:
     """Compare the sizes in the headers with the actual ones."""
     for entry in archive.infolist():
-        shape, dtype = types.get(_entry_name(entry), ((0,), np.dtype(float)))
+        shape, _, dtype = types.get(_entry_name(entry), ((0,), False, np.dtype(float)))
         if entry.file_size < math.prod(shape) * dtype.itemsize:
             raise RecordingError(f"'{_entry_name(entry)}' is cut short, save the file again")
 
 
-def _read_array(
-    archive: zipfile.ZipFile,
-    entry: zipfile.ZipInfo,
-    types: Mapping[str, tuple[tuple[int, ...], np.dtype]],
-    values: Array,
-) -> bool:
-    """Read the numbers of an array; returns whether it is in Fortran order."""
+def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, values: Array) -> None:
+    """Fill an array (N,) with the numbers of an entry."""
+    name = _entry_name(entry)
     with archive.open(entry) as file:
-        np.lib.format.read_magic(file)
-        _, fortran, _ = np.lib.format.read_array_header_1_0(file)
-        _read_column(_entry_name(entry), file, types[_entry_name(entry)][1], values)
-    return bool(fortran)
-
-
-def _entry_name(entry: zipfile.ZipInfo) -> str:
-    return entry.filename.removesuffix(".npy")
-
-
-def _read_header(name: str, file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
-    """Shape and type of an array from its header; the data follow in the file."""
-    try:
-        if np.lib.format.read_magic(file) != (1, 0):  # other versions have long headers
-            raise ValueError("not of numbers alone")
-        shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-    except (*_DAMAGE_ERRORS, OSError):
-        raise
-    except Exception as error:  # any error from evaluating a literal
-        raise ValueError(type(error).__name__) from None
-    if any(length < 0 for length in shape):
-        raise RecordingError(f"'{name}' has the shape {shape}, save the file again")
-    return shape, dtype
+        _read_column(name, file, _read_header(name, file)[2], values)
 
 
 def _read_column(name: str, file: IO[bytes], dtype: np.dtype, column: Array) -> None:
-    """Fill a column (N,)."""
     for start in range(0, len(column), _BLOCK_NUMBERS):
         part = column[start : start + _BLOCK_NUMBERS]
         data = file.read(len(part) * dtype.itemsize)
@@ -196,3 +161,22 @@ def _read_column(name: str, file: IO[bytes], dtype: np.dtype, column: Array) -> 
             part[:] = np.frombuffer(data, dtype)
     if file.read(1):
         raise RecordingError(f"'{name}' holds more than it declares, save the file again")
+
+
+def _entry_name(entry: zipfile.ZipInfo) -> str:
+    return entry.filename.removesuffix(".npy")
+
+
+def _read_header(name: str, file: IO[bytes]) -> _Header:
+    """The header of an array; the data follow in the file."""
+    try:
+        if np.lib.format.read_magic(file) != (1, 0):  # other versions have long headers
+            raise ValueError("not of numbers alone")
+        shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
+    except (*_DAMAGE_ERRORS, OSError):
+        raise
+    except Exception as error:  # any error from evaluating a literal
+        raise ValueError(type(error).__name__) from None
+    if any(length < 0 for length in shape):
+        raise RecordingError(f"'{name}' has the shape {shape}, save the file again")
+    return shape, is_fortran, dtype

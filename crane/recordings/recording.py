@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from crane.common import scratch_arrays
-from crane.common.errors import InputError, RecordingError, prefix_location, suggest_names
+from crane.common.errors import InputError, RecordingError, check_name, suggest_names
 from crane.common.one_line_repr import format_count
 from crane.common.result import Result
 from crane.common.samples import Array, as_number, as_seed
@@ -37,8 +37,11 @@ from crane.description.sensors import FORCE_UNITS as FORCE_UNITS
 from crane.description.sensors import VELOCITY_SUFFIX as VELOCITY_SUFFIX
 from crane.description.sensors import VELOCITY_UNITS as VELOCITY_UNITS
 from crane.recordings import table_reader, timeseries
-from crane.recordings.recording_columns import (
+from crane.recordings.timeseries import (
+    TIME,
+    Table,
     check_finite,
+    check_unit,
     checked_array,
     free_force_message,
     matching_units,
@@ -46,7 +49,6 @@ from crane.recordings.recording_columns import (
     require_active_joints,
     time_derivative,
 )
-from crane.recordings.timeseries import TIME, Table, check_unit
 
 # before the name of the quantity that a channel is the reference of
 REFERENCE_PREFIX = "reference_"
@@ -109,19 +111,13 @@ class Recording(Result):
         count = np.size(self.time)
         shape = (count, len(joints))
         for name in self.channel_units:
-            if name not in self.channels:
-                raise RecordingError(
-                    f"unit of the channel '{name}', {suggest_names(self.channels, name)}"
-                )
+            check_name(name, self.channels, f"unit of the channel '{name}'", RecordingError)
         if set(self.units) != set(joints):
             raise RecordingError(
                 f"units are for {quoted_list(self.units)}, give {quoted_list(joints)}"
             )
         for name in self.free:
-            if name not in joints:
-                raise RecordingError(
-                    f"free joint '{name}' is not recorded, {suggest_names(joints, name)}"
-                )
+            check_name(name, joints, f"free joint '{name}' is not recorded", RecordingError)
         checked = {
             "joints": joints,
             "free": tuple(x for x in joints if x in self.free),
@@ -151,8 +147,7 @@ class Recording(Result):
                 f"channels {quoted_list(self.channels)} hold an active joint, "
                 f"rename those that end in {VELOCITY_SUFFIX} and {FORCE_SUFFIX}"
             )
-        units = self._column_units()
-        for name, unit in units.items():
+        for name, unit in self._column_units().items():
             timeseries.check_column_name(name, unit)
         for name in ("machine", "task", "controller", "machine_name", "stopped", "start"):
             text = getattr(self, name)
@@ -165,8 +160,7 @@ class Recording(Result):
         for i, joint in enumerate(self.joints):
             if joint in self.free and self.tau[:, i].any():
                 raise RecordingError(free_force_message(joint, self.tau[:, i]))
-        arrays = (self.time, self.q, self.v, self.tau, *self.channels.values())
-        for values in arrays:
+        for values in (self.time, self.q, self.v, self.tau, *self.channels.values()):
             scratch_arrays.release_pages()
             if not np.isfinite(values).all():
                 check_finite(self.columns())
@@ -190,7 +184,6 @@ class Recording(Result):
         )
 
     def _column_names(self) -> list[str]:
-        """Names of all columns in the order of a file."""
         joints = [x + suffix for suffix in ("", VELOCITY_SUFFIX) for x in self.joints]
         return [TIME, *joints, *(x + FORCE_SUFFIX for x in self._driven_joints), *self.channels]
 
@@ -226,10 +219,7 @@ class Recording(Result):
                 f"a recording's columns go by names such as '{TIME}', give one; samples are "
                 "chosen by 'between' and 'at'"
             )
-        if name not in columns:
-            raise InputError(
-                f"column '{name}' is not in the recording, {suggest_names(columns, name)}"
-            )
+        check_name(name, columns, f"column '{name}' is not in the recording")
         return columns[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -284,15 +274,12 @@ class Recording(Result):
         columns, rng = self.columns(), np.random.default_rng(as_seed(seed))
         del columns[TIME]
         for name, deviation in deviations.items():
-            if name not in columns:
-                raise InputError(f"noise of the column '{name}', {suggest_names(columns, name)}")
+            check_name(name, columns, f"noise of the column '{name}'")
             if as_number(deviation, f"the noise of '{name}'", "") < 0:
                 raise InputError(
                     f"the noise of '{name}' is {deviation:g}, it must not be negative"
                 )
-        for name in [
-            name for name in columns if name in deviations
-        ]:  # independent of the order of the argument
+        for name in [name for name in columns if name in deviations]:  # in the order of columns
             columns[name] = columns[name] + deviations[name] * rng.normal(size=len(self.time))
         for joint in self.joints:
             if joint + VELOCITY_SUFFIX not in deviations:
@@ -307,8 +294,14 @@ class Recording(Result):
             for name in self.channels
             if name in deviations or not name.endswith((VELOCITY_SUFFIX, _ACCELERATION_SUFFIX))
         }
-        units = {name: self.channel_units[name] for name in channels}
-        return replace(self, q=q, v=v, tau=tau, channels=channels, channel_units=units)
+        return replace(
+            self,
+            q=q,
+            v=v,
+            tau=tau,
+            channels=channels,
+            channel_units={name: self.channel_units[name] for name in channels},
+        )
 
     def error(self, joint: str) -> Array:
         """Tracking error (N,) of a joint [rad], [m]: reference minus coordinate.
@@ -350,20 +343,17 @@ class Recording(Result):
         timeseries.write_npz(path, self._column_units(), columns, self._notes())
 
     def _notes(self) -> dict[str, str]:
+        is_name_of_file = self.machine_name == Path(without_changes(self.machine)).stem
+        optional = {
+            MACHINE_NAME_NOTE: "" if is_name_of_file else self.machine_name,
+            "controller": self.controller,
+            SENSORS_NOTE: IDEAL_SENSORS if self.ideal else "",
+            FREE_JOINTS_NOTE: ", ".join(self.free),
+            STOPPED: self.stopped,
+            START: self.start,
+        }
         notes = {"crane recording": "", "machine": self.machine, "task": self.task}
-        if self.machine_name not in ("", Path(without_changes(self.machine)).stem):
-            notes[MACHINE_NAME_NOTE] = self.machine_name
-        if self.controller:
-            notes["controller"] = self.controller
-        if self.ideal:
-            notes[SENSORS_NOTE] = IDEAL_SENSORS
-        if self.free:
-            notes[FREE_JOINTS_NOTE] = ", ".join(self.free)
-        if self.stopped:
-            notes[STOPPED] = self.stopped
-        if self.start:
-            notes[START] = self.start
-        return notes
+        return notes | {key: text for key, text in optional.items() if text}
 
     @classmethod
     def from_csv(cls, path: str | Path) -> "Recording":
@@ -391,10 +381,8 @@ class Recording(Result):
         Raises:
             RecordingError: A column is missing, has a wrong unit, or is not valid in a recording.
         """
-        try:
+        with timeseries.located_errors(path):
             return cls._from_table(table)
-        except RecordingError as error:
-            raise RecordingError(prefix_location(str(path), error)) from None
 
     @classmethod
     def _from_table(cls, table: Table) -> "Recording":

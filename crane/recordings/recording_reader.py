@@ -19,7 +19,7 @@ from crane.common.errors import (
     CraneWarning,
     InputError,
     RecordingError,
-    prefix_location,
+    check_name,
     suggest_names,
 )
 from crane.description.sensors import (
@@ -37,7 +37,7 @@ from crane.description.sensors import quantity_names as quantity_names
 from crane.machine.machine import Machine
 from crane.recordings import logs, table_reader
 from crane.recordings.recording import IDEAL_SENSORS, SENSORS_NOTE
-from crane.recordings.timeseries import Table, table_column
+from crane.recordings.timeseries import Table, located_errors, table_column
 
 _ALIKE = 0.7  # similarity from which a name counts as a misspelling
 
@@ -74,13 +74,11 @@ def quantities_from_readings(
     table: Table, path: str | Path, machine: Machine | None, span: TimeSpan
 ) -> Table:
     """Correct readings of a file, and select a time span."""
-    try:
+    with located_errors(path):
         known = known_sensors(table, machine)
         if known and machine is not None:
             _warn_conflicting_notes(table, machine)
         table = correct_readings(table, known)
-    except RecordingError as error:
-        raise RecordingError(prefix_location(str(path), error)) from None
     return select_time_span(table, span, path)
 
 
@@ -110,13 +108,6 @@ def read_sensor_readings(
 
 
 def _check_names(machine: Machine, table: Table, columns: str | Path) -> None:
-    """Check that no column misspells the name of a quantity of the machine.
-
-    Other columns are channels and may have any name.
-
-    Raises:
-        RecordingError: A column does.
-    """
     names = quantity_names(machine.tree)
     nodes = [] if machine.hydraulics is None else machine.hydraulics.node_names
     # similar to the names of cylinder pressures
@@ -148,7 +139,6 @@ def _likeness(one: str, two: str) -> float:
 def _read_machine_log(
     path: Path, machine: Machine, sensors: Mapping[str, Sensor], arrays: Mapping[str, np.ndarray]
 ) -> Table:
-    """Table of a log whose columns the sensors of a machine define."""
     lines, missing_sensors = [], []
     for quantity, sensor in sensors.items():
         unit = sensor.unit or quantity_unit(machine.tree, quantity) or ""
@@ -162,13 +152,15 @@ def _read_machine_log(
         else:
             missing_sensors.append(f"'{quantity}' (no '{missing[0]}')")
     if missing_sensors:
-        text = (
+        warnings.warn(
             f"{path}: the log does not have all of the machine's sensors: "
-            f"{', '.join(missing_sensors)}"
+            f"{', '.join(missing_sensors)}",
+            CraneWarning,
+            stacklevel=4,
         )
-        warnings.warn(text, CraneWarning, stacklevel=4)
-    notes = {"machine": machine.load_expression}
-    return logs.assemble_table(path, machine.path, arrays, lines, notes)
+    return logs.assemble_table(
+        path, machine.path, arrays, lines, {"machine": machine.load_expression}
+    )
 
 
 def known_sensors(table: Table, machine: Machine | None = None) -> dict[str, Sensor]:
@@ -187,7 +179,6 @@ def known_sensors(table: Table, machine: Machine | None = None) -> dict[str, Sen
 
 
 def _sensor_notes(table: Table) -> dict[str, float]:
-    """Sensor parameters in the notes."""
     parameters = {}
     for name, text in table.notes.items():
         if not name.startswith(SENSOR_PREFIX):
@@ -195,10 +186,8 @@ def _sensor_notes(table: Table) -> dict[str, float]:
         try:
             quantity, _ = parse_sensor_parameter(name)
             parameters[name] = float(text)
-            if quantity not in table.units:
-                raise RecordingError(
-                    f"the note '{name}' is of no column, {suggest_names(table.units, quantity)}"
-                )
+            problem = f"the note '{name}' is of no column"
+            check_name(quantity, table.units, problem, RecordingError)
         except InputError as error:
             raise RecordingError(f"the note {error}") from None
         except ValueError:
@@ -207,7 +196,6 @@ def _sensor_notes(table: Table) -> dict[str, float]:
 
 
 def _warn_conflicting_notes(table: Table, machine: Machine) -> None:
-    """Warn of sensor parameters that differ between machine and recording."""
     machine_parameters = sensor_parameters(machine.sensors)
     messages = [
         f"{name} ({value:g}, not {machine_parameters[name]:g})"
@@ -217,8 +205,11 @@ def _warn_conflicting_notes(table: Table, machine: Machine) -> None:
         not in (value, getattr(Sensor(), parse_sensor_parameter(name)[1]))
     ]
     if messages:
-        text = f"notes of the recording count, not the machine's sensors: {', '.join(messages)}"
-        warnings.warn(text, CraneWarning, stacklevel=4)
+        warnings.warn(
+            f"notes of the recording count, not the machine's sensors: {', '.join(messages)}",
+            CraneWarning,
+            stacklevel=4,
+        )
 
 
 def correct_readings(table: Table, sensors: Mapping[str, Sensor]) -> Table:

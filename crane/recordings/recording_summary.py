@@ -74,16 +74,10 @@ class RecordingSummary:
 
     def to_markdown(self) -> str:
         """Table with one row per joint, in degrees and millimetres, and remarks below it."""
-        head = (
-            "joint",
-            "range",
-            "peak speed",
-            "peak force",
-            "RMS force",
-            "peak error",
-            "RMS error",
-        )
-        rows = [head, ("---",) + ("---:",) * (len(head) - 1)]
+        rows: list[tuple[str, ...]] = [
+            ("joint", "range", "peak speed", "peak force", "RMS force", "peak error", "RMS error"),
+            ("---", *["---:"] * 6),
+        ]
         for joint in self.joints:
             unit, scale = DISPLAY_UNITS[joint.unit]
             force = FORCE_UNITS[joint.unit]
@@ -144,12 +138,8 @@ def _lift_time(time: Array, force: Array) -> float | None:
     """Time [s] at which a support with contact force (N,) lifts, None if it does not."""
     is_lifted = (force <= 0) & np.maximum.accumulate(force > 0)
     edges = np.flatnonzero(np.diff(is_lifted.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
-    lift_starts = [
-        first
-        for first, behind in edges.tolist()
-        if time[behind - 1] - time[first] > _MIN_LIFT_DURATION
-    ]
-    return float(time[lift_starts[0]]) if lift_starts else None
+    starts = (a for a, b in edges.tolist() if time[b - 1] - time[a] > _MIN_LIFT_DURATION)
+    return next((float(time[first]) for first in starts), None)
 
 
 def _stability_text(recording: Recording) -> str:
@@ -161,8 +151,7 @@ def _stability_text(recording: Recording) -> str:
         f"stability: at least {100 * shares[least]:.1f} % of the weight hold it down, at t = "
         f"{recording.time[least]:.4g} s (at rest {100 * static_shares.min():.1f} %)"
     )
-    tipping_text = tipping_message(recording)
-    return f"{text}; {tipping_text}" if tipping_text else text
+    return "; ".join(filter(None, (text, tipping_message(recording))))
 
 
 def result_title(machine: str, what: str = "") -> str:
@@ -211,13 +200,16 @@ def summarize(recording: Recording) -> RecordingSummary:
             )
         )
     distance = tip_error(recording)
+    gaps = ("", energy_imbalance(recording)), ("of the oil ", oil_energy_imbalance(recording))
     return RecordingSummary(
         duration=float(time[-1] - time[0]),
         joints=tuple(joints),
         tip_peak_error=None if distance is None else _peak(distance),
         tip_rms_error=None if distance is None else rms(time, distance),
         stability_text=_stability_text(recording),
-        balance_text=_balance_text(recording),
+        balance_text=", ".join(
+            f"{what}off by at most {_peak(gap):.2g} J" for what, gap in gaps if gap is not None
+        ),
         ringing=limit_cycle_message(recording),
         stopped=recording.stopped,
         start=recording.start,
@@ -257,16 +249,6 @@ def _energy_difference(
         ],
         len(recording.time),
     )[:, 0]
-
-
-def _balance_text(recording: Recording) -> str:
-    balances = (
-        ("", energy_imbalance(recording)),
-        ("of the oil ", oil_energy_imbalance(recording)),
-    )
-    return ", ".join(
-        f"{what}off by at most {_peak(gap):.2g} J" for what, gap in balances if gap is not None
-    )
 
 
 def point_channel(recording: Recording, name: str) -> Array | None:
@@ -356,10 +338,12 @@ def joint_differences(recording: Recording, other: Recording) -> list[JointDiffe
             np.interp(time, shifted_time, other.q[:, other.joints.index(joint)]) - one
         )
         largest_index = int(distance.argmax())
-        unit = recording.units[joint]
         found.append(
             JointDifference(
-                joint, unit, float(distance[largest_index]), float(time[largest_index])
+                joint,
+                recording.units[joint],
+                float(distance[largest_index]),
+                float(time[largest_index]),
             )
         )
     return found

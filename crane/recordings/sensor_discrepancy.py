@@ -22,8 +22,12 @@ from crane.description.sensors import (
     quantity_unit,
 )
 from crane.machine.machine import Machine
-from crane.recordings.measured_configurations import MeasuredConfigurations, add_inclination_angles
-from crane.recordings.missing_measurements import AGREEMENT_TOLERANCE, tolerance
+from crane.recordings.measured_configurations import (
+    AGREEMENT_TOLERANCE,
+    MeasuredConfigurations,
+    add_inclination_angles,
+    tolerance,
+)
 from crane.recordings.recording_reader import known_sensors
 from crane.recordings.timeseries import TIME, Table, table_column
 
@@ -53,30 +57,24 @@ def warn_discrepancies(machine: Machine, table: Table) -> None:
     known = known_sensors(table, machine)
     try:
         configurations = MeasuredConfigurations(machine, add_inclination_angles(machine, table))
-        sensors = [
-            _RedundantSensor(configurations, name)
-            for name in _redundant_columns(machine, table, configurations.drives)
-        ]
         messages = [
-            text
-            for pair in sensors
-            if (text := pair.discrepancy_message(known, list(table.units)))
+            _RedundantSensor(configurations, name).discrepancy_message(known, list(table.units))
+            for name in _redundant_columns(machine, table, configurations.drives)
         ]
     except (ClosureError, MechanismError):  # the caller reports that loops do not close
         return
-    for text in messages:
+    for text in filter(None, messages):
         warnings.warn(text, CraneWarning, stacklevel=3)
 
 
 def _redundant_columns(machine: Machine, table: Table, drives: tuple[str, ...]) -> list[str]:
-    """Redundant columns, in units of the machine, that the determining joints give as well."""
-    found = []
-    for name, unit in table.units.items():
-        base = name.removesuffix(VELOCITY_SUFFIX)
-        is_determined = base in machine.joints or base.startswith(INCLINATION_PREFIX)
-        if is_determined and name not in drives and unit == quantity_unit(machine.tree, name):
-            found.append(name)
-    return found
+    names = [x for x, unit in table.units.items() if unit == quantity_unit(machine.tree, x)]
+    determined = {*machine.joints, *(x + VELOCITY_SUFFIX for x in machine.joints)}
+    return [
+        x
+        for x in names
+        if x not in drives and (x in determined or x.startswith(INCLINATION_PREFIX))
+    ]
 
 
 @dataclass(frozen=True)
@@ -125,13 +123,15 @@ class _RedundantSensor:
         self.quantity = name.removesuffix(VELOCITY_SUFFIX)
         self.is_rate = self.quantity != name
         self.unit = str(quantity_unit(configurations.machine.tree, self.quantity))
+        from scipy.integrate import cumulative_trapezoid
+
         reading, random_walk = table_column(configurations.table, name), 0.0
         if self.is_rate:
             time = table_column(configurations.table, TIME)
             random_walk = (
                 noise_std(reading) * float(time[-1] - time[0]) / float(np.sqrt(len(time)))
             )
-            reading = _integral(time, reading)
+            reading = cumulative_trapezoid(reading, time, initial=0)
         self.measured = reading[configurations.sample_slice]
         self.expected = configurations.expected_reading(self.quantity)
         self.off = self.measured - self.expected
@@ -163,7 +163,7 @@ class _RedundantSensor:
         if self.is_rate and not cause:
             return ""  # integrals of rates drift for many reasons
         unit, factor = _DISPLAY_UNITS[self.unit]
-        used = ", ".join(self._determining_joints)
+        used = ", ".join(self._determining_joints())
         if self.is_rate:
             drift_rate = factor * float(self._fit_discrepancy([self.time])[0][0])
             return (
@@ -176,22 +176,20 @@ class _RedundantSensor:
             f"({low:+.3g} to {high:+.3g} over the motion) against {used}: {cause}"
         )
 
-    @property
     def _determining_joints(self) -> list[str]:
-        """Determining joints that the reading depends on."""
         configurations = self._configurations
         q = configurations.q[configurations.derivative_slice]
-        gamma = configurations.machine.closure.gamma(q)
-        derivatives = [
-            configurations.directional_derivative(self.quantity, q, g)
-            for g in np.moveaxis(gamma, 2, 0)
-        ]
-        pairs = zip(configurations.machine.active, derivatives, strict=True)
+        gamma = np.moveaxis(configurations.machine.closure.gamma(q), 2, 0)
+        slopes = [configurations.directional_derivative(self.quantity, q, g) for g in gamma]
+        pairs = zip(configurations.machine.active, slopes, strict=True)
         return [joint for joint, slope in pairs if np.abs(slope).max() > _ZERO_DERIVATIVE]
 
     def _explanation(self, known: Mapping[str, Sensor], measured_columns: Sequence[str]) -> str:
         """Text of the cause; "" for a rate without a cause."""
-        own_zero, explanation_limit = self._zero_cause(), self.limit
+        values, residual_rms = self._fit_discrepancy([self._zero_column])
+        own_zero = _DiscrepancyCause(
+            {self.name: {"zero": float(values[0])}}, residual_rms, "a constant offset"
+        )
         zeros = sorted(
             [own_zero, *self._drive_zero_causes(measured_columns)], key=lambda x: x.residual_rms
         )
@@ -200,7 +198,7 @@ class _RedundantSensor:
             if zeros[0].residual_rms < _IMPROVEMENT_SHARE * own_zero.residual_rms
             else own_zero
         )
-        if zeros[0].residual_rms <= explanation_limit:
+        if zeros[0].residual_rms <= self.limit:
             detection_limit = max(_EQUIVALENT_FACTOR * zeros[0].residual_rms, 0.2 * self.tolerance)
             named = " or ".join(
                 x.format_parameters(known) for x in zeros if x.residual_rms <= detection_limit
@@ -215,14 +213,14 @@ class _RedundantSensor:
             [*self._scale_and_delay_causes(), *self._pin_causes()], key=lambda x: x.residual_rms
         )
         if self.is_rate:
-            other_causes = [x for x in other_causes if x.residual_rms <= explanation_limit]
+            other_causes = [x for x in other_causes if x.residual_rms <= self.limit]
             return self._format_causes([zero, other_causes[0]], known) if other_causes else ""
         if absolute_angle := self._absolute_angle_hint(zero):
             return absolute_angle
         detection_limit = (
             min(
                 _IMPROVEMENT_SHARE * zero.residual_rms,
-                max(explanation_limit, _NEAR_BEST_FACTOR * other_causes[0].residual_rms),
+                max(self.limit, _NEAR_BEST_FACTOR * other_causes[0].residual_rms),
             )
             if other_causes
             else 0.0
@@ -261,12 +259,6 @@ class _RedundantSensor:
         """Change (N,) of the reading per zero."""
         return self.time - self.time[0] if self.is_rate else np.ones_like(self.time)
 
-    def _zero_cause(self) -> _DiscrepancyCause:
-        values, residual_rms = self._fit_discrepancy([self._zero_column])
-        return _DiscrepancyCause(
-            {self.name: {"zero": float(values[0])}}, residual_rms, "a constant offset"
-        )
-
     def _scale_and_delay_causes(self) -> list[_DiscrepancyCause]:
         """Causes: a zero with a scale, and a zero with a delay."""
         if np.ptp(self.expected) < _MIN_MOTION_FACTOR * self.tolerance:
@@ -293,8 +285,7 @@ class _RedundantSensor:
     def _drive_zero_causes(self, measured_columns: Sequence[str]) -> list[_DiscrepancyCause]:
         """Causes: zeros of the determining joints, one at a time, by the Gauss-Newton method."""
         found = []
-        drives = self._configurations.machine.active
-        for i, joint in enumerate(drives if not self.is_rate else ()):
+        for i, joint in enumerate(self._configurations.machine.active if not self.is_rate else ()):
             if joint not in measured_columns:
                 continue
             zero, residual_rms = 0.0, np.inf
@@ -330,31 +321,23 @@ class _RedundantSensor:
             configurations.q[configurations.derivative_slice],
             self.time[configurations.derivative_slice],
         )
+        positions = {x.child: x.xyz for x in configurations.machine.tree.joints.values()}
         found: dict[str, list[tuple[float, _DiscrepancyCause]]] = {}
         for name, dq in configurations.pin_derivatives.items() if not self.is_rate else ():
             sampled_derivative = configurations.directional_derivative(self.name, q, dq)
             if np.abs(sampled_derivative).max() < _ZERO_DERIVATIVE:
                 continue
             link, _, axis = name.rpartition(".")
-            position = configurations.link_positions[link]["xyz".index(axis)]
             derivative = np.interp(self.time, time, sampled_derivative)
             (move, zero), residual_rms = self._fit_discrepancy([derivative, self._zero_column])
             (move_alone,), residual_without_zero = self._fit_discrepancy([derivative])
+            zero_parameters = {self.name: {"zero": float(zero)}}
+            description = "a pin elsewhere besides"
             if residual_without_zero <= max(_NEAR_BEST_FACTOR * residual_rms, self.limit):
-                move, zero_parameters, residual_rms, description = (
-                    move_alone,
-                    {},
-                    residual_without_zero,
-                    "a pin elsewhere alone",
-                )
-            else:
-                zero_parameters, description = (
-                    {self.name: {"zero": float(zero)}},
-                    "a pin elsewhere besides",
-                )
-            cause = _DiscrepancyCause(
-                zero_parameters, residual_rms, description, {name: float(position + move)}
-            )
+                move, residual_rms = move_alone, residual_without_zero
+                zero_parameters, description = {}, "a pin elsewhere alone"
+            position = float(positions[link]["xyz".index(axis)] + move)
+            cause = _DiscrepancyCause(zero_parameters, residual_rms, description, {name: position})
             found.setdefault(link, []).append((abs(float(move)), cause))
         return [_smallest_pin_move(causes, self.limit) for causes in found.values()]
 
@@ -405,9 +388,3 @@ def _smallest_pin_move(
 def noise_std(x: Array) -> float:
     """Standard deviation of white noise on a smooth signal (N,), by its second differences."""
     return float(np.median(np.abs(np.diff(x, 2)))) / 1.65 if len(x) > 2 else 0.0
-
-
-def _integral(time: Array, rate: Array) -> Array:
-    """Integral (N,) of a rate (N,) by the trapezoidal rule."""
-    steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)
-    return np.concatenate([[0.0], np.cumsum(steps)])

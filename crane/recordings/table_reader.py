@@ -11,14 +11,13 @@ import itertools
 import os
 import stat
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
 from crane.common import scratch_arrays
-from crane.common.errors import RecordingError, prefix_location
+from crane.common.errors import RecordingError
 from crane.common.samples import Array
 from crane.common.units import SI_CONVERSIONS, accepted_units
 from crane.description.sensors import TIME
@@ -29,10 +28,10 @@ from crane.recordings.timeseries import (
     Table,
     check_column_name,
     check_unit,
+    located_errors,
     parse_heading,
 )
 
-T = TypeVar("T")
 _UTF8_ENCODING = "utf-8-sig"  # with or without a byte order mark
 _BLOCK_BYTES = 1 << 20  # bytes of a block, and largest length of a line
 _MAX_HEADING_LENGTH, _MAX_NAME_LENGTH = 1 << 16, 200  # characters
@@ -63,7 +62,7 @@ def read_csv(path: str | Path) -> Table:
             line or column, and the remedy.
     """
     path = Path(path)
-    try:
+    with located_errors(path, "the path of a CSV file"):
         check_regular_file(path)
         lines = _count_lines(path)
         notes, heading, line = _read_header(path)
@@ -79,13 +78,6 @@ def read_csv(path: str | Path) -> Table:
         return _convert_to_si(
             Table(units, values, {key: x for key, x in notes.items() if key != SAMPLE_COUNT_NOTE})
         )
-    except RecordingError as error:
-        raise RecordingError(prefix_location(str(path), error)) from None
-    except UnicodeDecodeError:
-        raise RecordingError(f"{path}: is not text, give a CSV in UTF-8") from None
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise RecordingError(f"{path}: {reason}, give the path of a CSV file") from None
 
 
 def read_npz(path: Path) -> Table:
@@ -94,9 +86,11 @@ def read_npz(path: Path) -> Table:
     Raises:
         RecordingError: The file does not exist, or as for `crane.recordings.npz.read_columns`.
     """
-    names, values, comment = _read_npz_file(path, read_columns)
+    with located_errors(path, "the path of an npz file"):
+        check_regular_file(path)
+        names, values, comment = read_columns(path)
     lines = (line.strip() for line in comment.splitlines())
-    return _build_table(
+    return build_table(
         path, names, values, dict(_parse_note(x) for x in lines if x.startswith("#"))
     )
 
@@ -111,64 +105,41 @@ def read_log_arrays(path: Path) -> dict[str, np.ndarray]:
     Raises:
         RecordingError: The file does not exist or is not valid.
     """
-    if path.suffix.lower() == ".npz":
-        return _read_npz_file(path, read_arrays)
-    try:
+    with located_errors(path, "the path of a CSV or npz file"):
         check_regular_file(path)
+        if path.suffix.lower() == ".npz":
+            return read_arrays(path)
         _count_lines(path)
         encoding = _detect_encoding(path)
         notes, heading, line = _read_header(path, encoding)
         _check_last_line(path, notes, encoding)
         separator = max(",;\t", key=heading.count)
-        names = [cell.strip() for cell in next(csv.reader([heading], delimiter=separator))]
-        values = _read_log_values(
-            lambda: _log_rows(path, encoding, line, separator), line, separator, names
-        )
+        try:
+            names = [cell.strip() for cell in next(csv.reader([heading], delimiter=separator))]
+            values = _read_log_values(
+                lambda: _log_rows(path, encoding, line, separator), line, separator, names
+            )
+        except (ValueError, csv.Error) as error:  # text among the numbers
+            reason = str(error).rstrip(".")
+            raise RecordingError(f"no table of numbers ({reason}), correct it") from None
         _check_sample_count(values, notes)
-    except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from None
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise RecordingError(f"{path}: {reason}, give the path of a CSV or npz file") from None
-    except (ValueError, csv.Error) as error:  # text among the numbers
-        reason = str(error).rstrip(".")
-        raise RecordingError(f"{path}: no table of numbers ({reason}), correct it") from None
-    if values.shape[1] != len(names) or len(set(names)) < len(names):
-        raise RecordingError(
-            f"{path}: {len(set(names))} different names head {values.shape[1]} columns, name each"
-        )
-    return dict(zip(names, values.T, strict=True))
+        if values.shape[1] != len(names) or len(set(names)) < len(names):
+            raise RecordingError(
+                f"{len(set(names))} different names head {values.shape[1]} columns, name each"
+            )
+        return dict(zip(names, values.T, strict=True))
 
 
-def _read_npz_file(path: Path, read: Callable[[Path], T]) -> T:
-    try:
-        check_regular_file(path)
-        return read(path)
-    except RecordingError as error:
-        raise RecordingError(prefix_location(str(path), error)) from None
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise RecordingError(f"{path}: {reason}, give the path of an npz file") from None
-
-
-def table_from_columns(
-    path: Path, columns: Mapping[str, np.ndarray], notes: dict[str, str]
-) -> Table:
-    """Table in SI units of arrays (N,) named 'name [unit]'; the path is for messages.
+def build_table(path: Path, names: Iterable[str], values: Array, notes: dict[str, str]) -> Table:
+    """Table in SI units of columns (N, columns) named 'name [unit]'; the path is for messages.
 
     Raises:
         RecordingError: A name is no valid heading.
     """
-    return _build_table(path, list(columns), np.column_stack(list(columns.values())), notes)
-
-
-def _build_table(path: Path, names: Sequence[str], values: Array, notes: dict[str, str]) -> Table:
     heading = io.StringIO()
     csv.writer(heading).writerow(names)
-    try:
+    with located_errors(path):
         return _convert_to_si(Table(_parse_header(heading.getvalue().rstrip()), values, notes))
-    except RecordingError as error:
-        raise RecordingError(prefix_location(str(path), error)) from None
 
 
 def check_regular_file(path: Path) -> None:
@@ -191,8 +162,10 @@ def _count_lines(path: Path) -> int:
             first, last = ends.find(b"\n"), ends.rfind(b"\n")
             line_bytes += first if first >= 0 else len(block)
             if line_bytes > _BLOCK_BYTES:
-                what = f"line {line_count + 1} has more than {_BLOCK_BYTES} bytes"
-                raise RecordingError(f"{what}, write one line per sample")
+                raise RecordingError(
+                    f"line {line_count + 1} has more than {_BLOCK_BYTES} bytes, write one line "
+                    "per sample"
+                )
             line_count += block.count(b"\n") or block.count(b"\r")
             if last >= 0:
                 line_bytes = len(block) - last - 1
@@ -219,10 +192,10 @@ def _check_sample_count(values: Array, notes: Mapping[str, str]) -> None:
     Raises:
         RecordingError: They differ.
     """
-    if SAMPLE_COUNT_NOTE in notes and notes[SAMPLE_COUNT_NOTE] != str(len(values)):
-        said = notes[SAMPLE_COUNT_NOTE][:20]
+    said = notes.get(SAMPLE_COUNT_NOTE, str(len(values)))
+    if said != str(len(values)):
         raise RecordingError(
-            f"has {len(values)} of the {said} samples that it says, {_TRUNCATION_HINT}"
+            f"has {len(values)} of the {said[:20]} samples that it says, {_TRUNCATION_HINT}"
         )
 
 
@@ -234,8 +207,6 @@ def _convert_to_si(table: Table) -> Table:
             units[name], a, b = SI_CONVERSIONS[unit]
             with np.errstate(over="ignore"):  # infinite values are reported with their name later
                 values[:, i] = values[:, i] * a / b
-    for i, name in enumerate(table.units):
-        scratch_arrays.release_pages()
         column = values[:, i]
         is_too_large = np.isfinite(column) & (np.abs(column) > _MAX_VALUE)
         if is_too_large.any():
@@ -248,7 +219,6 @@ def _convert_to_si(table: Table) -> Table:
 
 
 def _detect_encoding(path: Path) -> str:
-    """Text encoding of a log."""
     with path.open("rb") as file:
         if file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
             return "utf-16"
@@ -299,7 +269,6 @@ def _read_header(path: Path, encoding: str = _UTF8_ENCODING) -> tuple[dict[str, 
 
 
 def _parse_note(text: str) -> tuple[str, str]:
-    """Key and value of a line '# key: value'."""
     key, _, value = text.removeprefix("#").partition(":")
     return key.strip(), value.strip()
 
@@ -402,7 +371,6 @@ def _read_log_values(
 def _raise_invalid_cell(
     rows: Iterator[str], header: int, separator: str, names: Sequence[str]
 ) -> None:
-    """Raise an error about the first cell of a log that is not a number."""
     for line, text in enumerate(rows, start=header + 1):
         cells = text.rstrip("\n").split(separator) if text.strip() else []
         for name, cell in zip(names, cells, strict=False):
@@ -421,7 +389,6 @@ def _parse_number(cell: str) -> float | None:
 
 
 def _raise_first_fault(path: Path, header: int, units: Mapping[str, str]) -> None:
-    """Raise an error about the first invalid line."""
     names, last = list(units), -np.inf
     with path.open(encoding=_UTF8_ENCODING) as file:
         for line, text in enumerate(file, start=1):

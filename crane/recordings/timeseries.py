@@ -1,4 +1,4 @@
-"""Tables of time series: columns with names and units, and how they are written.
+"""Tables of time series: columns with names and units, their checks, and how they are written.
 
 A CSV file has comment lines `# key: value`, then one header row `time [s],name [unit],...`, then
 one row per sample. The comment `# crane samples: N` gives the number of samples, so that a
@@ -7,24 +7,34 @@ the fewest digits that give the same float64 again.
 """
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from crane.common import scratch_arrays
 from crane.common.atomic_output import replace_file
-from crane.common.errors import RecordingError
+from crane.common.errors import RecordingError, check_name, prefix_location
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.common.units import accepted_units as accepted_units
+from crane.description.sensors import (
+    FORCE_SUFFIX,
+    FORCE_UNITS,
+    VELOCITY_SUFFIX,
+    VELOCITY_UNITS,
+)
 from crane.description.sensors import TIME as TIME
 from crane.recordings import npz
 
 _NAME_PATTERN = re.compile(r'[^\s,\[\]"#](?:[^,\[\]"]*[^\s,\[\]"])?')
 SAMPLE_COUNT_NOTE = "crane samples"  # note with the number of samples
 BLOCK_ROWS = 4096
+_MAX_LISTED = 40  # names in a message
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -43,14 +53,35 @@ class Table(OneLineRepr):
     notes: dict[str, str]
 
 
+@contextmanager
+def located_errors(path: str | Path, wanted: str = "another file") -> Iterator[None]:
+    """Context in which errors about a file name it.
+
+    Args:
+        path: The file.
+        wanted: What to give instead of a file that cannot be read.
+
+    Raises:
+        RecordingError: The block raises a `RecordingError`, or cannot read the file.
+    """
+    try:
+        yield
+    except RecordingError as error:
+        raise RecordingError(prefix_location(str(path), error)) from None
+    except UnicodeDecodeError:
+        raise RecordingError(f"{path}: is not text, give a file in UTF-8") from None
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise RecordingError(f"{path}: {reason}, give {wanted}") from None
+
+
 def check_column_name(name: str, unit: str) -> None:
     """Check that a header can contain a name and a unit.
 
     Raises:
         RecordingError: They contain invalid characters.
     """
-    words = {"name": name, "unit": unit} if unit else {"name": name}
-    for what, text in words.items():
+    for what, text in ({"name": name, "unit": unit} if unit else {"name": name}).items():
         if not _NAME_PATTERN.fullmatch(text) or not text.isprintable():
             raise RecordingError(
                 f"column '{name}': {text!r} cannot be the {what} of a column, "
@@ -147,3 +178,102 @@ def check_unit(column: str, unit: str, allowed: Iterable[str]) -> None:
         found = f"is in [{unit}]" if unit else "has no unit"
         wanted = " or ".join(f"'{column} [{x}]'" for x in allowed)
         raise RecordingError(f"column '{column}' {found}, give {wanted}")
+
+
+def check_columns_present(required: Iterable[Sequence[str]], present: Collection[str]) -> None:
+    """Check that one of each group of alternative columns is present.
+
+    Raises:
+        RecordingError: Groups are missing; the message lists them.
+    """
+    absent = [" or ".join(map(repr, names)) for names in required if not set(names) & set(present)]
+    if absent:
+        raise RecordingError(f"columns are missing: {', '.join(absent)}")
+
+
+def time_derivative(x: Array, time: Array) -> Array:
+    """Central differences (N,) of x (N,); zero if time does not increase."""
+    if len(x) < 2 or not (np.diff(time) > 0).all():
+        return np.zeros_like(x)
+    return np.asarray(np.gradient(x, time))
+
+
+def check_finite(columns: Mapping[str, Array]) -> None:
+    """Check that columns (N,) contain finite numbers.
+
+    Raises:
+        RecordingError: A column does not.
+    """
+    for name, values in columns.items():
+        if not np.isfinite(values).all():
+            sample = int(np.argmin(np.isfinite(values)))
+            raise RecordingError(
+                f"'{name}' is {values[sample]} at sample {sample}, give finite numbers"
+            )
+
+
+def checked_array(
+    what: str, value: ArrayLike, shape: tuple[int, ...], copy: bool, names: Sequence[str] = ()
+) -> Array:
+    """Convert to a float64 array of a shape, copied to contiguous memory if `copy` is set."""
+    try:
+        order: Literal["C", "K"] = "C" if copy or len(shape) == 1 else "K"
+        array = np.array(value, dtype=np.float64, order=order, copy=copy or None)
+    except (TypeError, ValueError):
+        raise RecordingError(f"{what} is not an array of numbers, give {shape}") from None
+    if array.shape != shape:
+        columns = f", a column each for {quoted_list(names)}" if names else ""
+        raise RecordingError(f"{what} has the shape {array.shape}, give {shape}{columns}")
+    return array
+
+
+def quoted_list(names: Iterable[str]) -> str:
+    """List of quoted names for a message, with at most 40 of them."""
+    names = list(names)
+    more = [f"{len(names) - _MAX_LISTED} more"] if len(names) > _MAX_LISTED else []
+    return ", ".join([f"'{name}'" for name in names[:_MAX_LISTED]] + more) or "none"
+
+
+def free_force_message(joint: str, tau: Array) -> str:
+    """Message about a force (N,) of a free joint that is not zero."""
+    sample = int(np.argmax(tau != 0))
+    return (
+        f"'{joint}' is free and has the force {tau[sample]:.3g} at sample {sample}: leave the "
+        "force out, or name the joint as active"
+    )
+
+
+def require_active_joints(names: Sequence[str], free: Sequence[str]) -> tuple[str, ...]:
+    """Active joints among columns, at least one: those with a force column, and free joints.
+
+    Raises:
+        RecordingError: There is none, or a joint has velocity and force, but no coordinate.
+    """
+    available = set(names)
+    for stem in (x.removesuffix(FORCE_SUFFIX) for x in names if x.endswith(FORCE_SUFFIX)):
+        if stem not in available and stem + VELOCITY_SUFFIX in available:
+            raise RecordingError(
+                f"column '{stem}' is missing beside '{stem}{VELOCITY_SUFFIX}', "
+                f"'{stem}{FORCE_SUFFIX}', add it, or rename those if '{stem}' is not an active "
+                "joint"
+            )
+    for x in free:
+        check_name(x, names, f"column '{x}' of a free joint is missing", RecordingError)
+    joints = tuple(x for x in names if x + FORCE_SUFFIX in available or x in free)
+    if not joints:
+        raise RecordingError(
+            f"no active joint among the columns {quoted_list(names)}, give for each joint "
+            f"its displacement, force and perhaps velocity, as in q1, q1{FORCE_SUFFIX}, "
+            f"q1{VELOCITY_SUFFIX}"
+        )
+    return joints
+
+
+def matching_units(joint: str, units: Mapping[str, str]) -> list[str]:
+    """Units of a joint that match the units of its velocity and force columns."""
+    return [
+        unit
+        for unit, rate in VELOCITY_UNITS.items()
+        if units.get(joint + VELOCITY_SUFFIX, rate) == rate
+        and units.get(joint + FORCE_SUFFIX, FORCE_UNITS[unit]) == FORCE_UNITS[unit]
+    ]

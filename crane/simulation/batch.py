@@ -142,8 +142,7 @@ def simulate_batch(
     failures: dict[int, str] = {}
     # the first one compiles the machine code of the others
     indices = list(range(len(machines)))
-    workers = threads or os.cpu_count() or 1
-    with ThreadPoolExecutor(workers) as pool:
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
         for i, future in _completed_runs(pool, run, (indices[:1], indices[1:])):
             error = future.exception()
             if isinstance(error, CraneError):

@@ -6,9 +6,15 @@ from typing import Any
 
 from crane.closure.kinematics_formulas import FormulaConstants, PositionKinematics
 from crane.closure.loop_formulas import LoopFormulas
-from crane.codegen import Scalar, Tape
 from crane.codegen.casadi_expressions import casadi_expressions
-from crane.codegen.symbolic import add_vectors, matvec, subtract_vectors, transpose
+from crane.codegen.symbolic import (
+    Scalar,
+    Tape,
+    add_vectors,
+    matvec,
+    subtract_vectors,
+    transpose,
+)
 from crane.common.errors import InputError, MechanismError, suggest_names
 from crane.common.optional_libraries import import_optional_library
 from crane.control.valve_commands import ValveSignals
@@ -89,20 +95,17 @@ def casadi_function(
         sizes, arguments, outputs = _dynamics_quantity(machine, quantity, friction)
     symbols = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
     flat = [x for formulas, _ in outputs.values() for x in formulas]
-    inputs = [_casadi_argument(ca, symbols, one) for one in arguments]
+    # arguments of the tape: numbers, or the symbols named in a tuple
+    inputs = [
+        [x for name in one for x in ca.vertsplit(symbols[name])] if isinstance(one, tuple) else one
+        for one in arguments
+    ]
     values, results = casadi_expressions(flat, inputs), []
     for formulas, shape in outputs.values():
         part = ca.vertcat(*values[: len(formulas)]) if formulas else ca.SX(0, 1)
         values = values[len(formulas) :]
         results.append(ca.reshape(part, shape[1], shape[0]).T if len(shape) == 2 else part)
     return ca.Function(quantity, list(symbols.values()), results, list(sizes), list(outputs))
-
-
-def _casadi_argument(ca: Any, symbols: dict[str, Any], argument: Any) -> Any:
-    """An argument of the tape: numbers, or the symbols named in a tuple."""
-    if not isinstance(argument, tuple):
-        return argument
-    return [x for name in argument for x in ca.vertsplit(symbols[name])]
 
 
 def _dynamics_quantity(
@@ -125,11 +128,13 @@ def _dynamics_quantity(
     formulas = QUANTITIES[quantity.replace("_", " ") + WITH_FRICTION * friction](
         dynamics_formulas, x
     )
-    zeros = [0.0] * n
     arguments = [geometry, ("q",), dynamics.formula_constants, *((name,) for name in names)]
-    arguments += [zeros] * (2 - len(names))
-    sizes = {"q": len(q)} | dict.fromkeys(names, n)
-    return sizes, arguments, {quantity: (formulas, dynamics.result_shape(quantity))}
+    arguments += [[0.0] * n] * (2 - len(names))
+    return (
+        {"q": len(q)} | dict.fromkeys(names, n),
+        arguments,
+        {quantity: (formulas, dynamics.result_shape(quantity))},
+    )
 
 
 def _kinematic_quantity(
@@ -168,17 +173,11 @@ def _simulation_quantity(machine: Machine) -> tuple[dict[str, int], list[Any], F
         state_layout(machine, drive.circuit.state_count),
     )
     tape, m = Tape(), len(drive.circuit.spools)
-    formulas = trace_machine(chart, tape, layout, 4, [])
     # zeros among the settings are features that the circuit does not have
-    inputs = formulas.controller_inputs(
-        controller_settings(drive, tape, 2, True), tape.load_vector(3, 0, m)
-    )
-    tau, rates = drive.trace(inputs)
-    formulas = formulas.with_circuit_friction(drive, inputs)
-    accelerations, stiff_state_count = (
-        formulas.accelerations(tau, with_joints_at_rest=False),
-        drive.circuit.stiff_state_count,
-    )
+    settings = controller_settings(drive, tape, 2, True)
+    formulas = trace_machine(chart, drive, tape, layout, 4, tape.load_vector(3, 0, m), settings)
+    rates, stiff_state_count = formulas.controller_rate, drive.circuit.stiff_state_count
+    accelerations = formulas.accelerations(with_joints_at_rest=False)
     numbers = (
         machine.closure.compiled_closure.geometry.constants,
         chart.dynamics.formula_constants,

@@ -137,10 +137,10 @@ def record_run(
     """
     active = machine.closure.active
     q_a = scratch_arrays.compute_in_blocks(lambda part: rows.q[part][:, active], len(time))
-    channels: dict[str, Array] = {}
-    units: dict[str, str] = {}
-    for name, values, unit in _channel_columns(machine, control, time, rows):
-        channels[name], units[name] = values, unit
+    columns = list(_channel_columns(machine, control, time, rows))
+    controller = "" if isinstance(control, ZeroForce) else type(control).__name__
+    if isinstance(control, ValveDrive):
+        controller = getattr(control.command, "title", type(control.command).__name__)
     return Recording(
         time=time,
         joints=machine.active,
@@ -148,11 +148,11 @@ def record_run(
         v=rows.v_a,
         tau=rows.tau,
         units={joint: machine.unit(joint) for joint in machine.active},
-        channels=channels,
-        channel_units=units,
+        channels={name: values for name, values, _ in columns},
+        channel_units={name: unit for name, _, unit in columns},
         machine=machine.load_expression,
         task=task,
-        controller=_controller_name(control),
+        controller=controller,
         ideal=True,
         free=machine.free,
         machine_name=shorten_to_line(machine.name).strip(),
@@ -189,14 +189,8 @@ def _channel_columns(
     ):
         joint = machine.joints[column]
         yield f"rest_{joint}", values, FORCE_UNITS[machine.unit(joint)]
-    names = {
-        "kinetic": "kinetic",
-        "potential": "potential",
-        "work": "work",
-        "dissipated": "dissipated",
-    }
-    for name, part in names.items():
-        yield name, getattr(rows, part)[:, 0], "J"
+    for name in ("kinetic", "potential", "work", "dissipated"):
+        yield name, getattr(rows, name)[:, 0], "J"
     yield from _external_force_columns(machine, rows)
     yield from _stability_columns(machine, rows)
     if isinstance(control, ValveDrive):
@@ -251,8 +245,9 @@ def _stability_columns(machine: Machine, rows: LayoutView) -> Iterator[ChannelCo
             columns += [margins.moments, margins.smallest_ratio[:, None]]
         return np.hstack(columns)
 
-    found = scratch_arrays.compute_in_blocks(stand, len(rows.q))
-    for (name, unit), values in zip(titles, found.T, strict=True):
+    for (name, unit), values in zip(
+        titles, scratch_arrays.compute_in_blocks(stand, len(rows.q)).T, strict=True
+    ):
         yield name, values, unit
 
 
@@ -277,13 +272,6 @@ def _point_columns(name: str, positions: Array) -> Iterator[ChannelColumn]:
     """Positions (N, 3) [m] by axis."""
     for axis, values in zip("xyz", positions.T, strict=True):
         yield f"{name}_{axis}", values, "m"
-
-
-def _controller_name(control: Controller) -> str:
-    """What drives the machine: what its command calls itself, or the name of its class."""
-    if isinstance(control, ValveDrive):
-        return getattr(control.command, "title", type(control.command).__name__)
-    return "" if isinstance(control, ZeroForce) else type(control).__name__
 
 
 _INPUT_PREFIXES = (VALVE_SIGNAL_PREFIX, SUPPLY_PRESSURE, TANK_PRESSURE)
@@ -338,14 +326,9 @@ def _select_columns(machine: Machine, table: Table, units: Mapping[str, str]) ->
 
 def simulated_units(machine: Machine) -> dict[str, str]:
     """Units of the columns that a simulation with valves records, by name."""
-    joint_units = {joint: machine.unit(joint) for joint in machine.joints}
-    units = dict(joint_units)
-    units |= {
-        joint + VELOCITY_SUFFIX: VELOCITY_UNITS[joint_units[joint]] for joint in machine.active
-    }
-    units |= {
-        joint + FORCE_SUFFIX: FORCE_UNITS[joint_units[joint]] for joint in machine.driven_joints
-    }
+    units = {joint: machine.unit(joint) for joint in machine.joints}
+    units |= {x + VELOCITY_SUFFIX: VELOCITY_UNITS[machine.unit(x)] for x in machine.active}
+    units |= {x + FORCE_SUFFIX: FORCE_UNITS[machine.unit(x)] for x in machine.driven_joints}
     units |= {f"tip_{axis}": "m" for axis in "xyz" if machine.tip is not None}
     for joint in machine.hydraulics.joints if machine.hydraulics else ():
         units |= {f"pressure_{joint}_{side}": "Pa" for side in "ab"}
@@ -362,19 +345,10 @@ def read_simulation(machine: Machine, recording: Recording, names: list[str]) ->
         names: See `simulated_columns`.
     """
     columns = recording.columns()
-    inclination_names = [name for name in names if name.startswith(INCLINATION_PREFIX)]
-    readings = columns | (
-        _inclination_readings(machine, recording, inclination_names) if inclination_names else {}
-    )
-    values = [readings[name] for name in names]
+    if inclinations := [name for name in names if name.startswith(INCLINATION_PREFIX)]:
+        q = np.column_stack([columns[joint] for joint in machine.joints])
+        order = [recording.joints.index(joint) for joint in machine.active]
+        v = np.einsum("nij,nj->ni", machine.closure.gamma(q), recording.v[:, order])
+        columns |= ideal_readings(machine, q, v, inclinations)
+    values = [columns[name] for name in names]
     return np.column_stack(values) if values else np.empty((len(recording.time), 0))
-
-
-def _inclination_readings(
-    machine: Machine, recording: Recording, names: list[str]
-) -> dict[str, Array]:
-    columns = recording.columns()
-    q = np.column_stack([columns[joint] for joint in machine.joints])
-    order = [recording.joints.index(joint) for joint in machine.active]
-    v = np.einsum("nij,nj->ni", machine.closure.gamma(q), recording.v[:, order])
-    return ideal_readings(machine, q, v, names)

@@ -23,6 +23,7 @@ from crane.control.valve_drive import ValveDrive
 from crane.description.sensors import SUPPLY_PRESSURE, TANK_PRESSURE, VALVE_SIGNAL_PREFIX
 from crane.machine.machine import Machine
 from crane.recordings.measured_configurations import (
+    MissingMeasurements,
     add_inclination_angles,
     determining_joints,
     joint_motion,
@@ -32,12 +33,10 @@ from crane.recordings.measured_recordings import (
     check_strokes,
     locked_joint_conflicts,
 )
-from crane.recordings.missing_measurements import MissingMeasurements
 from crane.recordings.recording import VELOCITY_SUFFIX, Recording
-from crane.recordings.recording_columns import time_derivative
 from crane.recordings.recording_reader import FULL_TIME_SPAN, TimeSpan, read_quantities
 from crane.recordings.sensor_discrepancy import warn_discrepancies
-from crane.recordings.timeseries import TIME, Table, table_column
+from crane.recordings.timeseries import TIME, Table, table_column, time_derivative
 from crane.simulation.recorded_run import read_simulation, recorded_columns
 from crane.simulation.simulation_run import Progress, simulate
 
@@ -157,9 +156,8 @@ def replay(
     steps = int(time[-1] / step + 1e-9)
     if steps < 1:
         raise RecordingError(f"{path}: is shorter than a step of {step:g} s, shorten the step")
-    label = Path(path).stem
     recording = simulate(
-        machine, drive, initial, steps * step, step, label=label, progress=progress
+        machine, drive, initial, steps * step, step, label=Path(path).stem, progress=progress
     )
     try:
         return recording, compare_channels(machine, table, recording)
@@ -226,8 +224,9 @@ class ReplayInputs:
             line_pressures = [
                 None if x is None else np.interp(time, self.time, x) for x in line_pressures
             ]
-        signals = ValveSignals(machine, time, self.signals, *line_pressures)
-        return ValveDrive(machine, signals, self.pressures)
+        return ValveDrive(
+            machine, ValveSignals(machine, time, self.signals, *line_pressures), self.pressures
+        )
 
 
 def replay_inputs(machine: Machine, table: Table) -> ReplayInputs:
@@ -314,11 +313,17 @@ def _initial_motion(
     machine: Machine, table: Table, time: Array, signals: list[Array]
 ) -> tuple[Array, Array]:
     """Initial active coordinates and velocities."""
-    for text in locked_joint_conflicts(machine, _table_columns(table), table.units):
+    for text in locked_joint_conflicts(
+        machine, dict(zip(table.units, table.values.T, strict=True)), table.units
+    ):
         raise RecordingError(f"{text}, do not lock it, or lock it where it is")
     q_a, v_a = joint_motion(machine, table)
     _warn_of_limits(machine, time, q_a)
-    steady = time <= _steady_duration(time, signals)
+    has_moved = [np.abs(x - x[0]) > 1e-9 * max(float(np.ptp(x)), 1e-300) for x in signals]
+    # at rest until a valve moves, within bounds
+    first = min(float(time[x.argmax()]) if x.any() else np.inf for x in has_moved)
+    fit_duration = max(_START_FIT_DURATION, float(time[min(_MIN_FIT_SAMPLES, len(time)) - 1]))
+    steady = time <= max(min(first, _MAX_REST_DURATION), fit_duration)
     states = []
     for i, joint in enumerate(machine.active):
         has_velocity = joint + VELOCITY_SUFFIX in table.units or joint not in table.units
@@ -344,18 +349,6 @@ def _warn_of_limits(machine: Machine, time: Array, q_a: Array) -> None:
                 CraneWarning,
                 stacklevel=5,
             )
-
-
-def _table_columns(table: Table) -> dict[str, Array]:
-    return dict(zip(table.units, table.values.T, strict=True))
-
-
-def _steady_duration(time: Array, signals: list[Array]) -> float:
-    """Time until a valve moves [s], within bounds."""
-    has_moved = [np.abs(x - x[0]) > 1e-9 * max(float(np.ptp(x)), 1e-300) for x in signals]
-    first = min(float(time[x.argmax()]) if x.any() else np.inf for x in has_moved)
-    min_duration = float(time[min(_MIN_FIT_SAMPLES, len(time)) - 1])
-    return max(min(first, _MAX_REST_DURATION), _START_FIT_DURATION, min_duration)
 
 
 def _start_of_joint(
@@ -411,6 +404,7 @@ def _fit_parabola(time: Array, x: Array, order: int) -> tuple[float, float]:
     """Value or rate of a parabola at the first instant, and its standard deviation."""
     A = np.vander(time - time[0], 3)
     values, *_ = np.linalg.lstsq(A, x, rcond=None)
-    variance = float(np.sum((x - A @ values) ** 2)) / (len(x) - 3)
-    std = np.sqrt(variance * np.diag(np.linalg.pinv(A.T @ A)))
+    std = np.sqrt(
+        (float(np.sum((x - A @ values) ** 2)) / (len(x) - 3)) * np.diag(np.linalg.pinv(A.T @ A))
+    )
     return float(values[2 - order]), float(std[2 - order])

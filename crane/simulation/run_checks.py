@@ -60,11 +60,9 @@ def find_invalid_motion(
     than it took. For the arguments see `run_warnings`.
     """
     departure = find_piston_outside_cylinder(machine, time, rows.q)
-    return departure or (
-        find_stop_energy_gain(machine, time, rows, step, _energy_imbalance(rows))
-        if is_exact
-        else None
-    )
+    if departure is None and is_exact:
+        return find_stop_energy_gain(machine, time, rows, step, _energy_imbalance(rows))
+    return departure
 
 
 def passed_limits_text(machine: Machine, time: Array, q: Array) -> str:
@@ -122,20 +120,24 @@ def passed_strokes_text(machine: Machine, time: Array, q: Array) -> str:
     cylinders = machine.hydraulics.cylinders if machine.hydraulics is not None else {}
     with_end_stop = {stop.joint for stop in machine.end_stops}
     words = []
-    for joint in cylinders:
+    for joint in (x for x in cylinders if x in with_end_stop):
         release_pages()
-        i = machine.column(joint)
-        lower, upper = machine.coordinates.lower[i], machine.coordinates.upper[i]
-        depth = np.maximum(lower - q[:, i], q[:, i] - upper)
-        deepest, max_depth = int(depth.argmax()), _MAX_STROKE_EXCESS * (upper - lower)
-        if joint in with_end_stop and depth[deepest] > max_depth:
+        depth, stroke = _limit_excess(machine, joint, q)
+        deepest = int(depth.argmax())
+        if depth[deepest] > _MAX_STROKE_EXCESS * stroke:
             words.append(
                 f"the piston of '{joint}' is {depth[deepest]:.3g} m beyond its stroke at "
                 f"t = {time[deepest]:.4g} s"
             )
-    if not words:
-        return ""
-    return f"{', '.join(words)}: make end stops as stiff as steel is, or move slower"
+    remedy = ": make end stops as stiff as steel is, or move slower"
+    return ", ".join(words) + remedy if words else ""
+
+
+def _limit_excess(machine: Machine, joint: str, q: Array) -> tuple[Array, float]:
+    """By how much a joint is beyond its limits (N,), and the distance between these."""
+    i = machine.column(joint)
+    lower, upper = machine.coordinates.lower[i], machine.coordinates.upper[i]
+    return np.maximum(lower - q[:, i], q[:, i] - upper), upper - lower
 
 
 def find_piston_outside_cylinder(
@@ -145,8 +147,9 @@ def find_piston_outside_cylinder(
 
     For the arguments see `passed_limits_text`.
     """
-    cylinders = machine.hydraulics.cylinders if machine.hydraulics is not None else {}
-    for joint, cylinder in cylinders.items():
+    for joint, cylinder in (
+        machine.hydraulics.cylinders if machine.hydraulics is not None else {}
+    ).items():
         if cylinder.motor:
             continue
         release_pages()
@@ -175,9 +178,11 @@ def buried_contact_text(machine: Machine, q: Array) -> str:
     frames = FrameJacobians(machine)
     frames.set_configuration(q)
     for contact in contacts:
-        position = frames.frame_pose(contact.frame).translation.tolist()
-        height = float(contact.ground.distance_and_normal(position)[0])  # type: ignore[arg-type]
-        depth = contact.radius - height
+        depth = contact.radius - float(
+            contact.ground.distance_and_normal(
+                frames.frame_pose(contact.frame).translation.tolist()
+            )[0]
+        )
         if contact.stiffness * depth > _MAX_CONTACT_FORCE_RATIO * weight:
             return (
                 f"'{contact.name}' is {depth:.3g} m inside the ground, where its whole weight "
@@ -194,8 +199,9 @@ def _energy_imbalance(rows: LayoutView) -> Array:
 
 def _energy_throughput(rows: LayoutView) -> float:
     """The energy throughput: largest range of work, dissipation and energies [J]."""
-    parts = rows.work, rows.dissipated, rows.kinetic, rows.potential
-    return float(max(np.ptp(part) for part in parts))
+    return float(
+        max(np.ptp(part) for part in (rows.work, rows.dissipated, rows.kinetic, rows.potential))
+    )
 
 
 def find_stop_energy_gain(
@@ -206,11 +212,12 @@ def find_stop_energy_gain(
     if not np.ptp(energy_imbalance) > min_gain:
         return None
     for stop in machine.end_stops:
-        i = machine.column(stop.joint)
-        lower, upper = machine.coordinates.lower[i], machine.coordinates.upper[i]
-        depth = np.maximum(lower - rows.q[:, i], rows.q[:, i] - upper)
-        edges = np.flatnonzero(np.diff((depth > 0).astype(np.int8), prepend=0, append=0))
-        for first, behind in edges.reshape(-1, 2).tolist():
+        depth, _ = _limit_excess(machine, stop.joint, rows.q)
+        for first, behind in (
+            np.flatnonzero(np.diff((depth > 0).astype(np.int8), prepend=0, append=0))
+            .reshape(-1, 2)
+            .tolist()
+        ):
             before, after = max(first - 1, 0), min(behind, len(energy_imbalance) - 1)
             stored_energy = 0.5 * stop.stiffness * float(depth[first:behind].max()) ** 2
             energy_gain = float(energy_imbalance[before] - energy_imbalance[after])
@@ -236,14 +243,12 @@ def friction_chatter_text(machine: Machine, time: Array, rows: LayoutView, step:
     columns = list(smoothings)
     if not columns:
         return ""
-    dissipated_energy = rows.dissipated[:, 0]
-    dissipated_per_step, energy_tolerance = (
-        np.diff(dissipated_energy),
-        1e-6 * float(np.diff(dissipated_energy).max()),
-    )
+    dissipated_per_step = np.diff(rows.dissipated[:, 0])
+    energy_tolerance = 1e-6 * float(dissipated_per_step.max())
     friction = np.einsum("ni,ni->n", rows.friction, rows.v_a)
+    expected = 0.5 * (friction[1:] + friction[:-1]) * step
     suspect_steps = np.flatnonzero(
-        _energies_differ(dissipated_per_step, _midpoint_means(friction) * step, energy_tolerance)
+        _energies_differ(dissipated_per_step, expected, energy_tolerance)
     )
     forces, max_slow_velocities = (
         JointForces(machine),
@@ -285,11 +290,6 @@ def friction_chatter_text(machine: Machine, time: Array, rows: LayoutView, step:
         f"{len(time)} samples, first at t = {time[first]:.4g} s: steps of {step:g} s do not "
         "follow its smoothing, leave that out, so that it sticks, or shorten the step"
     )
-
-
-def _midpoint_means(values: Array) -> Array:
-    """Means (N - 1,) of neighbouring values."""
-    return 0.5 * (values[1:] + values[:-1])
 
 
 def _energies_differ(one: Array, other: Array, tolerance: float) -> np.ndarray:

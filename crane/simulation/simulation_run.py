@@ -19,11 +19,10 @@ from crane.common.errors import (
     suggest_names,
 )
 from crane.common.progress import progress_reporter
-from crane.common.samples import Array, as_number
+from crane.common.samples import as_number
 from crane.control.control_law import (
     ControlLaw,
     Controller,
-    TracedController,
     controller_reference,
 )
 from crane.control.valve_commands import ValveCommand
@@ -35,13 +34,17 @@ from crane.formats.machine_loading import load
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import tipping_message
-from crane.simulation.integration.chart_switching import ChartIntegrator, ChartSwitchingIntegrator
+from crane.simulation.integration.chart_switching import ChartSwitchingIntegrator
 from crane.simulation.integration.charts import Chart, row_layout
 from crane.simulation.integration.error_controlled_stepper import (
     DormandPrinceStepper,
     ErrorControlledStepper,
 )
-from crane.simulation.integration.integrators import ErrorControlledIntegrator, FixedStepIntegrator
+from crane.simulation.integration.integrators import (
+    ErrorControlledIntegrator,
+    FixedStepIntegrator,
+    StickSlipIntegrator,
+)
 from crane.simulation.integration.python_stepper import IntegrationHaltError, explain_halt
 from crane.simulation.integration.radau import RadauStepper
 from crane.simulation.integration.rosenbrock import RosenbrockStepper
@@ -101,7 +104,7 @@ def simulate(
 
     At a dead centre of the active coordinates the run continues in other coordinates, with the
     forces of the same drives. Where branches of motion cross, it continues on its own branch. Both
-    give a warning (see `crane.simulation.integration.charts` and `branch_crossing`).
+    give a warning (see `crane.simulation.integration.charts`).
 
     Args:
         machine: The machine, or an argument of `crane.load`.
@@ -162,7 +165,6 @@ def simulate(
     if text := reference_limits_text(machine, control, steps * step):
         warnings.warn(text, CraneWarning, stacklevel=2)
     dynamics = Dynamics(machine, formulation, backend)
-    ends_with_command = duration is None
     run = integrate(
         dynamics,
         control,
@@ -172,7 +174,7 @@ def simulate(
         method,
         progress,
         tolerance,
-        ends_with_command=ends_with_command,
+        ends_with_command=duration is None,
     )
     for note in run.notes:
         warnings.warn(note, CraneWarning, stacklevel=2)
@@ -181,13 +183,10 @@ def simulate(
         if interrupted and (text := passed_limits_text(machine, run.time, run.rows.q)):
             warnings.warn(text, CraneWarning, stacklevel=2)
         raise stop_with_recording(machine, control, run, label, steps * step)
-    every_step = has_fixed_steps(dynamics, control, method)
-    for text in run_warnings(
-        machine, run.time, run.rows, step, every_step, formulation == "exact"
-    ):
-        warnings.warn(text, CraneWarning, stacklevel=2)
     recording = record_run(machine, control, run.time, run.rows, label, start_text=run.start_text)
-    if text := tipping_message(recording):
+    every_step, is_exact = has_fixed_steps(dynamics, control, method), formulation == "exact"
+    texts = run_warnings(machine, run.time, run.rows, step, every_step, is_exact)
+    for text in filter(None, [*texts, tipping_message(recording)]):
         warnings.warn(text, CraneWarning, stacklevel=2)
     return recording
 
@@ -234,15 +233,16 @@ def integrate(
     try:
         # from home, so that a run does not depend on earlier solutions
         configuration = machine.closure.solve(q_a, initial_guess=machine.home)
-        controller_state = _initial_controller_state(control, dynamics, configuration)
+        if isinstance(control, ControlLaw) and dynamics.formulation == "exact":
+            controller_state = control.start_closed(dynamics, configuration)
+        else:
+            controller_state = control.start(configuration[machine.closure.active])
     except ClosureError as error:
         raise SimulationError(f"at t = 0 s, where the motion starts: {error}") from None
     if text := buried_contact_text(machine, configuration):
         raise SimulationError(f"at t = 0 s, where the motion starts: {text}")
-    contact_states, energies = (
-        np.zeros(state_count(machine.external_forces)),
-        np.zeros(2 + len(machine.external_forces)),
-    )
+    contact_states = np.zeros(state_count(machine.external_forces))
+    energies = np.zeros(2 + len(machine.external_forces))
     state = np.concatenate([configuration, v_a, contact_states, controller_state, energies])
     make_integrator = integrator_factory(
         dynamics, control, len(controller_state), method, tolerance
@@ -251,9 +251,8 @@ def integrate(
     integrator = ChartSwitchingIntegrator(chart, control, len(controller_state), make_integrator)
     layout = row_layout(machine, control, len(controller_state))
     times = step * np.arange(step_count + 1, dtype=np.float64)
-    rows = scratch_arrays.empty_array(
-        step_count + 1, layout.size
-    )  # stored by columns, so that channels are views
+    # stored by columns, so that channels are views
+    rows = scratch_arrays.empty_array(step_count + 1, layout.size)
     released_until = 0  # instants whose memory pages are released
 
     def report(done: int) -> None:
@@ -263,7 +262,11 @@ def integrate(
             scratch_arrays.release_pages()
         if progress is not None:
             progress(done / (step_count + 1))
-        if ends_with_command and done and _is_command_finished(control):
+        if (
+            ends_with_command
+            and done
+            and (isinstance(control, ValveDrive) and control.command.is_finished)
+        ):
             raise _CommandFinishedError
 
     run = IntegrationResult(times, rows, layout, integrator.notes, start_text)
@@ -285,15 +288,11 @@ def integrate(
         run.notes.extend(chart.stick_slip.notes)
         if progress is not None:
             progress(1.0)
-    if invalid_motion := find_invalid_motion(
-        machine, run.time, run.rows, step, dynamics.formulation == "exact"
-    ):
+    is_exact = dynamics.formulation == "exact"
+    invalid_motion = find_invalid_motion(machine, run.time, run.rows, step, is_exact)
+    if invalid_motion is not None:
         return run.first_instants(invalid_motion[0], SimulationError(invalid_motion[1]))
     return run
-
-
-def _is_command_finished(control: Controller) -> bool:
-    return isinstance(control, ValveDrive) and control.command.is_finished
 
 
 def has_fixed_steps(dynamics: Dynamics, control: Controller, method: str | None) -> bool:
@@ -305,15 +304,9 @@ def _default_method(dynamics: Dynamics, control: Controller) -> str:
     """Name of the default method."""
     if isinstance(control, ValveDrive):
         return "rosenbrock"
-    traced = dynamics.backend == "compiled" and isinstance(control, TracedController)
-    return "DOP853" if traced else "rk4"
-
-
-def _initial_controller_state(control: Controller, dynamics: Dynamics, q: Array) -> Array:
-    """Initial states of a controller at a closed configuration."""
-    if isinstance(control, ControlLaw) and dynamics.formulation == "exact":
-        return control.start_closed(dynamics, q)
-    return control.start(q[dynamics.machine.closure.active])
+    return (
+        "DOP853" if (dynamics.backend == "compiled" and isinstance(control, ControlLaw)) else "rk4"
+    )
 
 
 def integrator_factory(
@@ -322,7 +315,7 @@ def integrator_factory(
     controller_state_count: int,
     requested_method: str | None,
     tolerance: float | None,
-) -> Callable[[Chart], ChartIntegrator]:
+) -> Callable[[Chart], StickSlipIntegrator]:
     """Function that creates the integrator of a method in a chart.
 
     Args:
@@ -340,8 +333,8 @@ def integrator_factory(
         requested_method or _default_method(dynamics, control),
     )
     if method not in ("rk4", "rosenbrock", *SCIPY_METHODS):
-        methods_text = suggest_names(("rk4", "rosenbrock", *SCIPY_METHODS), method)
-        raise InputError(f"method '{method}' is unknown, {methods_text}")
+        hint = suggest_names(("rk4", "rosenbrock", *SCIPY_METHODS), method)
+        raise InputError(f"method '{method}' is unknown, {hint}")
     if isinstance(control, ValveDrive) and control.period and method != "rosenbrock":
         raise InputError(
             f"method '{method}' does not call the valves' program, leave the method out"
@@ -366,10 +359,10 @@ def integrator_factory(
         _COMPILED_METHODS.get(method) if not valves or method == "rosenbrock" else None
     )
 
-    def make(chart: Chart) -> ChartIntegrator:
+    def make(chart: Chart) -> StickSlipIntegrator:
         """A compiled integrator, or one of scipy where the formulas cannot be compiled."""
         compiled = stepper_factory is not None and chart.dynamics.backend == "compiled"
-        if compiled and isinstance(control, TracedController):
+        if compiled and isinstance(control, ControlLaw):
             assert stepper_factory is not None
             with suppress(FormulaTooLongError):
                 return ErrorControlledIntegrator(
@@ -381,7 +374,7 @@ def integrator_factory(
             return FixedStepIntegrator(chart, control, controller_state_count)
         if chart.machine.coordinates.floating_base_columns:
             raise InputError("scipy's methods do not go round with a body that floats, take rk4")
-        scipys = "BDF" if method == "rosenbrock" else method
-        return ScipyIntegrator(chart, control, controller_state_count, scipys, **options)
+        name = "BDF" if method == "rosenbrock" else method
+        return ScipyIntegrator(chart, control, controller_state_count, name, **options)
 
     return make

@@ -80,8 +80,9 @@ def machine_under_control(machine: Machine, control: Controller) -> Machine:
     Raises:
         InputError: A load depends on phases, and the controller has none.
     """
-    clock = control.command.clock if isinstance(control, ValveDrive) else None
-    machine = machine.with_clock(clock)
+    machine = machine.with_clock(
+        control.command.clock if isinstance(control, ValveDrive) else None
+    )
     hydraulics = machine.hydraulics
     if (
         hydraulics is None
@@ -189,8 +190,9 @@ def equilibrium_on_contacts(dynamics: Dynamics, q_a: Array) -> tuple[Array, str]
         return q_a, ""
     equilibrium = StaticEquilibrium(dynamics, q_a)
     columns = equilibrium.columns
-    home = machine.home[machine.closure.active]
-    if not len(columns) or not np.array_equal(q_a[columns], home[columns]):
+    if not len(columns) or not np.array_equal(
+        q_a[columns], machine.home[machine.closure.active][columns]
+    ):
         return q_a, ""
     found = equilibrium.find()
     if found is None:
@@ -239,8 +241,9 @@ class StaticEquilibrium:
         for _, jacobian, place in self._contact_jacobians(q):
             self._home_positions.append(place)
             moves = np.maximum(moves, np.abs(jacobian).max(axis=0))
-        free = np.array([name in machine.free for name in machine.active], dtype=bool)
-        self.columns = np.flatnonzero(free & (moves > 0))
+        self.columns = np.flatnonzero(
+            np.array([name in machine.free for name in machine.active], dtype=bool) & (moves > 0)
+        )
         closure = machine.closure
         self._units = closure.units[closure.active][self.columns]
         self._inverse_time_squared = 1.0 / closure.characteristic_time**2

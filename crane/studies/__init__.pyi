@@ -1,6 +1,6 @@
 from .hydraulic_power_balance import power_balance as power_balance
+from .optimization.design_optimization import Design as Design
 from .optimization.design_optimization import design as design
-from .optimization.design_result import Design as Design
 from .power_balance_result import PowerBalance as PowerBalance
 from .power_balance_result import PowerComparison as PowerComparison
 from .residual_sway_study import SwayStudy as SwayStudy

@@ -13,12 +13,15 @@ from crane.description.force_elements import Friction
 from crane.description.sensors import VELOCITY_SUFFIX
 from crane.dynamics.dynamics import Dynamics
 from crane.hydraulics.circuit_elements import MAIN_PUMP, Engine
-from crane.hydraulics.circuit_equations import CircuitEquations
-from crane.hydraulics.power_balance import ROD_POWER, SHAFT_POWER, component_powers
+from crane.hydraulics.circuit_equations import (
+    ROD_POWER,
+    SHAFT_POWER,
+    CircuitEquations,
+    component_powers,
+)
 from crane.machine.machine import Machine
-from crane.recordings.missing_measurements import check_columns_present
 from crane.recordings.recording import Recording
-from crane.recordings.timeseries import check_unit
+from crane.recordings.timeseries import check_columns_present, check_unit
 from crane.studies.power_balance_result import (
     JOINT_FRICTION,
     LOAD,
@@ -52,25 +55,44 @@ def power_balance(machine: Machine, recording: Recording) -> PowerBalance:
     """
     recorded = recording.columns()
     is_measured = f"shaft_{MAIN_PUMP}" not in recorded and f"pressure_{MAIN_PUMP}" in recorded
-    given_pressures = np.zeros(1)
     drive = ValveDrive(
-        machine, ValveSignals(machine, [0.0], {}, given_pressures if is_measured else None)
+        machine, ValveSignals(machine, [0.0], {}, np.zeros(1) if is_measured else None)
     )
     circuit, hydraulics = drive.circuit, drive.circuit.hydraulics
-    _check_joints(machine, recording)
+    missing = [joint for joint in machine.active if joint not in recording.joints]
+    if missing:
+        raise RecordingError(
+            f"{', '.join(map(repr, missing))} of '{machine.name}' not recorded, "
+            f"{suggest_names(recording.joints)}"
+        )
+    for joint in machine.active:
+        check_unit(joint, recording.units[joint], [machine.unit(joint)])
     m = len(circuit.joints)
     lower_limits = drive.settings[len(circuit.constants) :][:m]
     columns = _CircuitColumns(recording, circuit)
-    columns.check_channels()
     x = np.column_stack([recorded[joint] for joint in circuit.joints]) - lower_limits
     v = np.column_stack([recorded[joint + VELOCITY_SUFFIX] for joint in circuit.joints])
     state_columns = [columns.state_column(name) for name in circuit.state_units]
-    boundary_pressures = columns.boundary_pressures() if is_measured else []
-    rows = np.column_stack([x, v, *state_columns, *columns.signal_columns(), *boundary_pressures])
-    names, values = _evaluate_powers(circuit, rows)
+    signals = [
+        spool.neutral + (spool.full - spool.neutral) * columns.spool_position(name)
+        for name, spool in hydraulics.spools.items()
+    ]
+    boundary_pressures = []  # of supply and tank [Pa]
+    if is_measured:
+        tank_pressure = np.full_like(recording.time, hydraulics.supply.tank)
+        boundary_pressures = [
+            recorded[f"pressure_{MAIN_PUMP}"], recorded.get("pressure_tank", tank_pressure)
+        ]  # fmt: skip
+    names, values = _evaluate_powers(
+        circuit,
+        np.column_stack([x, v, *state_columns, *signals, *boundary_pressures]),
+    )
     powers = dict(zip(names, values.T, strict=True))
-    friction_forces = {joint: powers.pop(f"{joint}.{_FRICTION_FORCE}") for joint in circuit.joints}
-    friction = _joint_friction(machine, recording, friction_forces)
+    friction = _joint_friction(
+        machine,
+        recording,
+        {joint: powers.pop(f"{joint}.{_FRICTION_FORCE}") for joint in circuit.joints},
+    )
     for i, joint in enumerate(circuit.joints):
         rod_power = powers.pop(f"{joint}.{ROD_POWER}")
         friction_power = friction[joint] * v[:, i]
@@ -104,22 +126,10 @@ def power_balance(machine: Machine, recording: Recording) -> PowerBalance:
 
 
 def _engine_power(engine: Engine, speed: Array) -> Array:
-    """Return the power (N,) of the governed engine at speeds (N,) [rad/s]."""
     torque_share = np.clip(
         (engine.speed + engine.speed_droop - speed) / engine.speed_droop, 0.0, 1.0
     )
     return np.asarray(engine.torque * torque_share * speed)
-
-
-def _check_joints(machine: Machine, recording: Recording) -> None:
-    missing = [joint for joint in machine.active if joint not in recording.joints]
-    if missing:
-        listed = ", ".join(f"'{joint}'" for joint in missing)
-        raise RecordingError(
-            f"{listed} of '{machine.name}' not recorded, {suggest_names(recording.joints)}"
-        )
-    for joint in machine.active:
-        check_unit(joint, recording.units[joint], [machine.unit(joint)])
 
 
 def _joint_friction(
@@ -137,8 +147,9 @@ def _joint_friction(
         return {joint: recording.channels[name] for joint, name in names.items()}
     order = [recording.joints.index(joint) for joint in machine.active]
     v = recording.v[:, order]
-    law_friction = Dynamics(machine).friction(recording.q[:, order], v)
-    friction = dict(zip(machine.active, law_friction.T, strict=True))
+    friction = dict(
+        zip(machine.active, Dynamics(machine).friction(recording.q[:, order], v).T, strict=True)
+    )
     for joint, friction_force in friction_forces.items():
         law, velocity = machine.friction.get(joint, Friction()), v[:, machine.active.index(joint)]
         sign = np.tanh(velocity / law.smoothing) if law.smoothing else np.sign(velocity)
@@ -152,19 +163,14 @@ class _CircuitColumns:
     Args:
         recording: The recording.
         circuit: The circuit.
+
+    Raises:
+        RecordingError: Channels are missing, or in other units.
     """
 
     def __init__(self, recording: Recording, circuit: CircuitEquations):
-        self._recording, self._circuit = recording, circuit
-        self._channels = recording.channels
-        self._spools = circuit.hydraulics.spools
-
-    def check_channels(self) -> None:
-        """Check that all channels are recorded in their units.
-
-        Raises:
-            RecordingError: Channels are missing, or in other units.
-        """
+        self._circuit, self._channels = circuit, recording.channels
+        self._spools, self._none = circuit.hydraulics.spools, np.zeros_like(recording.time)
         try:
             check_columns_present(self._required_columns(), self._channels)
         except RecordingError as error:
@@ -172,7 +178,7 @@ class _CircuitColumns:
                 f"{error} (power_balance needs what a simulation on valves records)"
             ) from None
         units = self._circuit.state_units | {"engine_speed": "rad/s", "pressure_tank": "Pa"}
-        for name, unit in self._recording.channel_units.items():
+        for name, unit in recording.channel_units.items():
             if name in units and unit:
                 check_unit(name, unit, [units[name]])
 
@@ -189,41 +195,22 @@ class _CircuitColumns:
     def state_column(self, name: str) -> Array:
         """Return a state (N,); the state of a pressure is s = p - p_vapour."""
         prefix, _, owner = name.partition("_")
-        oil = self._circuit.hydraulics.oil
         if name == "engine":
             engine = self._circuit.hydraulics.engine
             assert engine is not None
             return self._channels["engine_speed"] / engine.speed
         if prefix == "pressure":
-            return self._channels[name] - oil.vapour_pressure
+            return self._channels[name] - self._circuit.hydraulics.oil.vapour_pressure
         if name.startswith("spool_rate_") or prefix == "load":
-            return np.zeros_like(
-                self._recording.time
-            )  # no flow depends on it if the share is given
-        return self._spool_position(owner) if prefix in ("play", "spool") else self._channels[name]
+            return self._none  # no flow depends on it if the share is given
+        return self.spool_position(owner) if prefix in ("play", "spool") else self._channels[name]
 
-    def signal_columns(self) -> list[Array]:
-        """Return the signal (N,) of each spool at its recorded position [V]."""
-        return [
-            spool.neutral + (spool.full - spool.neutral) * self._spool_position(name)
-            for name, spool in self._spools.items()
-        ]
-
-    def _spool_position(self, name: str) -> Array:
+    def spool_position(self, name: str) -> Array:
+        """Return the recorded relative position (N,) of a spool."""
         if (u := self._channels.get(f"spool_{name}")) is not None:
             return u
         spool = self._spools[name]
         return (self._channels[f"voltage_{name}"] - spool.neutral) / (spool.full - spool.neutral)
-
-    def boundary_pressures(self) -> list[Array]:
-        """Return the pressures (N,) of supply and tank [Pa]."""
-        default_tank_pressure = np.full_like(
-            self._recording.time, self._circuit.hydraulics.supply.tank
-        )
-        return [
-            self._channels[f"pressure_{MAIN_PUMP}"],
-            self._channels.get("pressure_tank", default_tank_pressure),
-        ]
 
 
 def _evaluate_powers(circuit: CircuitEquations, rows: Array) -> tuple[list[str], Array]:

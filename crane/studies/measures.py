@@ -70,33 +70,27 @@ def measure_task(
         CraneError: The machine cannot perform the task.
     """
     if machine.tasks[task].space == "joystick":
-        return _measure_lever_task(machine, task)
+        levers = machine.tasks[task]
+        run = simulate(
+            machine.with_external_forces(*levers.loads),
+            joystick(machine, task),
+            duration=None if levers.phases else levers.duration,
+            step=_LEVER_TASK_STEP,
+        )
+        measures = _force_measures(machine, run.time, run.v, run.tau)
+        measures["pump_work"] = float(run.channels["pump_work"][-1])
+        return float(run.time[-1]), measures
     trajectory = task_trajectory(machine, task)
     time = np.linspace(
         0.0, trajectory.duration, int(np.ceil(_SAMPLES_PER_SECOND * trajectory.duration)) + 1
     )
     if machine.free:
-        step = float(time[1] - time[0])
-        run = simulate(machine, ComputedTorque(machine, trajectory), step=step)
+        run = simulate(machine, ComputedTorque(machine, trajectory), step=float(time[1] - time[0]))
         v_a, tau = run.v, run.tau
     else:
         q_a, v_a, a_a = trajectory(time)
         tau = dynamics.inverse(q_a, v_a, a_a, friction=True)
     return trajectory.duration, _force_measures(machine, time, v_a, tau)
-
-
-def _measure_lever_task(machine: Machine, name: str) -> tuple[float, dict[str, float]]:
-    """Compute duration and measures of a task of levers, with its circuit and loads."""
-    task = machine.tasks[name]
-    run = simulate(
-        machine.with_external_forces(*task.loads),
-        joystick(machine, name),
-        duration=None if task.phases else task.duration,
-        step=_LEVER_TASK_STEP,
-    )
-    measures = _force_measures(machine, run.time, run.v, run.tau)
-    measures["pump_work"] = float(run.channels["pump_work"][-1])
-    return float(run.time[-1]), measures
 
 
 def _force_measures(machine: Machine, time: Array, v_a: Array, tau: Array) -> dict[str, float]:
@@ -187,7 +181,6 @@ def _coupled_strokes(machine: Machine) -> NDArray[np.bool_]:
 
 
 def _values_per_stroke(is_coupled: NDArray[np.bool_]) -> int:
-    """Return the number of values of each stroke in the grid."""
     return max(3, int(_COUPLED_GRID_SIZE ** (1 / max(1, int(is_coupled.sum()))) + 1e-9))
 
 
@@ -206,7 +199,6 @@ def _stroke_ranges(machine: Machine, home_values: Array) -> tuple[Array, Array]:
 def _neighbouring_cells(
     cell: tuple[int, ...], grid_shape: tuple[int, ...]
 ) -> Iterator[tuple[int, ...]]:
-    """Yield the neighbours of a cell along the axes of a grid."""
     for i, step in itertools.product(range(len(grid_shape)), (-1, 1)):
         if 0 <= cell[i] + step < grid_shape[i]:
             yield (*cell[:i], cell[i] + step, *cell[i + 1 :])
@@ -276,7 +268,6 @@ def _stroke_end(
     stroke_index: int,
     sign: float,
 ) -> float:
-    """Return the upper (sign 1) or lower (-1) end of a stroke from closed configurations."""
     column = machine.closure.active[stroke_index]
     limit = float(limits[int(sign > 0)][stroke_index])
     values = sign * configurations[:, column]
@@ -288,9 +279,10 @@ def _stroke_end(
     def objective(q: Array) -> tuple[float, Array]:
         return sign * float(q[column]), gradient
 
-    q_a = configurations[:, machine.closure.active]
     starts = configurations[
-        _separated_indices(values, _relative_strokes(q_a, limits))[:_STROKE_START_COUNT]
+        _separated_indices(
+            values, _relative_strokes(configurations[:, machine.closure.active], limits)
+        )[:_STROKE_START_COUNT]
     ]
     return sign * max(
         maximize_on_branch(machine, q, strokes.tolist(), limits, objective)[0] for q in starts
@@ -303,7 +295,6 @@ def _largest_reach(
     is_coupled: NDArray[np.bool_],
     limits: tuple[Array, Array],
 ) -> float:
-    """Return the largest horizontal distance of the tip over all strokes."""
     kinematics, up = Kinematics(machine), up_direction(machine)
     active = machine.closure.active
 
@@ -348,7 +339,6 @@ def _largest_reach(
 
 
 def _relative_strokes(q_a: Array, limits: tuple[Array, Array]) -> Array:
-    """Return active coordinates (N, n) as shares of their ranges."""
     return (q_a - limits[0]) / np.where(limits[1] > limits[0], limits[1] - limits[0], 1.0)
 
 

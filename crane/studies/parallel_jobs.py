@@ -62,15 +62,18 @@ def compute_on_cluster(
                 stacklevel=2,
             )
         run = uuid.uuid4().hex
-        keys = [f"crane-study-{run}-{index}" for index in range(len(jobs))]
-        futures = client.map(function, jobs, key=keys, pure=False)
+        futures = client.map(
+            function,
+            jobs,
+            key=[f"crane-study-{run}-{index}" for index in range(len(jobs))],
+            pure=False,
+        )
         indices = {future.key: index for index, future in enumerate(futures)}
         for future in dask.as_completed(futures, loop=client.loop):
             yield indices[future.key], _job_result(future, indices[future.key], scheduler)
 
 
 def _job_result(future: Any, index: int, scheduler: str) -> Any:
-    """Return the result of a finished job, or raise the reason of its failure."""
     from distributed import KilledWorker
 
     if future.status == "finished":
@@ -122,7 +125,6 @@ def machine_from_files(machine: Machine | str | Path) -> tuple[Machine, str]:
 
 
 def _tasks_without_loads(machine: Machine) -> dict[str, tuple[object, int]]:
-    """Return the tasks without their loads, and the number of these loads."""
     return {
         name: (replace(task, loads=()), len(task.loads)) for name, task in machine.tasks.items()
     }
@@ -134,32 +136,41 @@ def check_process_count(count: int) -> int:
     Raises:
         InputError: The number is not valid.
     """
-    max_processes = _PROCESSES_PER_CORE * (os.cpu_count() or 1)
-    return as_count(count, "the number of processes", 1, max_processes)
+    return as_count(
+        count, "the number of processes", 1, _PROCESSES_PER_CORE * (os.cpu_count() or 1)
+    )
 
 
 def compute_jobs(
-    function: Callable[[J], R], jobs: Sequence[J], processes: int, scheduler: str | None
-) -> Iterator[tuple[int, R]]:
-    """Yield indices and results of jobs as they finish.
+    function: Callable[[J], R],
+    jobs: Sequence[J],
+    processes: int,
+    scheduler: str | None,
+    report: Callable[[int], object],
+) -> list[R]:
+    """Return the results of jobs.
 
     Args:
         function: Function of a job; other processes import it from this package.
         jobs: Arguments of the function.
         processes: Number of processes.
         scheduler: Address of a Dask scheduler whose workers compute instead.
+        report: Called with the number of finished jobs after each.
     """
     if scheduler is not None:
-        yield from compute_on_cluster(function, jobs, scheduler)
+        finished = compute_on_cluster(function, jobs, scheduler)
     elif processes <= 1 or len(jobs) == 1:
-        for index, job in enumerate(jobs):
-            yield index, function(job)
+        finished = ((index, function(job)) for index, job in enumerate(jobs))
     else:
-        yield from _compute_in_processes(function, jobs, min(processes, len(jobs)))
+        finished = _compute_in_processes(function, jobs, min(processes, len(jobs)))
+    results: dict[int, R] = {}
+    for index, result in finished:
+        results[index] = result
+        report(len(results))
+    return [results[index] for index in range(len(jobs))]
 
 
 def _exit_with_parent() -> None:
-    """End this process when its parent ends, for whatever reason."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -181,8 +192,9 @@ def _compute_in_processes(
             "measures that are lambdas or local functions stay in one process: give a Python "
             f"file, functions of a module, or processes=1 ({error})"
         ) from None
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(processes, context, initializer=_exit_with_parent)
+    pool = ProcessPoolExecutor(
+        processes, multiprocessing.get_context("spawn"), initializer=_exit_with_parent
+    )
     try:
         futures = {pool.submit(function, job): index for index, job in enumerate(jobs)}
         for future in as_completed(futures):

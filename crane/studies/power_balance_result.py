@@ -1,6 +1,6 @@
 """Results of power balances: powers of one run by part, and a comparison of several runs."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from crane.common.errors import InputError
 from crane.common.result import Result
 from crane.common.samples import Array, as_number
 from crane.common.units import format_quantity
-from crane.hydraulics.power_balance import SHAFT_POWER, STORED_POWERS
+from crane.hydraulics.circuit_equations import SHAFT_POWER, STORED_POWERS
 from crane.recordings.timeseries import TIME, write_columns
 
 DIESEL_DENSITY = 840.0  # [kg/m3]
@@ -172,15 +172,18 @@ class PowerBalance(Result):
         listed_parts = [
             x for x in self.powers if self.integrate_energy(np.abs(self.powers[x])) > min_energy
         ]
-        rows += [self._table_row(f"{part_owner(x)}: {part_kind(x)}", [x]) for x in listed_parts]
-        total_labels = {SHAFT_POWER: "all shafts", "lost": "all losses", LOAD: "all loads",
-                 "stored": "all that is stored"}  # fmt: skip
-        for total_kind, label in total_labels.items():
-            rows.append(
-                self._table_row(
-                    f"**{label}**", [x for x in self.powers if part_total(x) == total_kind]
-                )
-            )
+        rows += [
+            self._table_cells(f"{part_owner(x)}: {part_kind(x)}", self.powers[x])
+            for x in listed_parts
+        ]
+        for total_kind, label in {
+            SHAFT_POWER: "all shafts",
+            "lost": "all losses",
+            LOAD: "all loads",
+            "stored": "all that is stored",
+        }.items():
+            total = self._total_power(x for x in self.powers if part_total(x) == total_kind)
+            rows.append(self._table_cells(f"**{label}**", total))
         if self.engine_power is not None:
             rows.append(self._table_cells("**engine**", self.engine_power))
         text = "".join(f"| {' | '.join(row)} |\n" for row in rows)
@@ -199,9 +202,6 @@ class PowerBalance(Result):
 
     def _total_power(self, names: Iterable[str]) -> Array:
         return sum((self.powers[name] for name in names), np.zeros_like(self.time))
-
-    def _table_row(self, label: str, names: Sequence[str]) -> tuple[str, ...]:
-        return self._table_cells(label, self._total_power(names))
 
     def _table_cells(self, label: str, power: Array) -> tuple[str, ...]:
         energy, shaft_energy = (
@@ -281,25 +281,22 @@ class PowerComparison(Result):
 
     def to_markdown(self) -> str:
         """Return a table of time, energy, peak and fuel of each run, and its energy by class."""
-        rows = [["", *self.balances], ["---", *["---:"] * len(self.balances)]]
-        all_balances = self.balances.values()
-        energies = [balance.totals[SHAFT_POWER] for balance in all_balances]
-        rows.append(["time [s]", *(f"{x.time[-1] - x.time[0]:.2f}" for x in all_balances)])
-        rows.append(["work of the shafts [kJ]", *(f"{1e-3 * x:.1f}" for x in energies)])
-        rows.append(
-            [
-                "mean of them [kW]",
-                *(f"{1e-3 * x.mean_power(x.shaft_power):.1f}" for x in all_balances),
+        runs = self.balances.values()
+        energies = [run.totals[SHAFT_POWER] for run in runs]
+        rows = [
+            ["", *self.balances],
+            ["---", *["---:"] * len(runs)],
+            ["time [s]", *(f"{run.time[-1] - run.time[0]:.2f}" for run in runs)],
+            ["work of the shafts [kJ]", *(f"{1e-3 * x:.1f}" for x in energies)],
+            ["mean of them [kW]", *(f"{1e-3 * x.mean_power(x.shaft_power):.1f}" for x in runs)],
+            ["peak of them [kW]", *(f"{1e-3 * run.shaft_power.max():.1f}" for run in runs)],
+        ]
+        if any(run.fuel_mass is not None for run in runs):
+            masses, volumes = [x.fuel_mass for x in runs], [x.fuel_volume for x in runs]
+            rows += [
+                ["fuel [g]", *("" if x is None else f"{1e3 * x:.1f}" for x in masses)],
+                ["fuel [ml]", *("" if x is None else f"{1e6 * x:.1f}" for x in volumes)],
             ]
-        )
-        rows.append(
-            ["peak of them [kW]", *(f"{1e-3 * x.shaft_power.max():.1f}" for x in all_balances)]
-        )
-        if any(x.fuel_mass is not None for x in all_balances):
-            fuels = [x.fuel_mass for x in all_balances]
-            rows.append(["fuel [g]", *("" if x is None else f"{1e3 * x:.1f}" for x in fuels)])
-            volumes = [x.fuel_volume for x in all_balances]
-            rows.append(["fuel [ml]", *("" if x is None else f"{1e6 * x:.1f}" for x in volumes)])
         if self.moved_mass is not None:
             rows.append(
                 [f"work per kg of {self.moved_mass:g} [J/kg]"]

@@ -14,8 +14,7 @@ from crane.common.units import format_table
 from crane.control.valve_feedforward import ValveFeedforward, fastest_trajectory
 from crane.formats.machine_loading import load
 from crane.machine.machine import Machine
-from crane.motion.sway import Sway
-from crane.motion.sway_suppression import SWAY_METHODS
+from crane.motion.sway import SWAY_METHODS, Sway
 from crane.motion.task_trajectories import task_trajectory
 from crane.simulation.simulation_run import simulate
 
@@ -76,8 +75,7 @@ class SwayStudy(OneLineRepr):
 
     def to_text(self) -> str:
         """Return a table of the results."""
-        heading = ("payload", "method", "duration", "against none", "residual sway", "less")
-        cells = [heading] + [
+        cells = [(("payload", "method", "duration", "against none", "residual sway", "less"))] + [
             (
                 f"{row.payload:g} kg",
                 row.label,
@@ -132,8 +130,11 @@ def sway_study(
         for method in SWAY_METHODS:
             trajectory = fastest_trajectory(loaded_machine, reference, method)
             for ratio in (0.0, damping)[: 1 + (damping > 0)]:
-                control = ValveFeedforward(loaded_machine, trajectory, sway=ratio)
-                residual = _residual_sway(loaded_machine, control, trajectory.duration)
+                residual = _residual_sway(
+                    loaded_machine,
+                    ValveFeedforward(loaded_machine, trajectory, sway=ratio),
+                    trajectory.duration,
+                )
                 if reference_result is None:
                     reference_result = trajectory.duration, residual
                 rows.append(
@@ -154,7 +155,6 @@ def sway_study(
 
 
 def _residual_sway(machine: Machine, control: ValveFeedforward, duration: float) -> float:
-    """Return the largest sway after a motion [rad]."""
     start = control.planned_trajectory.position(0.0)
     end_time = _STEP * np.ceil((duration + _OBSERVATION_TIME) / _STEP)
     run = simulate(

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from crane.common.atomic_output import replace_file
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.common.result import Result
 from crane.common.samples import Array
+from crane.common.units import format_table
 
 _MAXIMIZED_MEASURES = ("reach", "range", "highest")
 
@@ -69,11 +70,8 @@ class Study(Result):
         Raises:
             InputError: The measure is not in the study.
         """
-        if measure not in self.columns or measure in self.parameters:
-            names = [name for name in self.columns if name not in self.parameters]
-            raise InputError(
-                f"measure '{measure}' is not in the study, {suggest_names(names, measure)}"
-            )
+        names = [name for name in self.columns if name not in self.parameters]
+        check_name(measure, names, f"measure '{measure}' is not in the study")
         values = self.columns[measure]
         is_maximized = measure in _MAXIMIZED_MEASURES or (
             measure.isidentifier() and measure.startswith("upper_")
@@ -122,14 +120,12 @@ class Study(Result):
             self.rank(self.measures[0]),
             self.measures[0].isidentifier(),
         )
-        lines = [titles]
-        for i in ranking[:max_rows]:
-            lines.append([f"{self.columns[name][i]:.6g}" for name in shown_columns])
-        widths = [max(len(line[k]) for line in lines) for k in range(len(shown_columns))]
+        cells = [
+            [f"{self.columns[name][i]:.6g}" for name in shown_columns] for i in ranking[:max_rows]
+        ]
         text = [
-            ("* " if row == 1 and has_preferred_direction else "  ")
-            + "  ".join(word.rjust(width) for word, width in zip(line, widths, strict=True))
-            for row, line in enumerate(lines)
+            ("* " if row == 1 and has_preferred_direction else "  ") + line
+            for row, line in enumerate(format_table([titles, *cells], left_aligned=()))
         ]
         failed = [reason for reason in self.failure_reasons if reason]
         summary = (

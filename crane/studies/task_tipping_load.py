@@ -1,12 +1,13 @@
 """The payload at which a machine tips during a task."""
 
 import warnings
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
 
-from crane.common.errors import CraneWarning, InputError, suggest_names
+from crane.common.errors import CraneWarning, InputError, check_name
 from crane.control.control_law import ComputedTorque
 from crane.control.levers import joystick
 from crane.dynamics.tipping_stability import TippingStability
@@ -51,22 +52,20 @@ def tipping_load(machine: Machine, task: str) -> TippingLoad:
         InputError: The machine has no such task, no payload or no supports, or it tips without
             payload.
     """
-    if task not in machine.tasks:
-        raise InputError(
-            f"machine '{machine.name}' has no task '{task}', {suggest_names(machine.tasks, task)}"
-        )
+    check_name(task, machine.tasks, f"machine '{machine.name}' has no task '{task}'")
     TippingStability(machine)  # raises without supports
     variants = MachineVariants(machine)
     if PAYLOAD_MASS not in variants.values:
         raise InputError(f"'{machine.name}' has no payload, describe one in its machine file")
-    recordings: dict[float, Recording] = {}
 
-    def smallest_margin(mass: float, channel: str = "stability") -> float:
-        if mass not in recordings:
-            with warnings.catch_warnings():  # tipping is expected
-                warnings.simplefilter("ignore", CraneWarning)
-                recordings[mass] = _simulate_task(variants.machine({PAYLOAD_MASS: mass}), task)
-        return float(recordings[mass].channels[channel].min())
+    @cache
+    def simulate_with(mass: float) -> Recording:
+        with warnings.catch_warnings():  # tipping is expected
+            warnings.simplefilter("ignore", CraneWarning)
+            return _simulate_task(variants.machine({PAYLOAD_MASS: mass}), task)
+
+    def smallest_margin(mass: float, channel: str) -> float:
+        return float(simulate_with(mass).channels[channel].min())
 
     masses: list[float] = []
     for channel in ("static_stability", "stability"):
@@ -83,8 +82,7 @@ def tipping_load(machine: Machine, task: str) -> TippingLoad:
             float(brentq(smallest_margin, 0.0, upper_mass, (channel,), rtol=_RELATIVE_TOLERANCE))
         )
     static, mass = masses
-    smallest_margin(mass)
-    run = recordings[mass]
+    run = simulate_with(mass)
     return TippingLoad(mass, float(run.time[run.channels["stability"].argmin()]), static)
 
 

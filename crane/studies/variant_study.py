@@ -4,6 +4,7 @@ import itertools
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,8 +15,8 @@ from crane.common.errors import (
     CraneError,
     CraneWarning,
     InputError,
+    check_name,
     prefix_location,
-    suggest_names,
 )
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_count, as_samples, as_seed
@@ -70,10 +71,7 @@ class StudyJob(NamedTuple):
         with_strokes: Whether the strokes are measured.
         expressions: Expressions of measures, see `crane.studies.optimization`.
         requirements: Requirements.
-        user_measures: Python file of user measures, or functions by name.
-        frame: Link at which loads hang.
-        rule: Rating rule of loads.
-        expression_tasks: Tasks of expressions.
+        options: Options of the expressions.
     """
 
     machine: str
@@ -83,10 +81,7 @@ class StudyJob(NamedTuple):
     with_strokes: bool
     expressions: tuple[str, ...] = ()
     requirements: tuple[str, ...] = ()
-    user_measures: str | Mapping[str, MeasureFunction] | None = None
-    frame: str | None = None
-    rule: str | Rule = "none"
-    expression_tasks: tuple[str, ...] = ()
+    options: MeasureOptions = MeasureOptions()
 
 
 def study(
@@ -156,7 +151,7 @@ def study(
     units = _parameter_units(
         base_machine, vary, has_lever_tasks or bool(expressions) or bool(require)
     )
-    expression_tasks = tasks
+    options = MeasureOptions(frame, find_rule(rule), tasks, transferable_measures(user_measures))
     if not set(selected_measures) & set(task_measure_units):
         tasks = ()
     jobs = [
@@ -168,26 +163,28 @@ def study(
             not set(selected_measures) <= set(task_measure_units),
             expressions,
             tuple(require),
-            transferable_measures(user_measures),
-            frame,
-            find_rule(rule),
-            expression_tasks,
+            options,
         )
         for row in values
     ]
-    rows: dict[int, tuple[dict[str, float], str]] = {}
-    for index, row in compute_jobs(measure_variant, jobs, processes, scheduler):
-        rows[index] = row
-        if progress is not None:
-            progress(len(rows) / len(jobs))
-    reasons = tuple(rows[i][1] for i in range(len(jobs)))
+    rows = compute_jobs(
+        measure_variant, jobs, processes, scheduler,
+        lambda done: progress and progress(done / len(jobs)),
+    )  # fmt: skip
+    reasons = tuple(reason for _, reason in rows)
     if all(reasons):
         raise InputError(f"none of {len(jobs)} variants can be measured, the first: {reasons[0]}")
     measures = tuple(dict.fromkeys((*(measures or ()), *selected_measures)))
     available |= {x: PLAIN_MEASURES.get(x, "") for x in expressions}
-    column_measures = _column_measures(measures, task_measure_units, tasks)
+    column_measures = {
+        column: x
+        for x in measures
+        for column in (
+            x, *(f"{x} {task}" for task in tasks if len(tasks) > 1 and x in task_measure_units)
+        )
+    }  # fmt: skip
     columns = dict(zip(vary, values.T, strict=True)) | {
-        column: np.array([rows[i][0].get(column, np.nan) for i in range(len(jobs))])
+        column: np.array([row.get(column, np.nan) for row, _ in rows])
         for column in column_measures
     }
     units |= {column: available[measure] for column, measure in column_measures.items()}
@@ -195,18 +192,6 @@ def study(
         name, tuple(vary), measures, tasks,
         units, columns, reasons, grid_shape, resolution_notes(base_machine, measures),
     )  # fmt: skip
-
-
-def _column_measures(
-    measures: Sequence[str], task_measures: Mapping[str, str], tasks: Sequence[str]
-) -> dict[str, str]:
-    """Return the measure of each column; with several tasks there is a column for each task."""
-    task_columns = tasks if len(tasks) > 1 else ()
-    return {
-        column: x
-        for x in measures
-        for column in (x, *(f"{x} {task}" for task in task_columns if x in task_measures))
-    }
 
 
 def measure_variant(study_job: StudyJob) -> tuple[dict[str, float], str]:
@@ -254,9 +239,9 @@ def _is_expression(
     """
     if text in available:
         return False
-    if text.isidentifier() and text not in functions and text not in PLAIN_MEASURES:
+    if text.isidentifier():
         names = [*available, *PLAIN_MEASURES, *functions]
-        raise InputError(f"measure '{text}' is unknown, {suggest_names(names, text)}")
+        check_name(text, names, f"measure '{text}' is unknown")
     load_positions([MeasureExpression(text)])
     return True
 
@@ -271,16 +256,12 @@ def _evaluate_expressions(machine: Machine, study_job: StudyJob) -> dict[str, fl
         *map(MeasureExpression, study_job.expressions),
         *(parse_requirement(x)[0] for x in study_job.requirements),
     ]
-    options = MeasureOptions(
-        study_job.frame,
-        study_job.rule,
-        study_job.expression_tasks,
-        load_user_measures(study_job.user_measures),
-    )
-    no_values = np.zeros(0)
+    functions = load_user_measures(study_job.options.user_measures)
+    options = replace(study_job.options, user_measures=functions)
     evaluation = VariantEvaluation(
-        MachineVariants(machine), (), no_values, no_values, options, load_positions(expressions)
-    )
+        MachineVariants(machine), (), np.zeros(0), np.zeros(0), options,
+        load_positions(expressions),
+    )  # fmt: skip
     values = [evaluation.evaluate(x) for x in expressions]
     for text, value in zip(
         study_job.requirements, values[len(study_job.expressions) :], strict=True
@@ -319,8 +300,7 @@ def _unique_names(
 ) -> tuple[str, ...]:
     """Return the requested names without repetitions; all by default."""
     for name in requested or ():
-        if name not in available:
-            raise InputError(f"{label} '{name}' is unknown, {suggest_names(available, name)}")
+        check_name(name, available, f"{label} '{name}' is unknown")
     return tuple(dict.fromkeys(available if requested is None else requested))
 
 
@@ -335,10 +315,7 @@ def _parameter_units(machine: Machine, vary: Mapping[str, object], with_circuit:
     names = MachineVariants(machine).values
     units = {}
     for parameter in vary:
-        if parameter not in names:
-            raise InputError(
-                f"parameter '{parameter}' is unknown, {suggest_names(names, parameter)}"
-            )
+        check_name(parameter, names, f"parameter '{parameter}' is unknown")
         prefix, *remaining_names = parameter.split(".")
         if (
             not with_circuit

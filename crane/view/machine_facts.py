@@ -48,8 +48,12 @@ def machine_facts(machine: Machine) -> Iterator[MachineFact]:
 
 def _chain_fact(machine: Machine) -> MachineFact:
     folder, chains = machine.path.parent, machine.chains
-    rows = tuple((x.name, _relative_path(x.urdf, folder), x.parent or "") for x in chains)
-    return MachineFact("chains", ", ".join(x.name for x in chains), ("", "", "on"), rows)
+    return MachineFact(
+        "chains",
+        ", ".join(x.name for x in chains),
+        ("", "", "on"),
+        tuple((x.name, _relative_path(x.urdf, folder), x.parent or "") for x in chains),
+    )
 
 
 def _relative_path(file: Path, folder: Path) -> str:
@@ -60,13 +64,15 @@ def _joint_fact(machine: Machine) -> MachineFact:
     """Return all joints, active ones first."""
     free_text = f" and {len(machine.free)} free" if machine.free else ""
     mass = sum(inertia.mass for inertia in list(machine.model.inertias)[1:])
-    columns = [*machine.closure.active, *machine.closure.passive]
     return MachineFact(
         "joints",
         f"{len(machine.joints)}, of which {len(machine.driven_joints)} active{free_text}; "
         f"moving mass {format_quantity(mass, 'kg', 4)}",
         ("", "", "home", "effort", ""),
-        tuple(_joint_row(machine, int(i)) for i in columns),
+        tuple(
+            _joint_row(machine, int(i))
+            for i in [*machine.closure.active, *machine.closure.passive]
+        ),
     )
 
 
@@ -80,14 +86,13 @@ def _joint_row(machine: Machine, joint_index: int) -> tuple[str, ...]:
         if driven and isfinite(effort) and effort
         else ""
     )
-    role = "passive" if not driven else "free" if joint in machine.free else "driven"
     lower, upper = machine.coordinates.lower[joint_index], machine.coordinates.upper[joint_index]
     return (
         joint,
         _format_limits(lower, upper, unit),
         f"{machine.home[joint_index]:.5g} {unit}",
         max_effort,
-        role,
+        ("passive" if not driven else "free" if joint in machine.free else "driven"),
     )
 
 

@@ -20,8 +20,7 @@ from crane.recordings.recording_summary import summarize
 from crane.view.machine_facts import MachineFact, machine_facts
 from crane.view.page.html_document import html_table
 from crane.view.page.report_page import report_html
-from crane.view.plots.image_tags import image_tag, svg_tag
-from crane.view.plots.recording_figure import FIGURE_STYLE
+from crane.view.plots.figure_style import FIGURE_STYLE, image_tag, svg_tag
 from crane.view.result_files import figure_function, notebook_figures, result_files
 from crane.view.sketches.sketch_figure import sketch_figure
 
@@ -90,8 +89,10 @@ def _figure_images(value: Any) -> Iterator[str]:
                 yield svg_tag(sketch_figure(value), f"sketch of {value.name}")
             for name in notebook_figures(value):
                 result = figure_function(name)(value)
-                figures = result if isinstance(result, list) else [result]
-                yield from (image_tag(figure, repr(value)) for figure in figures[:_MAX_FIGURES])
+                yield from (
+                    image_tag(figure, repr(value))
+                    for figure in (result if isinstance(result, list) else [result])[:_MAX_FIGURES]
+                )
     except CraneError as error:
         yield _note_paragraph(f"no picture: {error}")
 
@@ -131,8 +132,11 @@ def _split_blocks(text: str, render_text: Callable[[str], str]) -> Iterator[str]
 
 def _render_markdown(text: str) -> str:
     """Markdown of lists, tables, bold words and code; HTML, links and images are but text."""
-    rules = ["backticks", "emphasis", "heading", "list", "table"]
-    return MarkdownIt("zero").enable(rules).render(text)
+    return (
+        MarkdownIt("zero")
+        .enable(["backticks", "emphasis", "heading", "list", "table"])
+        .render(text)
+    )
 
 
 def _preformatted(text: str) -> str:

@@ -76,8 +76,11 @@ def write_result(
     """Write a result into a folder, see `Result.write`."""
     files, folder = _checked_files(result, options), Path(folder)
     check_folder_is_writable(folder, overwrite)
-    stale = [*files.more_files, *(files.stale(result, folder) if files.stale else ())]
-    with replace_folder(folder, overwrite, stale) as part:
+    with replace_folder(
+        folder,
+        overwrite,
+        [*files.more_files, *(files.stale(result, folder) if files.stale else ())],
+    ) as part:
         text = files.text(result, **options)
         if files.summary:
             (part / files.summary).write_text(text, encoding="utf-8")
@@ -138,7 +141,7 @@ def _view_function(name: str) -> Callable[..., Any]:
 
 
 def _write_figure(path: Path, function: str, *arguments: Any) -> None:
-    from crane.view.plots.recording_figure import write_figure
+    from crane.view.plots.figure_style import write_figure
 
     write_figure(path, lambda: figure_function(function)(*arguments))
 
@@ -221,7 +224,7 @@ def _power_comparison_text(comparison: Any, **_: object) -> str:
 
 def _write_design(result: Any, folder: Path) -> None:
     for name, chart in zip(("before", "after"), result.capacity_charts() or (), strict=False):
-        _write_figure(folder / f"{name}.png", "capacity_figure.capacity_figure", chart)
+        _write_figure(folder / f"{name}.png", "rating_figures.capacity_figure", chart)
     _write_machine(
         lambda: write_machine(result.variant(), folder / MACHINE_FOLDER),
         "the machine is not written, take its numbers from design.md",
@@ -261,8 +264,10 @@ def _write_machine(write: Callable[[], object], consequence: str) -> None:
 def _machine_files(machine: Machine, folder: Path) -> Sequence[str]:
     """Machine files of an earlier result in a folder, unless the machine was read from them."""
     target = (folder / MACHINE_FOLDER).resolve()
-    read_files = (machine.path, *(chain.urdf for chain in machine.chains))
-    is_read = any(file.resolve().is_relative_to(target) for file in read_files)
+    is_read = any(
+        file.resolve().is_relative_to(target)
+        for file in (machine.path, *(chain.urdf for chain in machine.chains))
+    )
     if is_read or not (folder / REPORT).is_file():
         return ()
     return [f"{MACHINE_FOLDER}/**/*.{suffix}" for suffix in ("yaml", "urdf")]
@@ -312,7 +317,7 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         summary="capacity.md",
         tables={"capacity.csv": "to_csv"},
         figures={
-            "capacity.png": "capacity_figure.capacity_figure",
+            "capacity.png": "rating_figures.capacity_figure",
             "sheet.pdf": "capacity_sheet.capacity_sheet_figure",
         },
         documents={"capacity.html": "page.capacity_page.write_capacity_page"},
@@ -320,7 +325,7 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         more=_write_capacity_derivatives,
         more_files=("slopes.csv",),
         options=("torques", "parameters"),
-        notebook_figures=("capacity_figure.capacity_figure",),
+        notebook_figures=("rating_figures.capacity_figure",),
     ),
     "Comparison": ResultFiles(
         summary="comparison.md",
@@ -341,13 +346,13 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
     "Design": ResultFiles(
         summary="design.md",
         tables={"solutions.csv": "to_csv"},
-        figures={"design.png": "design_figure.design_figure"},
+        figures={"design.png": "study_figures.design_figure"},
         more=_write_design,
         more_files=("before.png", "after.png", _MACHINE),
     ),
     "Excitation": ResultFiles(
         tables={"reference.csv": "to_csv", "coefficients.yaml": "to_yaml"},
-        figures={"reference.png": "excitation_figure.excitation_figure"},
+        figures={"reference.png": "identification_figures.excitation_figure"},
     ),
     "Identification": ResultFiles(
         tables={"parameters.csv": "to_csv"},
@@ -404,15 +409,15 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
     ),
     "SignalExcitation": ResultFiles(
         tables={"signals.csv": "to_csv"},
-        figures={"signals.png": "excitation_figure.signals_figure"},
+        figures={"signals.png": "identification_figures.signals_figure"},
     ),
     "Study": ResultFiles(
-        tables={"study.csv": "to_csv"}, figures={"study.png": "study_figure.study_figure"}
+        tables={"study.csv": "to_csv"}, figures={"study.png": "study_figures.study_figure"}
     ),
     "ToolForce": ResultFiles(
         summary="tool_force.md",
         tables={"tool_force.csv": "to_csv"},
-        figures={"tool_force.png": "tool_force_figure.tool_force_figure"},
+        figures={"tool_force.png": "rating_figures.tool_force_figure"},
     ),
     "ValveCurve": ResultFiles(
         summary="valve.txt",
@@ -424,11 +429,11 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
     "WorkingRange": ResultFiles(
         summary="working_range.md",
         tables={"working_range.csv": "to_csv"},
-        figures={"working_range.png": "working_range_figure.working_range_figure"},
+        figures={"working_range.png": "workspace_figures.working_range_figure"},
     ),
     "Workspace": ResultFiles(
         summary="workspace.md",
         tables={"workspace.csv": "to_csv", "curves.csv": "curves_to_csv"},
-        figures={"workspace.png": "workspace_figure.workspace_figure"},
+        figures={"workspace.png": "workspace_figures.workspace_figure"},
     ),
 }

@@ -1,1 +1,1 @@
-"""The reduced-scale forwarder paper, computed again; see scripts/reproduce_mini_forwarder.py."""
+"""Repetition of the reduced-scale forwarder paper; see scripts/reproduce_mini_forwarder.py."""

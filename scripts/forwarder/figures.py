@@ -1,4 +1,4 @@
-"""Figures like 8 to 10 of the paper, and what the formulations and reconstructions do."""
+"""Figures like 8 to 10 of the paper, and effects of formulations and reconstructions."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from crane.common.atomic_output import replace_file
 from crane.common.samples import Array
-from crane.view.plots.recording_figure import FIGURE_STYLE
+from crane.view.plots.figure_style import FIGURE_STYLE
 from forwarder.paper import JOINTS, SIGNALS, TASKS, published
 from forwarder.runs import Run
 

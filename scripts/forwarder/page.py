@@ -1,4 +1,4 @@
-"""docs/validation/mini_forwarder.md: tables and what they mean."""
+"""Tables and text of docs/validation/mini_forwarder.md."""
 
 from collections.abc import Iterable
 
@@ -16,29 +16,43 @@ ROWS = ((0, 1.0), (0, 5.0), (1, 1.0), (2, 1.0))
 
 # Why a number lies outside, by task, factor and signal; {gap} is how far the last one is.
 REASONS = {
-    ("loading", 1.0, "tau_1"): "the row of trajectory 1 is too small throughout (next three rows)",
-    ("loading", 1.0, "F_A1"): "the row of trajectory 1 is too small throughout",
-    ("loading", 1.0, "F_A2"): "the row of trajectory 1 is too small throughout",
-    ("loading", 5.0, "tau_1"): "the factor is only near five: with 5.2 both are inside",
-    ("loading", 5.0, "F_A1"): "links 4, 5 and 6 and the actuator A2 ride on link 2, and A1 lifts "
-    "them; the decoupled form forgets it, and the printed friction was chosen with that form",
-    ("return", 1.0, "F_A1"): "what rides on link 2, as in trajectory 1",
-    ("return", 1.0, "F_A2"): "by {gap}, less than what any of the reconstructed numbers moves it",
-    ("lift", 1.0, "tau_1"): "Table 2 prints 0; ours is the offset Delta_C = 0.011 N m, which acts "
-    "at rest too if (5) is read to the letter",
+    (
+        "loading",
+        1.0,
+        "tau_1",
+    ): "all values of trajectory 1 in Table 2 are too small (see the next three rows)",
+    ("loading", 1.0, "F_A1"): "all values of trajectory 1 in Table 2 are too small",
+    ("loading", 1.0, "F_A2"): "all values of trajectory 1 in Table 2 are too small",
+    ("loading", 5.0, "tau_1"): "the factor is only approximately five: with 5.2 both are inside",
+    (
+        "loading",
+        5.0,
+        "F_A1",
+    ): "link 2 carries links 4, 5 and 6 and the actuator A2, and A1 lifts them; the "
+    "decoupled form neglects this, and the published friction was tuned with that form",
+    ("return", 1.0, "F_A1"): "the bodies that link 2 carries, as in trajectory 1",
+    ("return", 1.0, "F_A2"): "by {gap}, less than the effect of any reconstructed value",
+    (
+        "lift",
+        1.0,
+        "tau_1",
+    ): "Table 2 gives 0; here it is the offset Delta_C = 0.011 N m, which also acts at rest "
+    "if (5) is taken literally",
     (
         "lift",
         1.0,
         "F_A1",
-    ): "exact: what rides on link 2; decoupled: above the upper bound by {gap}, and "
-    "none of the reconstructed numbers brings it down to it, nor does a controller that starts "
-    "with empty integrals (1 % less); masses from CAD that are too large by as much would",
+    ): "exact: the bodies that link 2 carries; decoupled: above the upper bound by {gap}, "
+    "which no reconstructed value corrects, nor a controller that starts with empty "
+    "integrals (1 % less); masses from CAD that are too large by this amount would "
+    "explain it",
 }
 PRINTED = (
-    "Friction as printed: all numbers that are outside are so because this friction pushes the "
-    "crane along; its tip leaves the path by {} mm (trajectories 1, 2, 3), so nobody can have "
-    "simulated that. Printed or turned, the offset of X2's Coulomb friction (21.5 N) is larger than "
-    "its mean (7.5 N): a constant force hides in it, and the machine file keeps it as it is."
+    "Friction as printed: the values outside are due to this friction, which drives the "
+    "crane; the tip deviates from the path by {} mm (trajectories 1, 2, 3), so the "
+    "published simulation cannot have used it. With either sign, the offset of X2's "
+    "Coulomb friction (21.5 N) is larger than its mean (7.5 N): it probably contains a "
+    "constant force, and the machine file keeps it unchanged."
 )
 
 
@@ -138,11 +152,12 @@ def scoreboard(runs: Runs, ranges: Ranges) -> str:
     return "\n\n".join(
         [
             "## Scoreboard against Table 2",
-            "Table 2 gives the measured forces' energies I_VE over 10 s and those of the "
-            "differences, I_VD. So the RMS of the published simulation lies within "
-            "(1 +- sqrt(PE)) of the measured RMS. Bold: ours lies there, too. With friction that "
-            f"brakes and trajectory 1 times five, that are {count['decoupled']} of 9 for the "
-            f"decoupled form, which the paper used, and {count['exact']} of 9 for the exact one.",
+            "Table 2 gives the energies I_VE of the measured forces over 10 s and those of the "
+            "differences, I_VD. So the RMS of the published simulation lies within (1 +- "
+            "sqrt(PE)) of the measured RMS. Bold values also lie in this interval. With friction "
+            f"that brakes and trajectory 1 times five, these are {count['decoupled']} of 9 for "
+            f"the decoupled form, which the paper used, and {count['exact']} of 9 for the exact "
+            "one.",
             table(head, rows),
             "![RMS of the forces in their published intervals](images/mini_forwarder_scoreboard.png)",
             "Outside, with friction that brakes:",
@@ -188,23 +203,25 @@ def rig_errors(runs: Runs, measured: dict[str, Run], rig: Rig, wins: dict[int, A
     pictures = "\n\n".join(f"![Trajectory {k}](images/mini_forwarder_{k}.png)" for k in (1, 2, 3))
     return "\n\n".join(
         [
-            "## The simulations against a virtual rig, like Figures 8 to 10",
-            "The experiment was never published as data. In its place stands a **virtual rig** "
-            f"(`rig`, seed {rig.seed}): the exact model with masses, pins and friction drawn "
-            "within tolerances, stiction, an encoder of 0.042 deg, potentiometers of 12 bits, "
-            "PI control at 1 kHz on what these tell, and forces from currents by (8). Its "
-            f"resistors err by {gains} (tau_1, F_A1, F_A2). It is no measurement and says nothing "
-            "about the real crane; it says what such an experiment can tell.",
+            "## Comparison with a virtual rig, like Figures 8 to 10",
+            "The experiment was not published as data. It is replaced by a **virtual rig** "
+            f"(`rig`, seed {rig.seed}): the exact model with masses, pins and friction drawn at "
+            "random within tolerances, stiction, an encoder of 0.042 deg, potentiometers of 12 "
+            "bits, PI control at 1 kHz on their readings, and forces from currents by (8). The "
+            f"errors of its resistors are {gains} (tau_1, F_A1, F_A2). It is not a measurement "
+            "and gives no information about the real crane; it shows what such an experiment can "
+            "determine.",
             pictures,
             "Percentage errors (9), as in Table 2:",
             table(head, rows),
-            f"Of {len(wins)} rigs (seeds {min(wins)} to {max(wins)}) the exact form has the smaller "
-            f"error of F_A1 in {count[:, 1].sum()} of {count[:, 1].size} recordings and of F_A2 in "
-            f"{count[:, 2].sum()}, although the rigs are exact machines. Resistors of 5 to 10 % hide "
-            "most of what the formulations differ by: an experiment that measures force by these "
-            "currents cannot decide between them, a load cell would.",
+            f"Of {len(wins)} rigs (seeds {min(wins)} to {max(wins)}) the exact form has the "
+            f"smaller error of F_A1 in {count[:, 1].sum()} of {count[:, 1].size} recordings and "
+            f"of F_A2 in {count[:, 2].sum()}, although the rigs are exact machines. Errors of the "
+            "resistors of 5 to 10 % hide most of the difference between the formulations: an "
+            "experiment that measures force by these currents cannot decide between them; a load "
+            "cell would.",
             "PE of tau_1 in trajectory 3, where the crane does not slew, compares friction and "
-            "noise around zero; the paper prints 0.",
+            "noise around zero; the paper gives 0.",
         ]
     )
 
@@ -234,14 +251,15 @@ def sensitivity(ranges: Ranges) -> str:
     return "\n\n".join(
         [
             "## What the reconstructed numbers do",
-            "The pins G and K are not printed and the actuators' mass is lost. Both pins were "
-            "drawn within 6 mm of the reconstruction and the mass from 28 to 56 g (an L12 of any "
-            "stroke). A variant counts if all three trajectories stay within the strokes, if the "
-            f"strokes reverse within half a second of what the text says ({facts}), and if X1' "
-            "stays within 0.5 mm/s of -2 mm/s from second 2 to 8 of `loading`. Of "
-            f"{ranges.draws} draws each remained: {kept}. They span {spans}. RMS of the forces, "
-            "least to largest, from inverse dynamics along the reference at 10 Hz (no control "
-            "errors, so the values differ a little from the scoreboard's):",
+            "The positions of the pins G and K and the actuators' mass are not published. Both "
+            "pins were drawn at random within 6 mm of the reconstruction and the mass from 28 to "
+            "56 g (an L12 of any stroke). A variant is accepted if all three trajectories stay "
+            "within the strokes, if the strokes reverse within half a second of the times in the "
+            f"text ({facts}), and if X1' stays within 0.5 mm/s of -2 mm/s from second 2 to 8 of "
+            f"`loading`. Of {ranges.draws} draws each, these were accepted: {kept}. They span "
+            f"{spans}. RMS of the forces, least to largest, from inverse dynamics along the "
+            "reference at 10 Hz (no control errors, so the values differ a little from the "
+            "scoreboard's):",
             table(head, rows),
         ]
     )
@@ -261,22 +279,22 @@ def neglected(found: dict[str, tuple[Array, Array, Array]], work: dict[str, floa
     return "\n\n".join(
         [
             "## What the decoupled form neglects",
-            "Equation (21) is block-diagonal: each sub-chain moves on a base held still. Projected "
-            "with gamma it lacks what a chain puts on the chain that carries it, first of all "
-            "weight: links 4 and 6 ride on link 2, link 5 on link 3, A1, A2 and link 2 on link 1. "
-            "Largest difference to the exact form over the whole rectangle of the strokes, without "
-            "friction; at speed: all signs of the largest velocities (and accelerations) of the "
-            "three trajectories:",
+            "Equation (21) is block-diagonal: each sub-chain moves on a fixed base. Projected "
+            "with gamma it lacks the forces of a chain on the chain that carries it, mainly "
+            "gravity: link 2 carries links 4 and 6, link 3 carries link 5, link 1 carries A1, A2 "
+            "and link 2. The table shows the largest difference to the exact form over the whole "
+            "rectangle of the strokes, without friction; at speed: all signs of the largest "
+            "velocities (and accelerations) of the three trajectories:",
             table(head, rows),
-            "At the speeds of this crane it is a matter of weight: velocities and accelerations "
-            "add little. tau_1 is hardly touched because the slewing axis is vertical. The weights "
-            "of the decoupled form have no potential: around the rectangle of the inner 80 % of "
-            f"both strokes they do {1e3 * work['decoupled']:.1f} mJ of work, the exact ones "
-            f"{1e3 * work['exact']:.0e} mJ. A simulation with it neither keeps energy nor can be "
-            "tested by it.",
-            "That the difference is exactly the carried chains' wrench on their bases is tested: "
-            "`tests/test_formulation.py` (each block against Pinocchio on the lone sub-chain, and "
-            "the sum of base wrenches times base Jacobians, both to 1e-12).",
+            "At the speeds of this crane gravity dominates: velocities and accelerations add "
+            "little. tau_1 hardly changes because the slewing axis is vertical. Gravity in the "
+            "decoupled form has no potential: around the rectangle of the inner 80 % of both "
+            f"strokes its work is {1000.0 * work['decoupled']:.1f} mJ, that of the exact form "
+            f"{1000.0 * work['exact']:.0e} mJ. A simulation with it does not conserve energy and "
+            "cannot be checked by its energy balance.",
+            "`tests/test_formulation.py` checks that the difference is exactly the wrench of the "
+            "carried chains on their bases (each block against Pinocchio on the single "
+            "sub-chain, and the sum of base wrenches times base Jacobians, both to 1e-12).",
         ]
     )
 
@@ -299,12 +317,12 @@ def tracking(errors: dict[str, dict[str, Array]]) -> str:
             "## Tracking",
             "Distance of the tip from its reference [mm], largest and median, exact form:",
             table(("", "trajectory 1", "2", "3"), rows),
-            "PI control as in (7) knows neither the load nor the velocity of the reference. Three "
-            "things make its error: the references set out with a velocity while the crane stands "
-            "still (Figures 8 to 10 must show the same start); Coulomb friction turns its sign "
-            "where a stroke reverses, and until the integral has turned too the actuator waits; "
-            "and while the force keeps changing an error F' / K_i remains, because only an error "
-            "makes the integral grow. The last row is that formula alone, from the reference.",
+            "PI control as in (7) uses neither the load nor the velocity of the reference. Its "
+            "error has three causes: the references start with a velocity while the crane is at "
+            "rest (Figures 8 to 10 must show the same start); Coulomb friction changes its sign "
+            "where a stroke reverses, and the actuator waits until the integral has followed; "
+            "and while the force changes, an error F' / K_i remains, because the integral grows "
+            "only with an error. The last row is this formula alone, from the reference.",
         ]
     )
 
@@ -319,13 +337,14 @@ def misprints() -> str:
 def whole(parts: list[str]) -> str:
     """The page."""
     head = (
-        "# The reduced-scale forwarder paper, computed again\n\n"
-        "Written by `scripts/reproduce_mini_forwarder.py` (`make reproduce`). The paper: "
-        "*Design, rapid manufacturing and modeling of a reduced-scale forwarder crane with closed "
-        "kinematic chain*, Mechanics Based Design of Structures and Machines. The machine: "
-        "`models/mini_forwarder.yaml`, whose comments say which number is printed, corrected, "
-        "reconstructed or assumed. Nothing is fitted to the tables below except the pins G and K, "
-        "which the paper does not print. Friction is smooth over 0.01 rad/s and 1 mm/s, A; that of the "
-        "virtual rig sticks."
+        "# Validation: the reduced-scale forwarder paper\n\nThis page repeats the computations "
+        "of a paper and compares the results with the published values. It is written by "
+        "`scripts/reproduce_mini_forwarder.py` (`make reproduce`). The paper: *Design, rapid "
+        "manufacturing and modeling of a reduced-scale forwarder crane with closed kinematic "
+        "chain*, Mechanics Based Design of Structures and Machines. The machine: "
+        "`models/mini_forwarder.yaml`, whose comments state which values are published, "
+        "corrected, reconstructed or assumed. Nothing is fitted to the tables below except "
+        "the pins G and K, which the paper does not give. Friction is smoothed over 0.01 "
+        "rad/s and 1 mm/s (assumed); the virtual rig has stiction."
     )
     return "\n\n".join([head, *parts]) + "\n"

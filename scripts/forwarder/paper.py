@@ -1,4 +1,4 @@
-"""What the reduced-scale forwarder paper prints: tables, facts in the text, misprints."""
+"""Published values of the reduced-scale forwarder paper: tables, facts in the text, misprints."""
 
 from dataclasses import dataclass
 
@@ -34,19 +34,20 @@ CRUISE = -2e-3  # [m/s] X1' of trajectory 1 from second 2 to 8
 
 MISPRINTS = (
     ("Table 1", "friction coefficients negative, with + F_F on the left of (6): they would drive "
-     "the motion", "signs turned; tau_1 of trajectory 2 confirms it (see the scoreboard)"),
+     "the motion", "signs reversed; tau_1 of trajectory 2 confirms it (see the scoreboard)"),
     ("(7)", "K_i1 in the second row, K_p2 twice in Table 1", "one pair of gains per joint"),
-    ("Table 2", "rows and columns scrambled", "PE = I_VD / I_VE puts every number in its place"),
-    ("Table 2, trajectory 1", "integrals smaller by about five than the text's statement that "
-     "F_A1 agrees with trajectory 3 allows", "both readings are on the scoreboard; PE does not "
-     "depend on it"),
+    ("Table 2", "rows and columns scrambled",
+     "PE = I_VD / I_VE identifies the place of every number"),
+    ("Table 2, trajectory 1", "integrals about five times smaller than the text's statement "
+     "that F_A1 agrees with trajectory 3 permits",
+     "both readings are on the scoreboard; PE does not depend on it"),
     ("Table 4", "unit gr/m3 of the inertias", "g m2"),
     ("Table 4, links 3 to 7", "inertias about the proximal pin, not the centre of mass: their "
      "radii of gyration exceed half the length", "moved to the centre of mass"),
-    ("Table 4, link 2", "inertia 0.00817 g m2, a tenth of what a body of that size has",
+    ("Table 4, link 2", "inertia 0.00817 g m2, a tenth of that of a body of this size",
      "0.0817 g m2"),
-    ("Table 4(h)", "the actuators' mass is lost, values shifted by one row",
-     "0.034 kg assumed; its influence is below"),
+    ("Table 4(h)", "the actuators' mass is missing, values shifted by one row",
+     "0.034 kg assumed; its effect is shown below"),
     ("before (13)", "A_2^0 and A_3^0 count links on the left, rows of Table 3(a) on the right: "
      "read literally, poses are off by 5 cm", "CM3 stands on rows 1 to 3, CM7 on rows 1 to 5"),
     ("(13), Table 4(b)", "PCY3 in the equation, PCZ3 in the table", "the same length, 0.0109 m"),
@@ -55,8 +56,9 @@ MISPRINTS = (
     ("Table 4(f)", "A2B and A2C rounded to 0.1 mm",
      "0.042426 m and 0.051614 m, from the triangle"),
     ("not printed", "pins G (rod eye of A2 on link 3) and K (link 6 on link 7)",
-     "reconstructed; their influence is below"),
-    ("(10), (11)", "trajectory 2 is said to start where trajectory 1 ends: 2 cm apart",
+     "reconstructed; their effect is shown below"),
+    ("(10), (11)", "according to the text trajectory 2 starts where trajectory 1 "
+     "ends; they are 2 cm apart",
      "taken as printed"),
     ("2.5.1", "percentage error: a ratio of energies", "the relative RMS error is its root"),
 )  # fmt: skip

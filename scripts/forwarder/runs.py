@@ -150,13 +150,13 @@ def tip_errors(machine: crane.Machine, path: crane.motion.Trajectory) -> dict[st
     e = F' / K_i remains wherever the force keeps changing.
     """
     q, v, a = path(0.0)
-    out = {"as it is": simulate(machine, path, "exact", "braking").tip_error}
+    out = {"without changes": simulate(machine, path, "exact", "braking").tip_error}
     smooth = {
         joint: dataclasses.replace(friction, coulomb=0.0)
         for joint, friction in machine.friction.items()
     }
     for name, plant in (
-        ("set out with the reference's velocity and the force of that motion", machine),
+        ("start with the reference's velocity and the force of that motion", machine),
         ("and without Coulomb friction", machine.replace(friction=smooth)),
     ):
         ki = np.array([plant.control[joint].ki for joint in plant.active])

@@ -1,1 +1,1 @@
-"""The electro-hydraulic forwarder paper again; see scripts/reproduce_hydraulic_forwarder.py."""
+"""Repetition of the electro-hydraulic paper; see scripts/reproduce_hydraulic_forwarder.py."""

@@ -1,4 +1,4 @@
-"""The crane, its motions, and the logger: what takes the place of the paper's laboratory."""
+"""The crane, its motions, and the logger: a simulated replacement of the paper's laboratory."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence

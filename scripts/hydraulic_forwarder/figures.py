@@ -12,8 +12,8 @@ from crane.common.samples import Array
 from crane.identification.hydraulics.cylinder_friction import CylinderFriction
 from crane.identification.hydraulics.valve_curve import ValveCurve
 from crane.identification.signals.signal_processing import Motion
+from crane.view.plots.figure_style import DASHED_STYLE, FIGURE_STYLE, RECORDED_COLOUR
 from crane.view.plots.identification_figures import draw_friction, draw_valve_curve
-from crane.view.plots.recording_figure import DASHED_STYLE, FIGURE_STYLE, RECORDED_COLOUR
 from hydraulic_forwarder.mechanics import HeldOutForces
 
 LIGHT = {"color": "#c9c9c9", "linewidth": 0.6}

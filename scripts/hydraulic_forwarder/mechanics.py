@@ -6,14 +6,14 @@ import numpy as np
 
 import crane
 from crane.common.samples import Array
-from crane.identification.mechanics.force_terms import friction_term
 from crane.identification.mechanics.identification_result import Identification
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.model_term import (
+from crane.identification.mechanics.model_terms import (
     InertialTerm,
     ModelTerm,
     MotionSamples,
     body_names,
+    friction_term,
 )
 from crane.identification.signals.signal_processing import Motion, differentiate, low_pass
 from hydraulic_forwarder.experiment import CYLINDERS, STEP, Crane, averaged

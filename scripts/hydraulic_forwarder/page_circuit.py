@@ -1,4 +1,4 @@
-"""The part of the page on (21) to (32), valve and friction."""
+"""Section of the page about (21) to (32), valve and friction."""
 
 import numpy as np
 
@@ -36,17 +36,17 @@ def lifting(found: Results) -> str:
     return "\n\n".join(
         [
             "## Orifices and oil: (29) to (32)",
-            "The lift boom alone, three references of other amplitude and frequency:",
+            "Only the lift boom moves, with three references of different amplitude and "
+            "frequency:",
             table(head, rows),
             "![References, control input, rate of the force](../images/hydraulic_forwarder_8.png)",
-            "As Figure 8, one averaged period each. u is larger than the paper's, as its first "
-            "0.1143 open nothing. F' is larger because nothing has filtered the boom's swing "
-            "away; "
-            f"below 0.5 Hz it is {slow} kN/s. That swing is what tells 1/beta: the RMS of F'/beta "
-            f"is {share} of that of Y. By the paper's ranges F'/beta is at most {printed:.4f} of "
-            "Y "
-            f"(with beta = {STIFF:g} Pa), less than any sensor's error: such data tell c1 to c4, "
-            "hardly beta. The paper prints no value of its X.",
+            "This corresponds to Figure 8, one averaged period each. u is larger than the "
+            "paper's, because its first 0.1143 open nothing. F' is larger because the boom's "
+            f"oscillation is not filtered out; below 0.5 Hz it is {slow} kN/s. This oscillation "
+            f"determines 1/beta: the RMS of F'/beta is {share} of that of Y. In the paper's "
+            f"ranges F'/beta is at most {printed:.4f} of Y (with beta = {STIFF:g} Pa), less than "
+            "any sensor's error: such data determine c1 to c4, but hardly beta. The paper gives "
+            "no value of its X.",
         ]
     )
 
@@ -78,32 +78,31 @@ def orifices(found: Results) -> str:
     both = ", ".join(f"{name} {percent(x)}" for name, x in found.all_joints.items())
     return "\n\n".join(
         [
-            "**Without noise**, on the paper's crane (rigid hoses and walls, no leakage, a spool "
-            "that follows at once), through the logger's file and back, not averaged, relative "
-            "errors of X:",
+            "**Without noise**, for the paper's crane (rigid hoses and walls, no leakage, a "
+            "spool without dynamics), written to and read from the logger's file, not averaged, "
+            "relative errors of X:",
             table(("method", *PARAMETER_NAMES), clean),
-            "`ls` is the paper's (36) on the smoother's F' and x'; `weak` is (29) integrated "
-            "over windows, nothing differentiated; `chambers` both equations (23).",
+            "`ls` is the paper's (36) with the smoother's F' and x'; `weak` is (29) integrated "
+            "over windows, without differentiation; `chambers` is both equations (23).",
             "**With noise**, X from the three recordings; relative errors of (29) on each "
-            "recording by X of the other two. Bold: the truth (for 1/beta that of the oil alone) "
-            "is outside of the 95 % interval.",
+            "recording with X of the other two. Bold: the true value (for 1/beta that of the oil "
+            "alone) is outside of the 95 % interval.",
             table(("", *PARAMETER_NAMES, "(29) held out"), rows),
-            "- All methods find c1 to c4 to less than 1 %. `chambers` knows them "
-            f"{ratio.min():.0f} to {ratio.max():.0f} times better than `weak`, because in (29) c1 "
-            "and c2 differ only by how V_A / V_B changes "
-            "along the stroke.\n"
-            "- 1/beta of `ls` is wrong, even negative, and its interval does not tell. The "
-            "smoother takes the boom's swing in the stroke, some hundredths of a millimetre, for "
-            "noise, in the force it does not; so F' has no counterpart in Y. With a tenth of the "
-            f"noise, as of a hundred times the periods, the error is {quiet}.\n"
-            "- On the machine, c1 to c4 are off by some tenths of a percent, more than their "
-            "intervals say: those count noise, not the leakage (20 ml/min at 100 bar), which the "
-            "equations do not have. Without leakage (and noise) `chambers` has them right to "
-            f"{tight:.0e}.\n"
-            f"- (29) on sets 1 and 2, in which all joints move, by X of `chambers`: {both}.",
+            "- All methods estimate c1 to c4 to less than 1 %. The standard deviations of "
+            f"`chambers` are {ratio.min():.0f} to {ratio.max():.0f} times smaller than those of "
+            "`weak`, because in (29) c1 and c2 differ only by the change of V_A / V_B along the "
+            "stroke.\n- 1/beta of `ls` is wrong, even negative, and its interval does not show "
+            "it. The smoother treats the boom's oscillation in the stroke, some hundredths of a "
+            "millimetre, as noise, but not that in the force; so F' has no counterpart in Y. "
+            "With a tenth of the noise, as with a hundred times the periods, the error is "
+            f"{quiet}.\n- For the machine, the errors of c1 to c4 are some tenths of a per cent "
+            "and exceed their intervals, which include noise but not the leakage (20 ml/min at "
+            "100 bar), which the equations neglect. Without leakage (and noise) the errors of "
+            f"`chambers` are {tight:.0e}.\n- (29) on sets 1 and 2, in which all joints move, with "
+            f"X of `chambers`: {both}.",
             "![Both sides of (29)](../images/hydraulic_forwarder_9.png)",
-            "As Figure 9, on the machine, method `chambers`: each recording by X of the other "
-            "two. X of all three:",
+            "This corresponds to Figure 9, for the machine, method `chambers`: each recording "
+            "with X of the other two. X of all three:",
             table(("", "true", "identified", "95 % interval"), values),
         ]
     )
@@ -126,18 +125,18 @@ def modulus(found: Results) -> str:
     return "\n\n".join(
         [
             "### Which beta",
-            "The equations have one constant beta. The machine's chambers have "
-            "1/K = 1/B_oil + ((V - V_h) / V) / B_steel + (V_h / V) / B_hose, which depends on the "
-            "stroke: the less oil in the cylinder, the larger the hose's share. Over the strokes "
-            "of the three recordings:",
+            "The equations have one constant beta. For the chambers of the machine 1/K = 1/B_oil "
+            "+ ((V - V_h) / V) / B_steel + (V_h / V) / B_hose, which depends on the stroke: the "
+            "less oil in the cylinder, the larger the share of the hose. Over the strokes of the "
+            "three recordings:",
             table(("", "1/K [1/Pa]", "K [1e9 Pa]"), rows),
-            "What is identified is a mean of both chambers' 1/K, mostly of where the boom swings "
+            "The estimate is a mean of 1/K of both chambers, mainly where the boom oscillates "
             f"and pressures change. It is {percent(X.values[0] * OIL - 1)} above that of the oil "
-            "alone; the chambers' own are up to "
-            f"{percent(max(high_a, high_b) / X.values[0] - 1)} above it. For c1 to c4 it does not "
-            "matter: "
-            "F'/beta is below a percent of Y. With rigid hoses and walls, where beta is the "
-            f"oil's, it is {rigid.values[0]:.3g} ({span(a, b)}) for {1 / OIL:.3g} 1/Pa.",
+            "alone; those of the chambers are up to "
+            f"{percent(max(high_a, high_b) / X.values[0] - 1)} above it. For c1 to c4 this has no "
+            "effect: F'/beta is below a per cent of Y. With rigid hoses and walls, where beta is "
+            f"the oil's, the estimate is {rigid.values[0]:.3g} ({span(a, b)}) for {1 / OIL:.3g} "
+            "1/Pa.",
         ]
     )
 
@@ -152,20 +151,20 @@ def assumptions(found: Results) -> str:
     )
     return "\n\n".join(
         [
-            "### What has to be known",
-            "The signal that stands for the opening (machine, `chambers`):",
+            "### Required knowledge",
+            "The signal that is used as the opening (machine, `chambers`):",
             table(("", *PARAMETER_NAMES), signals),
-            "A real crane has the voltage. Its spool's second order is in data sheets; without it "
-            "each c is wrong by a percent in motions as slow as these. A spool sensor would "
-            "tell as much.",
-            "What sensors and numbers that are off do:",
+            "A real crane provides the voltage. The second-order dynamics of its spool are in "
+            "data sheets; without them each c has an error of a per cent in motions as slow as "
+            "these. A spool sensor would give the same information.",
+            "The effect of errors of sensors and known values:",
             table(("", *PARAMETER_NAMES, "misfit"), off),
-            "Offsets of single sensors go into one or two c; the misfit does not see them. What "
-            "has to be right is the valve's middle and dead band: at |u| of 0.2 to 0.3 an error "
-            "of 0.01 is a tenth of the opening. They come from a staircase of the same valve, "
-            f"here without compensation, by `identify_valve`: neutral {neutral} V, dead band "
-            f"{band}. Without compensation the speed bends a little over the voltage, which "
-            "costs a millivolt.",
+            "Offsets of single sensors change one or two c; the misfit does not show them. The "
+            "neutral signal and the dead band of the valve must be accurate: at |u| of 0.2 to "
+            "0.3 an error of 0.01 is a tenth of the opening. `identify_valve` estimates them "
+            f"from a staircase of the same valve, here without compensation: neutral {neutral} V, "
+            f"dead band {band}. Without compensation the speed is slightly nonlinear in the "
+            "voltage, which causes an error of a millivolt.",
         ]
     )
 
@@ -192,15 +191,15 @@ def valve(found: Results) -> str:
     return "\n\n".join(
         [
             "## Valve of the machine as published",
-            "Compensated, 40 l/min. Steps of its voltage of 2.5 s, up and down, speeds by the "
-            "smoother:",
+            "The valve is compensated, 40 l/min. Its voltage has steps of 2.5 s, up and down; "
+            "speeds are those of the smoother:",
             table(("", "true", *found.valves), rows),
-            "The extension, level, is fed by its compensator both ways: middle, dead band and "
-            "flow are as published. The lift boom comes down by its weight: the oil leaves "
-            "through the open edge, faster than the compensator feeds the other side, and the "
-            "speed is no straight line of the voltage; the edge downwards comes out "
-            "some millivolts late, and `flow down` is what leaves, not what the valve is built "
-            "for.",
+            "The extension is horizontal, and its compensator supplies it in both directions: "
+            "neutral signal, dead band and flow are as published. The lift boom is lowered by "
+            "its weight: the oil leaves through the open edge faster than the compensator "
+            "supplies the other side, and the speed is not linear in the voltage; the edge "
+            "downwards is some millivolts late, and `flow down` is the outflow, not the nominal "
+            "flow of the valve.",
         ]
     )
 
@@ -216,17 +215,16 @@ def friction(found: Results) -> str:
             low, high = found.friction.interval()[i]
             row.append(f"{found.friction.values[i]:.4g} ({span(low, high)})")
         else:
-            row.append("not told")
+            row.append("not determined")
         row.append(f"{found.heavy.values[i]:.4g}")
         rows.append(row)
     return "\n\n".join(
         [
             "## Friction of the lift cylinder",
-            "Strokes at nine constant speeds both ways, 3.3 to 45 mm/s; friction is F less "
-            "the load by the machine's masses. Noise is that of "
-            f"{PASSES} passes, averaged: pressures of 0.2 bar are 190 N, almost as much as what "
-            "is "
-            "looked for. One pass does not tell stiction.",
+            "The recording has strokes at nine constant speeds in both directions, 3.3 to 45 "
+            "mm/s; friction is F minus the load from the machine's masses. The noise is that of "
+            f"{PASSES} averaged passes: pressures of 0.2 bar are 190 N, almost as much as the "
+            "friction. One pass does not determine stiction.",
             table(
                 (
                     "",
@@ -237,8 +235,9 @@ def friction(found: Results) -> str:
                 ),
                 rows,
             ),  # fmt: skip
-            "A load that is wrong does not change its sign with the motion: it goes into the "
-            "offset, and only as far as it changes along the stroke into the rest.",
+            "An error of the load does not change its sign with the motion: it becomes part of "
+            "the offset, and influences the other parameters only as far as it changes along the "
+            "stroke.",
             "![Valve curve and friction](../images/hydraulic_forwarder_valve.png)",
         ]
     )

@@ -1,4 +1,4 @@
-"""The part of the page on (1) to (20)."""
+"""Section of the page about (1) to (20)."""
 
 import numpy as np
 
@@ -16,7 +16,7 @@ def torques(found: Results) -> str:
         "closed": "closed chain, friction at cylinders",
         "seven": "the paper's seven, friction at cylinders",
         "seven, friction at joints": "the paper's seven and (15), as (17)",
-        "seven, rest known": "the seven, other bodies' weight known",
+        "seven, rest known": "the seven, gravity of the other bodies known",
     }
     rows = []
     for model, text in words.items():
@@ -34,17 +34,17 @@ def torques(found: Results) -> str:
     return "\n\n".join(
         [
             "## Torques from pressures: (17) to (20)",
-            "Learned from a third motion (60 s, rates like those of set 2), judged by sets 1 and "
-            "2. RMS errors and relative errors, where the joint moves:",
+            "The training data are a third motion (60 s, velocities like those of set 2); sets 1 "
+            "and 2 are held out. RMS errors and relative errors, while the joint moves:",
             table(head, rows),
             "![Set 1: measured and modelled torques](../images/hydraulic_forwarder_6.png)",
             "![Set 2](../images/hydraulic_forwarder_7.png)",
-            "As Figures 6 and 7. Both sides went through one low-pass of "
-            f"{mechanics.BANDWIDTH:g} Hz: after each turn the boom swings on its oil at "
-            f"{found.oscillation:.1f} Hz, which the angles hardly show, so nothing can be "
-            "modelled there (grey). The first row is the floor, noise and what the filter "
-            "lets through; what is above it is mostly that (14) has no stiction. "
-            "With standstill counted, where friction is anything, set 1 has "
+            "These correspond to Figures 6 and 7. Both sides passed one low-pass of "
+            f"{mechanics.BANDWIDTH:g} Hz: after each reversal the boom oscillates on its oil at "
+            f"{found.oscillation:.1f} Hz, which the angles hardly show, so this part cannot be "
+            "modelled (grey). The first row is the lower limit, from noise and the remaining "
+            "oscillation; the excess over it is mainly due to the missing stiction in (14). "
+            "Including standstill, where friction can have any value, the errors of set 1 are "
             f"{', '.join(percent(x) for x in whole)}.",
         ]
     )  # fmt: skip
@@ -84,18 +84,18 @@ def parameters(found: Results) -> str:
     return "\n\n".join(
         [
             "## The seven base parameters (4) to (10)",
-            "The paper's crane is three bodies in a row. Ours carries its cylinders and the "
-            "brackets of the tilt boom's four-bar linkage: six bodies more, whose weight and "
-            "inertia go through the closed loops. Their part of the torques in set 1, RMS as a "
-            "share of the measured, and largest:",
+            "The paper's crane is a chain of three bodies. This crane also has cylinders and the "
+            "brackets of the tilt boom's four-bar linkage: six further bodies, whose weight and "
+            "inertia act through the closed loops. Their contribution to the torques in set 1, "
+            "RMS as a share of the measured torque, and maximum:",
             table(("", *(f"{s} [{u}]" for s, u in zip(SIGNALS, UNITS, strict=True))), shares),
             "So seven parameters are not complete here: they miss "
             f"{percent(found.shares['all of these'][0][0])} of tau_2. Yet they predict as well as "
-            "the closed chain (table above), because most of what is missing is weight that moves "
-            "much like that of the booms: they take it up, and stop being what (4) to (10) say. "
-            "With the other bodies' torques subtracted first (their masses are known) "
-            "theta_2, theta_4, theta_5 and theta_6 are what they should be. Bold: the truth is "
-            "outside of the 95 % interval.",
+            "the closed chain (table above), because the missing part is mainly gravity that "
+            "varies much like that of the booms: the parameters absorb it and no longer have the "
+            "meaning of (4) to (10). If the torques of the other bodies are subtracted first "
+            "(their masses are known), theta_2, theta_4, theta_5 and theta_6 have their correct "
+            "values. Bold: the true value is outside of the 95 % interval.",
             table(
                 (
                     "",
@@ -107,14 +107,14 @@ def parameters(found: Results) -> str:
                 ),
                 rows,
             ),  # fmt: skip
-            "theta_1, theta_3 and theta_7 cannot be told one by one: the lift boom's centre of "
-            "mass lies 2.2 degrees off the line to the elbow (on it, the rank is six), and a "
-            "constant offset of the lift cylinder's friction acts alike. Their sums with "
-            f"L = {L:.3f} m are better told. That of the inertias comes out too low: the lift "
-            "boom's accelerations, up to 0.06 rad/s2, ask it for 55 N m of 12 kN m; the stiction "
-            "that (14) does not have is 28 N m, and both come when the boom starts. With a column "
-            f"for stiction (5 mm/s) it is {sticky:.4g} ({span(least, most, 4)}); "
-            "the rest is there without noise, too.",
+            "theta_1, theta_3 and theta_7 are not identifiable separately: the lift boom's "
+            "centre of mass is 2.2 degrees off the line to the elbow (on it, the rank is six), "
+            "and a constant offset of the lift cylinder's friction has the same effect. Their "
+            f"sums with L = {L:.3f} m are determined better. The estimated sum of the inertias is "
+            "too low: the lift boom's accelerations, up to 0.06 rad/s2, require 55 N m of 12 kN "
+            "m; the stiction that (14) lacks is 28 N m, and both occur when the boom starts. "
+            f"With a column for stiction (5 mm/s) it is {sticky:.4g} ({span(least, most, 4)}); "
+            "the remaining error also occurs without noise.",
             closed_base(found.found["closed"]),
         ]
     )
@@ -137,14 +137,13 @@ def closed_base(one: Identification) -> str:
         )
     bodies = sum(not name.startswith("X_") for name in one.names)
     return (
-        f"For the closed chain the package finds {bodies} inertial base parameters (with friction "
-        f"{len(one.names)}); {covered} of their 95 % intervals hold the truth. Few are told one "
-        "by "
-        "one by motions as slow and as planar as these, which is why `crane identify` shows the "
-        "intervals, and has priors; those known to better than 10 %:\n\n"
+        f"For the closed chain the package finds {bodies} inertial base parameters (with "
+        f"friction {len(one.names)}); {covered} of their 95 % intervals contain the true "
+        "value. Such slow and planar motions determine few of them separately, which is why "
+        "`crane identify` gives intervals and accepts priors; the parameters known to better "
+        "than 10 %:\n\n"
         + table(("base parameter", "of the bodies", "identified", "95 % interval"), rows)
-        + "\n\nFriction of X_lift as Coulomb and viscous, 210 N and 330 N s/m, does not come out: "
-        "at these speeds, up to 15 mm/s, stiction of 90 exp(-(v / 5 mm/s)^2) N takes part, which "
-        "(14) does not have. "
-        "For that see [friction](#friction-of-the-lift-cylinder)."
+        + "\n\nFor X_lift, Coulomb and viscous friction, 210 N and 330 N s/m, are not identified "
+        "correctly: at these speeds, up to 15 mm/s, stiction of 90 exp(-(v / 5 mm/s)^2) N "
+        "contributes, which (14) lacks. See [friction](#friction-of-the-lift-cylinder)."
     )

@@ -1,4 +1,4 @@
-"""What the electro-hydraulic forwarder paper prints: ranges read off its figures."""
+"""Published values of the electro-hydraulic forwarder paper: ranges read from its figures."""
 
 ANGLES = ("q2", "q3", "X_ext")  # the paper's q2, q3, q4
 SIGNALS = ("tau_2", "tau_3", "F_4")

@@ -1,4 +1,4 @@
-"""Everything that the page and its figures show, computed once."""
+"""All results that the page and its figures show, computed once."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Tables and numbers in Markdown."""
+"""Format tables and numbers in Markdown."""
 
 from collections.abc import Iterable
 

@@ -1,8 +1,8 @@
-"""The virtual rig: a simulated experiment that stands in for the one that was never published.
+"""The virtual rig: a simulated experiment that replaces the unpublished one.
 
-The plant is the machine with parameters that a generator draws within tolerances, and with
-stiction. A discrete PI controller moves it, and knows only what quantised and noisy sensors tell.
-A recording of it says "virtual rig" in its task: it is no measurement of a real machine.
+The plant is the machine with random parameters within tolerances, and with stiction. A discrete PI
+controller moves it, using only quantised and noisy sensor readings. A recording of it has "virtual
+rig" in its task: it is not a measurement of a real machine.
 """
 
 from rig.plant import Tolerances

@@ -1,4 +1,4 @@
-"""The machine that moves in a virtual rig: the model with drawn parameters and stiction."""
+"""The plant of a virtual rig: the model with random parameters and stiction."""
 
 import dataclasses
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""A discrete PI controller that moves a plant, and knows only what the sensors tell."""
+"""A discrete PI controller that moves a plant, using only the sensor readings."""
 
 import math
 import warnings
@@ -25,13 +25,9 @@ from crane.motion.limit_violations import limit_violation_message
 from crane.motion.task_trajectories import add_free_joints
 from crane.motion.trajectory import Trajectory
 from crane.recordings.recording import FORCE_UNITS, VELOCITY_UNITS, Recording
-from crane.simulation.integration import (
-    Chart,
-    FixedStepIntegrator,
-    IntegrationHaltError,
-    explain_halt,
-    row_layout,
-)
+from crane.simulation.integration.charts import Chart, row_layout
+from crane.simulation.integration.integrators import FixedStepIntegrator
+from crane.simulation.integration.python_stepper import IntegrationHaltError, explain_halt
 from rig.plant import Tolerances, drawn
 from rig.sensors import Sensors, default_sensors
 

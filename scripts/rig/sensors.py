@@ -1,4 +1,4 @@
-"""What a virtual rig measures with, and what drives it.
+"""Sensors and drives of a virtual rig.
 
 Sources: the reduced-scale forwarder paper, sections 2.1, 2.4 and 3.3 (P); assumed (A).
 """

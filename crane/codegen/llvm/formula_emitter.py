@@ -10,9 +10,9 @@ one.
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from crane.codegen.intermediate_representation import Formula
 from crane.codegen.llvm.vector_functions import MAX_VECTOR_WIDTH, VECTOR_FUNCTIONS, format_real
 from crane.codegen.symbolic import Scalar, SymbolicExpression, required_operations
+from crane.codegen.vector_layout import Formula
 
 # Allows fused multiply-add; reordering sums would gain nothing and could cancel NaN.
 FAST_MATH_FLAGS = "nsz arcp contract"
@@ -22,11 +22,6 @@ Operands = Sequence[float | int]
 def format_operand(operand: float | int) -> str:
     """A number, or the register of an operation."""
     return f"%v{operand}" if isinstance(operand, int) else format_real(operand)
-
-
-def shared_operands(operation: tuple) -> tuple:
-    """Common part of dot operations that are computed together: name and first vector."""
-    return operation[: 1 + len(operation) // 2]
 
 
 def emit_dot_products(
@@ -130,9 +125,13 @@ def emit_formula(formula: Formula, functions: set[tuple[str, int]]) -> str:
     """A formula as a function; adds the vector functions that it calls to `functions`."""
     tapes = {value.tape for value in formula.outputs if isinstance(value, SymbolicExpression)}
     operations = tapes.pop().operations if tapes else []
+    steps = _group_operations(operations, formula)
+    # pieces of about equal length; a short formula is a single piece
+    count = round(len(steps) / PIECE_LENGTH) if len(steps) > MAX_SINGLE_FUNCTION_LENGTH else 1
+    size = max(1, -(-len(steps) // count))
     pieces = [
-        _FormulaPiece(operations, steps)
-        for steps in _split_steps(_group_operations(operations, formula))
+        _FormulaPiece(operations, steps[start : start + size])
+        for start in range(0, max(1, len(steps)), size)
     ]
     memory_slots = _assign_memory_slots(pieces)
     targets: dict[int, list[int]] = {}
@@ -149,40 +148,48 @@ def emit_formula(formula: Formula, functions: set[tuple[str, int]]) -> str:
         )
     if len(pieces) == 1 and len(copied_outputs) <= PIECE_LENGTH:
         texts = [[line for text in texts for line in text]]
-    inputs = [f"ptr noalias readonly %in{i}" for i in range(formula.input_count)]
-    arguments = ", ".join([*inputs, "ptr noalias %out"])
+    arguments = ", ".join(
+        [*[f"ptr noalias readonly %in{i}" for i in range(formula.input_count)], "ptr noalias %out"]
+    )
     head = f"define void @{formula.name}({arguments}) "
     if len(texts) <= 1:
         head += f"{_FRAME_POINTER_ATTRIBUTES} {{"
         return "\n".join([head, *(line for text in texts for line in text), _FUNCTION_END])
     shared = f"{arguments}, ptr noalias %between"
-    out, lines = (
-        [],
-        [
-            f"{head}{{",
-            f"  %between = alloca [{1 + max(memory_slots.values(), default=0)} x double]",
-        ],
+    words = ", ".join(
+        [*(f"ptr %in{i}" for i in range(formula.input_count)), "ptr %out, ptr %between"]
     )
+    between = f"  %between = alloca [{1 + max(memory_slots.values(), default=0)} x double]"
+    definitions, calls = [], [f"{head}{{", between]
     for number, text in enumerate(texts):
         name = f"@{formula.name}.{number}"
-        out.append(
-            "\n".join([f"define internal void {name}({shared}) noinline {{", *text, _FUNCTION_END])
-        )
-        words = [f"ptr %in{i}" for i in range(formula.input_count)]
-        lines.append(f"  call void {name}({', '.join([*words, 'ptr %out, ptr %between'])})")
-    return "\n".join([*out, *lines, _FUNCTION_END])
+        definitions += [
+            f"define internal void {name}({shared}) noinline {{", *text, _FUNCTION_END,
+        ]  # fmt: skip
+        calls.append(f"  call void {name}({words})")
+    return "\n".join([*definitions, *calls, _FUNCTION_END])
 
 
 def _group_operations(operations: Sequence[tuple], formula: Formula) -> list[list[int]]:
     """Operations in an order of computation, those of `_VECTORIZED` in groups."""
+    # by the largest number of `_VECTORIZED` operations on a path to them
+    level_of: dict[int, int] = {}
+    levels: list[list[int]] = []
+    for index in required_operations(formula.outputs):
+        operation = operations[index]
+        before = max((level_of[x] for x in _operand_indices(operation)), default=0)
+        level_of[index] = before + (operation[0] in _VECTORIZED)
+        while len(levels) <= level_of[index]:
+            levels.append([])
+        levels[level_of[index]].append(index)
     steps: list[list[int]] = []
-    for level in _dependency_levels(operations, required_operations(formula.outputs)):
+    for level in levels:
         same: dict[tuple, list[int]] = {}
         for i in level:
             if operations[i][0] in _VECTORIZED:
-                name = operations[i][:1]
-                alike = shared_operands(operations[i]) if name == ("dot",) else name
-                same.setdefault(alike, []).append(i)
+                # dot products with one first vector are computed together
+                shared = len(operations[i]) // 2 if operations[i][0] == "dot" else 0
+                same.setdefault(operations[i][: 1 + shared], []).append(i)
         for _, indices in sorted(same.items(), key=lambda item: item[0][0]):
             steps += [
                 indices[start : start + MAX_VECTOR_WIDTH]
@@ -190,13 +197,6 @@ def _group_operations(operations: Sequence[tuple], formula: Formula) -> list[lis
             ]
         steps += [[i] for i in level if operations[i][0] not in _VECTORIZED | {"load"}]
     return steps
-
-
-def _split_steps(steps: list[list[int]]) -> list[list[list[int]]]:
-    """Pieces of about equal length; a short formula is a single piece."""
-    count = round(len(steps) / PIECE_LENGTH) if len(steps) > MAX_SINGLE_FUNCTION_LENGTH else 1
-    size = -(-len(steps) // count) if steps else 1
-    return [steps[start : start + size] for start in range(0, max(1, len(steps)), size)]
 
 
 class _FormulaPiece:
@@ -245,8 +245,9 @@ class _FormulaPiece:
                     lines += self._emit_load(x, memory_slots)
             if self._operations[step[0]][0] == "dot":
                 lines += emit_dot_products(step, [self._operations[i][1:] for i in step], vectors)
-                lanes = ((at, k) for k, i in enumerate(step) for at in output_indices.get(i, ()))
-                lines += emit_dot_product_stores(step, lanes)
+                lines += emit_dot_product_stores(
+                    step, ((at, k) for k, i in enumerate(step) for at in output_indices.get(i, ()))
+                )
             else:
                 lines += self._emit_step(step, functions)
                 for index in step:
@@ -315,20 +316,6 @@ def _assign_memory_slots(pieces: Sequence[_FormulaPiece]) -> dict[int, int]:
             memory_slots[index] = free.pop()
         free += sorted(memory_slots[index] for index in piece.required if last[index] == number)
     return memory_slots
-
-
-def _dependency_levels(operations: Sequence[tuple], indices: Sequence[int]) -> list[list[int]]:
-    """Operations by the largest number of `_VECTORIZED` operations on a path to them."""
-    level: dict[int, int] = {}
-    out: list[list[int]] = []
-    for index in indices:
-        operation = operations[index]
-        before = max((level[x] for x in _operand_indices(operation)), default=0)
-        level[index] = before + (operation[0] in _VECTORIZED)
-        while len(out) <= level[index]:
-            out.append([])
-        out[level[index]].append(index)
-    return out
 
 
 def _emit_vector_call(name: str, width: int, calls: list[tuple[int, Any]]) -> list[str]:

@@ -1,7 +1,11 @@
 """Cylinders and loops added to machines that were described without them."""
 
-from crane.formats.additions.cylinder_addition import AddedCylinder, add_cylinder
-from crane.formats.additions.loop_addition import AddedLoops, add_loops
+from crane.formats.additions.machine_additions import (
+    AddedCylinder,
+    AddedLoops,
+    add_cylinder,
+    add_loops,
+)
 from crane.formats.additions.open_loop_search import LoopProposal, propose_loops
 
 __all__ = [

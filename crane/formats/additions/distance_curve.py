@@ -7,17 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.closure.active_joint_selection import coordinate_units
 from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.common.plausible_ranges import LONGEST
 from crane.common.samples import Array
-from crane.formats.additions.attachment_points import (
+from crane.formats.additions.steel_cylinder import (
     AttachmentPoint,
+    SteelCylinder,
     joints_between,
     lever_arm,
     vector_between,
 )
-from crane.formats.additions.steel_cylinder import SteelCylinder
 from crane.machine.machine import Machine
 
 _FINE_SAMPLES = 400  # over the range of the joint
@@ -95,32 +94,23 @@ class DistanceCurve:
                 lever_arm(self.machine, self.points, q, self.joint) * lever_arms[start_index] > 0
             )
 
-        first = last = start_index
-        while first > 0 and is_driven[first - 1]:
-            first -= 1
-        while last + 1 < len(is_driven) and is_driven[last + 1]:
-            last += 1
         resolution = _ROUNDING_TOLERANCE * max(abs(self.values[0]), abs(self.values[-1]))
         samples = list(zip(self.values, self.configurations, strict=True))
-        reached_samples = samples[first : last + 1]
-        if first > 0:
-            beyond = self.values[first - 1]
-            reached_samples.insert(
-                0,
-                last_closed_sample(
-                    self.machine, self.joint, reached_samples[0], beyond, resolution, is_driven_at
-                ),
-            )
-        if last + 1 < len(is_driven):
-            beyond = self.values[last + 1]
-            reached_samples.append(
-                last_closed_sample(
-                    self.machine, self.joint, reached_samples[-1], beyond, resolution, is_driven_at
+        before, after = [samples[start_index]], [samples[start_index]]
+        for half, step in ((before, -1), (after, 1)):
+            k = start_index + step
+            while 0 <= k < len(samples) and is_driven[k]:
+                half.append(samples[k])
+                k += step
+            if 0 <= k < len(samples):
+                beyond = self.values[k]
+                half.append(
+                    last_closed_sample(
+                        self.machine, self.joint, half[-1], beyond, resolution, is_driven_at
+                    )
                 )
-            )
-        start_in_reached = start_index - first + (first > 0)
         return start_index, DistanceCurve.from_samples(
-            self.machine, self.points, self.joint, reached_samples, start_in_reached
+            self.machine, self.points, self.joint, [*before[:0:-1], *after], len(before) - 1
         )
 
     @classmethod
@@ -134,8 +124,15 @@ class DistanceCurve:
     ) -> "DistanceCurve":
         """Return the curve over some configurations, that at `home_index` being the home."""
         values, q = (np.array(part) for part in zip(*samples, strict=True))
-        length = np.linalg.norm(vector_between(machine, points, q), axis=1)
-        return cls(machine, points, joint, values, q, length, home_index)
+        return cls(
+            machine,
+            points,
+            joint,
+            values,
+            q,
+            np.linalg.norm(vector_between(machine, points, q), axis=1),
+            home_index,
+        )
 
 
 def distance_curve(machine: Machine, points: Sequence[AttachmentPoint]) -> DistanceCurve:
@@ -149,7 +146,8 @@ def distance_curve(machine: Machine, points: Sequence[AttachmentPoint]) -> Dista
         InputError: No joint changes the distance.
     """
     joints_in_path = [
-        joint.name for joint in joints_between(machine, points[0].link, points[1].link)
+        joint.name
+        for joint in joints_between(machine.tree.parent_joints, points[0].link, points[1].link)
     ]
     if not joints_in_path:
         raise InputError(
@@ -162,12 +160,11 @@ def distance_curve(machine: Machine, points: Sequence[AttachmentPoint]) -> Dista
         coarse_curve = _scan_joint_range(machine, points, joint, _COARSE_SAMPLES)
         change = np.ptp(coarse_curve.length) / max(coarse_curve.length.max(), 1e-300)
         if len(coarse_curve.length) > 1 and change > _STANDSTILL_TOLERANCE:
-            home_lever_arm = abs(
-                lever_arm(
-                    machine, points, coarse_curve.configurations[coarse_curve.home_index], joint
-                )
+            home = coarse_curve.configurations[coarse_curve.home_index]
+            scaled_lever_arms[joint] = (
+                abs(lever_arm(machine, points, home, joint))
+                * coordinate_scales[machine.column(joint)]
             )
-            scaled_lever_arms[joint] = home_lever_arm * coordinate_scales[machine.column(joint)]
     if not scaled_lever_arms:
         raise InputError(
             f"no active joint changes the distance between '{points[0]}' and '{points[1]}' "
@@ -184,10 +181,9 @@ def distance_curve(machine: Machine, points: Sequence[AttachmentPoint]) -> Dista
         if joint in preferred or not preferred
     }
     best = max(candidates, key=lambda joint: candidates[joint])
-    alternative_joints = tuple(joint for joint in candidates if joint != best)
     return dataclasses.replace(
         _scan_joint_range(machine, points, best, _FINE_SAMPLES),
-        alternative_joints=alternative_joints,
+        alternative_joints=tuple(joint for joint in candidates if joint != best),
     )
 
 
@@ -197,7 +193,7 @@ def _scan_joint_range(
     column, index = machine.column(joint), machine.active.index(joint)
     home = float(machine.home[column])
     default_range = (
-        np.pi if machine.unit(joint) == "rad" else float(coordinate_units(machine.model)[column])
+        np.pi if machine.unit(joint) == "rad" else float(machine.coordinates.units[column])
     )
     lower, upper = (float(limits[index]) for limits in (machine.lower, machine.upper))
     lower = lower if np.isfinite(lower) else min(home, upper) - default_range

@@ -6,7 +6,7 @@ and a rod on two bodies that point at each other.
 """
 
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,9 +15,9 @@ import pinocchio as pin
 from crane.closure.coordinates import Coordinates
 from crane.closure.loop_equations import frame_id
 from crane.common.samples import Array
-from crane.description.kinematic_tree import Joint, Vector
-from crane.description.pinocchio_conversion import to_vector
+from crane.description.kinematic_tree import Joint, Vector, to_vector
 from crane.description.specification import LoopSpec, MachineSpec
+from crane.formats.additions.steel_cylinder import joints_between
 from crane.formats.machine_file.open_loop_warning import loop_end_pairs
 
 # largest gaps relative to the characteristic length, the second without a common normal
@@ -29,6 +29,7 @@ _PARALLEL_TOLERANCE = 1e-6  # sine of an angle
 _MIN_LOOP_JOINTS = 3  # with fewer joints of the tree a loop would lock them
 _BARREL_PATTERN = re.compile(r"barrel|tube|housing|cylinder|cyl", re.IGNORECASE)
 _ROD_PATTERN = re.compile(r"piston_?rod|rod|piston|ram|plunger", re.IGNORECASE)
+_Z = (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -77,10 +78,10 @@ class _OpenLoopSearch:
     """
 
     def __init__(self, spec: MachineSpec, model: pin.Model, q: Array):
-        self.spec, self.joints = spec, spec.tree.joints
-        self.parent_joints = {joint.child: joint for joint in self.joints.values()}
+        self.spec = spec
+        self.parent_joints = spec.tree.parent_joints
         self.joints_by_parent = spec.tree.joints_by_parent()
-        self.ways, self.bodies = self._trace_tree()
+        self.bodies = spec.tree.bodies_by_link()
         data = model.createData()
         pin.forwardKinematics(model, data, Coordinates(model).configuration(q))
         self.placements = {
@@ -93,30 +94,28 @@ class _OpenLoopSearch:
         self.largest_mass = max((one.mass for one in given if one is not None), default=0.0)
         self.loop_frames = {frozenset((loop.predecessor, loop.successor)) for loop in spec.loops}
 
-    def _trace_tree(self) -> tuple[dict[str, frozenset[str]], dict[str, str]]:
-        """Return the movable joints to the root, and the first link of the body, by link."""
-        root = self.spec.tree.root_link
-        joints_to_root, body_of_link, pending = {root: frozenset[str]()}, {root: root}, [root]
-        while pending:
-            link = pending.pop()
-            for joint in self.joints_by_parent.get(link, ()):
-                own_joint = {joint.name} if joint.is_movable else set()
-                joints_to_root[joint.child] = joints_to_root[link] | own_joint
-                body_of_link[joint.child] = joint.child if joint.is_movable else body_of_link[link]
-                pending.append(joint.child)
-        return joints_to_root, body_of_link
-
     def find_proposals(self) -> list[LoopProposal]:
         """Return all proposals, at most one for each pair of bodies."""
         proposed: list[LoopProposal] = []
+        names = {loop.name for loop in self.spec.loops}
         closed_bodies = {self._bodies_of(pair) for pair in self.loop_frames}
         used_frames = {frame for pair in self.loop_frames for frame in pair}
+
+        def frame_distance(proposal: LoopProposal) -> float:
+            ends = proposal.loop.predecessor, proposal.loop.successor
+            first, second = (self.placements[end].translation for end in ends)
+            return float(np.linalg.norm(second - first))
+
         for group in (self._named_proposals(), self._slide_proposals(), self._meeting_proposals()):
-            for proposal in sorted(group, key=self._frame_distance):
+            for proposal in sorted(group, key=frame_distance):
                 ends = {proposal.loop.predecessor, proposal.loop.successor}
                 if self._bodies_of(ends) in closed_bodies or ends & used_frames:
                     continue
-                proposed.append(self._with_unique_name(proposal, proposed))
+                name, number = proposal.loop.name, 2
+                while name in names:
+                    name, number = f"{proposal.loop.name}_{number}", number + 1
+                names.add(name)
+                proposed.append(replace(proposal, loop=replace(proposal.loop, name=name)))
                 closed_bodies.add(self._bodies_of(ends))
                 used_frames |= ends
         return proposed
@@ -124,12 +123,24 @@ class _OpenLoopSearch:
     def _named_proposals(self) -> Iterator[LoopProposal]:
         for name, first, second in loop_end_pairs(self.spec.tree):
             if len(self._bodies_of((first, second))) == 2:
-                kind, axis = _type_from_name(name) or self._loop_type_and_axis(first, second)
-                yield self._create_proposal(name, kind, (first, second), axis, is_named=True)
+                kind, axis = self._loop_type_and_axis(first, second)
+                if re.match(r"closed?_?loop", name, re.IGNORECASE):  # example-parallel-robots
+                    kind, axis = "spherical" if "3d" in name.lower() else "fixed", _Z
+                yield LoopProposal(
+                    LoopSpec(name, kind, first, second, axis, ""),
+                    self._gap(first, second),
+                    is_named=True,
+                )
 
     def _slide_proposals(self) -> Iterator[LoopProposal]:
         """Yield loops between a barrel and a rod, each on its own pin."""
-        links = [link for link in self._leaf_links() if self._is_on_revolute_joint(link)]
+        links = [
+            link
+            for link, body in self.bodies.items()
+            if not self.joints_by_parent.get(link)
+            and body in self.parent_joints
+            and self.parent_joints[body].kind == "revolute"
+        ]
         rods = {_ROD_PATTERN.sub("", link): link for link in links if _ROD_PATTERN.search(link)}
         for barrel in links:
             rod = (
@@ -175,7 +186,9 @@ class _OpenLoopSearch:
                 and self._is_away_from_origin(second)
             )
             if kind != "spherical" or are_separate_frames:
-                yield self._create_proposal(second, kind, (first, second), axis, is_named=False)
+                yield LoopProposal(
+                    LoopSpec(second, kind, first, second, axis, ""), gap, is_named=False
+                )
 
     def _nearby_pairs(self) -> Iterator[tuple[str, str]]:
         """Yield pairs of frames that are close or can be moved together by slides."""
@@ -199,10 +212,6 @@ class _OpenLoopSearch:
             return 0.0
         return joint.limits.upper - joint.limits.lower
 
-    def _leaf_links(self) -> list[str]:
-        """Return links without child joints."""
-        return [link for link in self.spec.tree.links if not self.joints_by_parent.get(link)]
-
     def _is_frame(self, link: str) -> bool:
         """Whether a link is a frame without mass, or a slide without child joints."""
         if link in (self.spec.tip, self.spec.tree.root_link):
@@ -216,19 +225,21 @@ class _OpenLoopSearch:
 
     def _is_away_from_origin(self, link: str) -> bool:
         """Whether a frame is not at the origin of its body."""
-        offset = self.placements[link].translation - self.placements[self.bodies[link]].translation
-        return bool(np.abs(offset).max() > _MIN_OFFSET_SHARE * self.characteristic_length)
-
-    def _is_on_revolute_joint(self, link: str) -> bool:
-        body = self.bodies[link]
-        return body in self.parent_joints and self.parent_joints[body].kind == "revolute"
+        return bool(
+            np.abs(
+                self.placements[link].translation - self.placements[self.bodies[link]].translation
+            ).max()
+            > _MIN_OFFSET_SHARE * self.characteristic_length
+        )
 
     def _bodies_of(self, pair: Collection[str]) -> frozenset[str]:
         return frozenset(self.bodies[link] for link in pair)
 
     def _joints_between(self, first: str, second: str) -> list[Joint]:
         """Return the movable joints of the tree between two links."""
-        return [self.joints[name] for name in sorted(self.ways[first] ^ self.ways[second])]
+        return sorted(
+            joints_between(self.parent_joints, first, second), key=lambda joint: joint.name
+        )
 
     def _gap(self, first: str, second: str) -> float:
         """Return the distance of two links, less the travel of a slide that ends in one."""
@@ -241,11 +252,6 @@ class _OpenLoopSearch:
                 gaps.append(float(np.linalg.norm(vector - slide_travel * axis)))
         return min(gaps)
 
-    def _frame_distance(self, proposal: LoopProposal) -> float:
-        ends = proposal.loop.predecessor, proposal.loop.successor
-        first, second = (self.placements[end].translation for end in ends)
-        return float(np.linalg.norm(second - first))
-
     def _axis_in_world(self, joint: Joint) -> Array:
         return np.asarray(self.placements[joint.child].rotation @ np.array(joint.axis))
 
@@ -255,14 +261,12 @@ class _OpenLoopSearch:
         Otherwise return spherical, which leaves a planar loop the same degrees of freedom.
         """
         loop_joints = self._joints_between(first, second)
-        revolute_axes = [
-            self._axis_in_world(joint) for joint in loop_joints if joint.kind == "revolute"
-        ]
-        prismatic_axes = [
-            self._axis_in_world(joint) for joint in loop_joints if joint.kind == "prismatic"
-        ]
+        revolute_axes, prismatic_axes = (
+            [self._axis_in_world(joint) for joint in loop_joints if joint.kind == kind]
+            for kind in ("revolute", "prismatic")
+        )
         if not revolute_axes:
-            return "spherical", (0.0, 0.0, 1.0)
+            return "spherical", _Z
         normal = revolute_axes[0]
         deviation = np.linalg.norm(np.cross(revolute_axes, normal), axis=1).max()
         deviation = max(
@@ -273,33 +277,7 @@ class _OpenLoopSearch:
             deviation < _PARALLEL_TOLERANCE
             and np.linalg.norm(axes[0] - axes[1]) < _PARALLEL_TOLERANCE
         )
-        return (
-            ("revolute", _round_direction(axes[0]))
-            if is_planar
-            else ("spherical", (0.0, 0.0, 1.0))
-        )
-
-    def _create_proposal(
-        self, name: str, kind: str, frames: tuple[str, str], axis: Vector, is_named: bool
-    ) -> LoopProposal:
-        return LoopProposal(LoopSpec(name, kind, *frames, axis, ""), self._gap(*frames), is_named)
-
-    def _with_unique_name(
-        self, proposal: LoopProposal, earlier: Sequence[LoopProposal]
-    ) -> LoopProposal:
-        """Return the proposal under a name that no loop has."""
-        names = {loop.name for loop in self.spec.loops} | {one.loop.name for one in earlier}
-        name, number = proposal.loop.name, 2
-        while name in names:
-            name, number = f"{proposal.loop.name}_{number}", number + 1
-        return replace(proposal, loop=replace(proposal.loop, name=name))
-
-
-def _type_from_name(name: str) -> tuple[str, Vector] | None:
-    """Return the loop type that a name of example-parallel-robots implies."""
-    if not re.match(r"closed?_?loop", name, re.IGNORECASE):
-        return None
-    return "spherical" if "3d" in name.lower() else "fixed", (0.0, 0.0, 1.0)
+        return ("revolute", _round_direction(axes[0])) if is_planar else ("spherical", _Z)
 
 
 def _round_direction(axis: Array) -> Vector:

@@ -1,35 +1,132 @@
-"""Hydraulic cylinders of steel: masses and shapes from bore, rod and stroke, links and loop."""
+"""Hydraulic cylinders of steel between attachment points: masses, shapes, links and loop."""
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 from lxml import etree
 
-from crane.common.errors import CraneWarning, InputError
+from crane.common.errors import CraneWarning, InputError, suggest_names
 from crane.common.plausible_ranges import LONGEST, implausible_value_text, suggested_units_text
 from crane.common.samples import Array, as_number
-from crane.description.kinematic_tree import Inertial, Joint, Limits, Link
-from crane.description.pinocchio_conversion import (
-    inertial_from_inertia,
-    to_vector,
-    xyz_rpy_from_se3,
-)
-from crane.formats.additions.attachment_points import (
-    AttachmentPoint,
-    joints_between,
-    vector_between,
-)
-from crane.formats.machine_file.machine_writer import MachineDraft
-from crane.formats.urdf_elements import add_joint, add_link, format_numbers
+from crane.description.kinematic_tree import Inertial, Joint, Limits, Link, Vector, to_vector
+from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
+from crane.description.specification import LoopSpec
+from crane.formats.machine_file.machine_writer import MachineDraft, loop_data
+from crane.formats.urdf_elements import add_joint, add_link, add_origin, format_numbers
 from crane.machine.machine import Machine
 
 STEEL_DENSITY = 7850.0  # [kg/m3]
 RELIEF_PRESSURE = 35e6  # [Pa] usual in mobile machines; determines the effort of the joint
 _WALL_SHARE = 0.1  # of the bore: at 35 MPa the stress in the tube is 35 / 0.2 MPa
+
+
+_DIFFERENCE_STEP = 1e-5  # of the fastest coordinate, for central differences
+
+
+@dataclass(frozen=True)
+class AttachmentPoint:
+    """A point of a body.
+
+    Attributes:
+        link: A link of the body.
+        point: (3,) in the link's frame [m].
+    """
+
+    link: str
+    point: Vector
+
+    def __str__(self) -> str:
+        """Return it in the notation that `parse_attachment_point` reads."""
+        point = ",".join(f"{value:.6g}" for value in self.point)
+        return f"{self.link}:{point}" if any(self.point) else self.link
+
+    def placement(self, machine: Machine, q: Array) -> pin.SE3:
+        """Return the pose of the link's frame, moved to the point, in the world."""
+        data = machine.model.createData()
+        pin.forwardKinematics(machine.model, data, machine.coordinates.configuration(q))
+        link_placement = pin.updateFramePlacement(machine.model, data, machine.frame(self.link))
+        return link_placement * pin.SE3(np.eye(3), np.array(self.point))
+
+
+def parse_attachment_point(machine: Machine, text: str) -> AttachmentPoint:
+    """Parse LINK or LINK:x,y,z, metres in the link's frame.
+
+    Raises:
+        InputError: The link is unknown, or the text is malformed.
+    """
+    text = str(text)
+    link, colon, coordinates = text.rpartition(":")
+    if text in machine.tree.links or not colon:
+        link, coordinates = text, "0,0,0"
+    try:
+        point = np.array([float(word) for word in coordinates.split(",")])
+    except ValueError:
+        point = np.zeros(0)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise InputError(
+            f"'{text}' is no point, write LINK or LINK:x,y,z with metres in the link's frame"
+        )
+    if link not in machine.tree.links:
+        raise InputError(
+            f"'{link}' is no link of '{machine.name}', {suggest_names(machine.tree.links, link)}"
+        )
+    return AttachmentPoint(link, to_vector(point))
+
+
+def joints_between(
+    parent_joints: Mapping[str, Joint], first_link: str, second_link: str
+) -> list[Joint]:
+    """Return the movable joints of a tree between two links, see `Tree.parent_joints`."""
+    paths_to_root = []
+    for link in (first_link, second_link):
+        path = []
+        while link in parent_joints:
+            path.append(parent_joints[link])
+            link = parent_joints[link].parent
+        paths_to_root.append(path)
+    first, second = ({joint.name for joint in path} for path in paths_to_root)
+    return [
+        joint
+        for path in paths_to_root
+        for joint in path
+        if joint.is_movable and joint.name in first ^ second
+    ]
+
+
+def vector_between(machine: Machine, points: Sequence[AttachmentPoint], q: Array) -> Array:
+    """Return the vector (3,) or (N, 3) from the first point to the second in the world [m].
+
+    Args:
+        machine: The machine.
+        points: Two attachment points.
+        q: (nq,) or (N, nq) configurations.
+    """
+    if q.ndim == 2:
+        return np.array([vector_between(machine, points, one) for one in q])
+    first, second = (point.placement(machine, q).translation for point in points)
+    return np.asarray(second - first)
+
+
+def lever_arm(machine: Machine, points: Sequence[AttachmentPoint], q: Array, joint: str) -> float:
+    """Return the derivative of the distance of two points by an active joint: the lever arm [m].
+
+    For a prismatic joint it is a ratio. It is computed along gamma at a closed configuration
+    (nq,), by central differences.
+
+    Raises:
+        ClosureError: The configuration is singular.
+    """
+    gamma_column = machine.closure.gamma(q)[:, machine.active.index(joint)]
+    step = _DIFFERENCE_STEP / float(np.abs(gamma_column).max())
+    ahead, back = (
+        np.linalg.norm(vector_between(machine, points, q + x * gamma_column))
+        for x in (step, -step)
+    )
+    return float(ahead - back) / (2 * step)
 
 
 @dataclass(frozen=True)
@@ -119,24 +216,17 @@ class SteelCylinder:
             _tube_inertia(back - self.part_length, back, 0, self.bore),
         )
 
-    def add_visuals(self, barrel_link: etree._Element, rod_link: etree._Element) -> None:
-        """Add cylinders of the true diameters to two `<link>` elements."""
-        _add_cylinder_visual(
-            barrel_link,
-            0,
-            self.retracted_length - self.part_length,
-            (1 + 2 * _WALL_SHARE) * self.bore,
-        )
-        _add_cylinder_visual(rod_link, 2 * self.part_length - self.retracted_length, 0, self.rod)
-
 
 def _tube_inertia(start: float, end: float, inner: float, outer: float) -> pin.Inertia:
     """Return the inertia of a tube along x with two diameters [m]."""
     length, squares = end - start, (inner**2 + outer**2) / 4
     mass = STEEL_DENSITY * math.pi / 4 * (outer**2 - inner**2) * length
     transverse_moment = mass * (3 * squares + length**2) / 12
-    tensor = np.diag([mass * squares / 2, transverse_moment, transverse_moment])
-    return pin.Inertia(mass, np.array([(start + end) / 2, 0, 0]), tensor)
+    return pin.Inertia(
+        mass,
+        np.array([(start + end) / 2, 0, 0]),
+        np.diag([mass * squares / 2, transverse_moment, transverse_moment]),
+    )
 
 
 def _total_inertial(*inertias: pin.Inertia) -> Inertial:
@@ -150,19 +240,9 @@ def _total_inertial(*inertias: pin.Inertia) -> Inertial:
 
 def _add_cylinder_visual(link: etree._Element, start: float, end: float, diameter: float) -> None:
     visual = etree.SubElement(link, "visual")
-    etree.SubElement(
-        visual,
-        "origin",
-        xyz=format_numbers([(start + end) / 2, 0, 0]),
-        rpy=format_numbers([0, math.pi / 2, 0]),
-    )
-    geometry = etree.SubElement(visual, "geometry")
-    etree.SubElement(
-        geometry,
-        "cylinder",
-        radius=format_numbers([diameter / 2]),
-        length=format_numbers([end - start]),
-    )
+    add_origin(visual, ((start + end) / 2, 0, 0), (0, math.pi / 2, 0))
+    size = {"radius": format_numbers([diameter / 2]), "length": format_numbers([end - start])}
+    etree.SubElement(etree.SubElement(visual, "geometry"), "cylinder", size)
 
 
 _OFFSET_TOLERANCE = 1e-6  # relative to the cylinder's length
@@ -218,13 +298,9 @@ def add_barrel_and_rod(
         name, _cylinder_urdf(name, cylinder, base_in_link, is_planar), {"parent": points[0].link}
     )
     draft.data["loops"].append(
-        {
-            "name": name,
-            "type": "revolute" if is_planar else "spherical",
-            "predecessor": f"{name}_rod",
-            "successor": f"{name}_eye",
-            "axis": list(_Y),
-        }
+        loop_data(
+            LoopSpec(name, "revolute" if is_planar else "spherical", f"{name}_rod", eye, _Y, "")
+        )
     )
     home = dict(zip(machine.joints, q.tolist(), strict=True))
     pins = [f"{name}_pin"] if is_planar else [f"{name}_pin_y", f"{name}_pin_z"]
@@ -239,10 +315,11 @@ def _plane_normal(
 ) -> Array | None:
     """Return the normal (3,) of the plane of relative motion of two bodies, None if spatial."""
     data = machine.model.createData()
-    configuration = machine.coordinates.configuration(q)
-    jacobian = pin.computeJointJacobians(machine.model, data, configuration).reshape(6, -1)
+    jacobian = pin.computeJointJacobians(
+        machine.model, data, machine.coordinates.configuration(q)
+    ).reshape(6, -1)
     revolute_axes, prismatic_axes = [], []
-    for joint in joints_between(machine, points[0].link, points[1].link):
+    for joint in joints_between(machine.tree.parent_joints, points[0].link, points[1].link):
         column = jacobian[:, machine.column(joint.name)]
         if joint.kind == "revolute":
             revolute_axes.append(column[3:])
@@ -279,11 +356,23 @@ def _cylinder_urdf(
         ]
     links += [Link(barrel, "", cylinder.barrel_inertial), Link(rod, "", cylinder.rod_inertial)]
     limits = Limits(0.0, cylinder.stroke, cylinder.max_force)
-    rod_origin = to_vector(np.array([cylinder.retracted_length, 0, 0]))
-    slide = Joint(name, "prismatic", barrel, rod, "", rod_origin, axis=_X, limits=limits)
+    slide = Joint(
+        name,
+        "prismatic",
+        barrel,
+        rod,
+        "",
+        to_vector(np.array([cylinder.retracted_length, 0, 0])),
+        axis=_X,
+        limits=limits,
+    )
     for link in links:
         add_link(robot, link)
-    cylinder.add_visuals(*(element for element in robot.findall("link")[-2:]))
+    barrel_element, rod_element = robot.findall("link")[-2:]
+    length, part = cylinder.retracted_length, cylinder.part_length
+    outer_diameter = (1 + 2 * _WALL_SHARE) * cylinder.bore
+    _add_cylinder_visual(barrel_element, 0, length - part, outer_diameter)
+    _add_cylinder_visual(rod_element, 2 * part - length, 0, cylinder.rod)
     for joint in (*pins, slide):
         add_joint(robot, joint)
     return robot

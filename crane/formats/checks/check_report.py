@@ -9,22 +9,25 @@ from pathlib import Path
 
 from crane.closure.closure import Closure
 from crane.common.atomic_output import portable_file_name
-from crane.common.errors import CraneWarning, message_kind
+from crane.common.errors import CraneWarning, format_one_line, message_kind
 from crane.common.package_search import (
     check_argument_values,
     check_package_folders,
     load_options,
     use_load_options,
 )
-from crane.description.findings import Findings, collect_findings, error_recovery
+from crane.description.findings import collect_findings, error_recovery
 from crane.description.floating_bases import add_floating_base
 from crane.description.machine_lookup import command_line_arguments, find_machine_file
 from crane.description.parameter_changes import set_active_joints
 from crane.description.specification import MachineSpec
 from crane.formats.additions.open_loop_search import LoopProposal, propose_loops
-from crane.formats.checks.circuit_check import flow_shortages, warn_about_circuit
 from crane.formats.checks.mechanism_check import check_mechanism
-from crane.formats.checks.plausibility_check import warn_about_implausible_values
+from crane.formats.checks.plausibility_check import (
+    flow_shortages,
+    warn_about_circuit,
+    warn_about_implausible_values,
+)
 from crane.formats.machine_file.machine_reader import read_machine_spec
 from crane.formats.robot_files import is_simulator_file
 from crane.machine.machine_checks import has_mass
@@ -132,13 +135,12 @@ class CheckReport:
     @property
     def counts(self) -> str:
         """One line with the number of errors and of warnings."""
-        words = [
-            f"{number or 'no'} {word}{'s' * (number != 1)}"
-            for number, word in ((self.errors, "error"), (self.warnings, "warning"))
-        ]
-        return ", ".join(words) + (
-            "; there is more, mend these first" if self.is_truncated else ""
-        )
+        return ", ".join(
+            [
+                f"{number or 'no'} {word}{'s' * (number != 1)}"
+                for number, word in ((self.errors, "error"), (self.warnings, "warning"))
+            ]
+        ) + ("; there is more, mend these first" if self.is_truncated else "")
 
 
 def check(
@@ -188,8 +190,9 @@ def _check_machine(
         if spec is not None and (active is not None or free is not None):
             with error_recovery():
                 spec = set_active_joints(spec, active, free)
-        if spec is not None:
-            closure = _check_closure(spec, collected)
+        if spec is not None and collected.can_be_assembled:
+            with error_recovery():
+                closure = check_mechanism(spec, collected)
         warn_about_implausible_values(collected.parsed_files, spec)
         if spec is not None:
             warn_about_circuit(spec)
@@ -199,23 +202,30 @@ def _check_machine(
         for one in caught
         if issubclass(one.category, CraneWarning)
     ]
-    summary = None
-    if spec is not None and closure is not None and not collected.errors:
-        summary = _machine_summary(spec, closure)
     ordered = sorted(set(findings), key=lambda x: (x.file, x.line, not x.is_error, x.message))
     is_truncated = collected.is_truncated or len(ordered) > _MAX_FINDINGS
-    open_loops: tuple[LoopProposal, ...] = ()
-    if spec is not None and closure is not None:
-        open_loops = propose_loops(spec, closure.model, closure.home)
-    notes = tuple(flow_shortages(spec)) if spec is not None and summary is not None else ()
     command_arguments = command_line_arguments(name, active, free)
-    if open_loops and summary is not None:  # active joints are those of the closed machine
-        command_arguments = command_line_arguments(
-            name, options=replace(load_options(), floating_root=False)
-        )
-    next_command = _next_command(command_arguments, spec, closure, summary, bool(open_loops))
-    return CheckReport(
-        tuple(ordered[:_MAX_FINDINGS]), summary, is_truncated, next_command, open_loops, notes
+    report = CheckReport(
+        tuple(ordered[:_MAX_FINDINGS]),
+        None,
+        is_truncated,
+        f"crane check {command_arguments} again, once the errors are mended",
+    )
+    if spec is None or closure is None:
+        return report
+    open_loops = propose_loops(spec, closure.model, closure.home)
+    if collected.errors:
+        return replace(report, proposals=open_loops)
+    next_command = _next_command(command_arguments, spec, closure)
+    if open_loops:  # active joints are those of the closed machine
+        options = replace(load_options(), floating_root=False)
+        next_command = f"crane add loops {command_line_arguments(name, options=options)}"
+    return replace(
+        report,
+        summary=_machine_summary(spec, closure),
+        next_command=next_command,
+        proposals=open_loops,
+        notes=tuple(flow_shortages(spec)),
     )
 
 
@@ -229,18 +239,8 @@ def _format_group(findings: list[Finding]) -> str:
     return f"{findings[0]} ({len(findings)} such{lines})"
 
 
-def _next_command(
-    command_arguments: str,
-    spec: MachineSpec | None,
-    closure: Closure | None,
-    summary: str | None,
-    is_open: bool,
-) -> str:
+def _next_command(command_arguments: str, spec: MachineSpec, closure: Closure) -> str:
     """Return the suggested next command for a machine given as command line arguments."""
-    if spec is None or closure is None or summary is None:
-        return f"crane check {command_arguments} again, once the errors are mended"
-    if is_open:
-        return f"crane add loops {command_arguments}"
     if closure.home_search is not None and is_simulator_file(spec.path):
         return f"crane convert {command_arguments} {portable_file_name(spec.name)}"
     if closure.home_search is not None:
@@ -255,26 +255,17 @@ def _next_command(
     return f"crane simulate {command_arguments} --duration 2 --out {portable_file_name(spec.name)}"
 
 
-def _check_closure(spec: MachineSpec, findings: Findings) -> Closure | None:
-    """Return the closure of a machine, None if errors prevent it."""
-    if not findings.can_be_assembled:
-        return None
-    with error_recovery():
-        return check_mechanism(spec, findings)
-    return None
-
-
 def _parse_finding(message: str, is_error: bool, file: str) -> Finding:
-    message = _replace_unprintable(message)
+    message = format_one_line(message)
     location = _LOCATION_PATTERN.match(message)
     if location is None:
-        return Finding(_replace_unprintable(file), 0, is_error, message)
-    problem = message[location.end() :]
-    return Finding(Path(location["file"]).name, int(location["line"] or 0), is_error, problem)
-
-
-def _replace_unprintable(text: str) -> str:
-    return "".join(c if c.isprintable() else " " for c in text)
+        return Finding(format_one_line(file), 0, is_error, message)
+    return Finding(
+        Path(location["file"]).name,
+        int(location["line"] or 0),
+        is_error,
+        message[location.end() :],
+    )
 
 
 def _machine_summary(spec: MachineSpec, closure: Closure) -> str:
@@ -287,6 +278,6 @@ def _machine_summary(spec: MachineSpec, closure: Closure) -> str:
         else ""
     )
     return (
-        f"{_replace_unprintable(spec.name)}: {joints} joints, {len(spec.loops)} loops, "
+        f"{format_one_line(spec.name)}: {joints} joints, {len(spec.loops)} loops, "
         f"{mobility} degrees of freedom, {elements_text}loops closed to {residual:.1e} m at home"
     )

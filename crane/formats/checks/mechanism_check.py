@@ -113,16 +113,11 @@ def _loop_gaps(spec: MachineSpec, model: pin.Model, initial_guess: Array) -> dic
         # rows of rotations are cosines of angles that are right ones when closed
         sine = min(1.0, float(np.linalg.norm(phi[rows & ~equations.is_translation])))
         if max(length, sine) > _OPEN_TOLERANCE:
+            metres = length * equations.characteristic_length
+            length_text = f"{metres:.3g} m" if metres >= 1 else f"{1e3 * metres:.3g} mm"
             angle_text = f"{np.degrees(np.arcsin(sine)):.3g} deg askew"
-            gap_texts[f"loop {loop.name}"] = (
-                f"{_format_length(length * equations.characteristic_length)} apart and "
-                f"{angle_text}"
-            )
+            gap_texts[f"loop {loop.name}"] = f"{length_text} apart and {angle_text}"
     return gap_texts
-
-
-def _format_length(metres: float) -> str:
-    return f"{metres:.3g} m" if metres >= 1 else f"{1e3 * metres:.3g} mm"
 
 
 def _warn_about_limits(spec: MachineSpec, closure: Closure) -> None:

@@ -1,4 +1,4 @@
-"""Warnings about values that are possible but unlikely: wrong units, inertias that do not fit.
+"""Warnings about what is possible but unlikely: units, inertias, connections of a circuit.
 
 The radius of gyration of a body is at most half of its size. Published robot models exceed that up
 to sevenfold, perhaps because only a part of the body is drawn, so the bounds are wider.
@@ -18,8 +18,21 @@ from crane.description.inertia_feasibility import inertia_problem
 from crane.description.specification import MachineSpec
 from crane.formats.visuals.urdf_shapes import MeshShape, UrdfShapes, Visual, read_shapes
 from crane.formats.xml_file import XmlFile
+from crane.hydraulics.circuit_elements import MAIN_PUMP, TANK_NODE
+from crane.hydraulics.components import Valve
+from crane.hydraulics.hydraulic_circuit import (
+    Hydraulics,
+    connected_nodes,
+    full_opening_flow,
+    nodes_draining_to_tank,
+    nodes_fed_by_pumps,
+)
+from crane.hydraulics.pump_equations import least_sensing_ratio, unstable_frequency_range
 
 Bounds = tuple[Array, Array]
+_MAX_DEMAND_RATIO = 1.01  # of the flow of its valves to the flow of a pump
+_MAX_PRESSURE_RISE = 0.1  # of a line, relative to the pressure of its pump
+_LITRES_PER_MINUTE = 6e4  # in 1 m3/s
 
 
 def read_numbers(element: etree._Element | None, key: str, count: int) -> Array | None:
@@ -50,16 +63,13 @@ _MAX_COM_DISTANCE = 3.0  # of the centre of mass, relative to the size of the sh
 _MAX_DENSITY = 1e5  # [kg/m3] in the bounding box of a link; osmium has 2.3e4
 _DUMMY_LIMITS = 1e-2, 1e-4  # [m], [kg] below which a link only represents a sensor or frame
 
-ElementProblems = list[tuple[etree._Element, str]]
-
 
 def warn_about_implausible_values(files: Sequence[XmlFile], spec: MachineSpec | None) -> None:
     """Warn of implausible values in parsed files and in the home configuration."""
     for xml in {xml.file: xml for xml in files}.values():
         shapes = read_shapes(xml, ("visual", "collision"))
         _warn_about_shapes(shapes)
-        _warn_about_angles(xml)
-        if _warn_about_lengths(xml):  # inertias cannot be compared with sizes in other units
+        if _warn_about_units(xml):  # inertias cannot be compared with sizes in other units
             continue
         joint_distances = _joint_distances(xml)
         # of visuals, or of collisions for links without visuals
@@ -77,62 +87,49 @@ def _warn(text: str) -> None:
     warnings.warn(text, CraneWarning, stacklevel=2)
 
 
-def _warn_first(xml: XmlFile, problems: ElementProblems, hint: str) -> bool:
-    """Warn of the first problem with their number, and return whether there are any."""
-    if problems:
-        element, problem = problems[0]
-        count_text = f" ({len(problems)} such in this file)" if len(problems) > 1 else ""
-        _warn(f"{xml.source_location(element)}: {problem}{count_text}, {hint}")
-    return bool(problems)
-
-
-def _warn_about_lengths(xml: XmlFile) -> bool:
-    problems: ElementProblems = []
-    lengths = (
-        ("origin", "xyz", 3), ("box", "size", 3), ("cylinder", "length", 1),
+def _warn_about_units(xml: XmlFile) -> bool:
+    """Warn of lengths and angles in other units, and return whether lengths seem to be."""
+    length_hint, rotation_hint = (
+        f"write {unit} if these are {other}"
+        for unit, other in (("metres", "millimetres"), ("radians", "degrees"))
+    )
+    limit_hint = f"{rotation_hint}, or make it continuous"
+    problems: dict[str, list[tuple[etree._Element, str]]] = {
+        rotation_hint: [], limit_hint: [], length_hint: [],
+    }  # fmt: skip
+    attributes = (
+        ("origin", "rpy", 3), ("origin", "xyz", 3), ("box", "size", 3), ("cylinder", "length", 1),
         ("cylinder", "radius", 1), ("sphere", "radius", 1),
     )  # fmt: skip
     values_by_element = (
-        (element, read_numbers(element, key, count))
-        for tag, key, count in lengths
+        (element, key, read_numbers(element, key, count))
+        for tag, key, count in attributes
         for element in xml.root.iter(tag)
     )
-    for element, values in values_by_element:
-        if values is not None and np.abs(values).max() > LONGEST:
-            largest = values[np.abs(values).argmax()]
-            problems.append(
-                (element, f"{largest:g} m in <{element.tag}> is a long way for a machine")
-            )
+    for element, key, values in values_by_element:
+        largest = 0.0 if values is None else values[np.abs(values).argmax()]
+        if key == "rpy" and abs(largest) > _REVOLUTION * 1.01:
+            problem = f'rpy="{element.get("rpy")}" turns more than once'
+            problems[rotation_hint].append((element, problem))
+        if key != "rpy" and abs(largest) > LONGEST:
+            problem = f"{largest:g} m in <{element.tag}> is a long way for a machine"
+            problems[length_hint].append((element, problem))
     for joint in xml.root.iterfind("joint"):
-        largest = _largest_limit(joint)
+        limit, label = joint.find("limit"), f"of joint '{joint.get('name')}'"
+        limits = (read_numbers(limit, key, 1) for key in ("lower", "upper"))
+        largest = max((float(end[0]) for end in limits if end is not None), key=abs, default=0.0)
         if joint.get("type") == "prismatic" and LONGEST < abs(largest) <= _NO_LIMIT:
-            problem = f"the limit {largest:g} m of joint '{joint.get('name')}' is a long way"
-            problems.append((joint.find("limit"), problem))
-    problems.sort(key=lambda item: item[0].sourceline or 0)
-    return _warn_first(xml, problems, "write metres if these are millimetres")
-
-
-def _largest_limit(joint: etree._Element) -> float:
-    """Return the limit with the largest magnitude, 0 for a joint without limits."""
-    limit = joint.find("limit")
-    limits = (read_numbers(limit, key, 1) for key in ("lower", "upper"))
-    return max((float(end[0]) for end in limits if end is not None), key=abs, default=0.0)
-
-
-def _warn_about_angles(xml: XmlFile) -> None:
-    rotation_problems: ElementProblems = []
-    for origin in xml.root.iter("origin"):
-        rpy = read_numbers(origin, "rpy", 3)
-        if rpy is not None and np.abs(rpy).max() > _REVOLUTION * 1.01:
-            rotation_problems.append((origin, f'rpy="{origin.get("rpy")}" turns more than once'))
-    _warn_first(xml, rotation_problems, "write radians if these are degrees")
-    limit_problems: ElementProblems = []
-    for joint in xml.root.iterfind("joint"):
-        largest = _largest_limit(joint)
+            problem = f"the limit {largest:g} m {label} is a long way"
+            problems[length_hint].append((limit, problem))
         if joint.get("type") == "revolute" and 2 * _REVOLUTION < abs(largest) <= _NO_LIMIT:
-            problem = f"the limit {largest:g} rad of joint '{joint.get('name')}' is many turns"
-            limit_problems.append((joint.find("limit"), problem))
-    _warn_first(xml, limit_problems, "write radians if these are degrees, or make it continuous")
+            problem = f"the limit {largest:g} rad {label} is many turns"
+            problems[limit_hint].append((limit, problem))
+    for hint, found in problems.items():
+        found.sort(key=lambda item: item[0].sourceline or 0)
+        count_text = f" ({len(found)} such in this file)" if len(found) > 1 else ""
+        for element, problem in found[:1]:
+            _warn(f"{xml.source_location(element)}: {problem}{count_text}, {hint}")
+    return bool(problems[length_hint])
 
 
 def _warn_about_home(spec: MachineSpec) -> None:
@@ -252,3 +249,142 @@ def _joint_distances(xml: XmlFile) -> dict[str, float]:
             link = parent.get("link", "").strip()
             found[link] = max(found.get(link, 0.0), float(np.linalg.norm(xyz)))
     return found
+
+
+def warn_about_circuit(spec: MachineSpec) -> None:
+    """Warn of implausible connections and pump controls of a circuit."""
+    if spec.hydraulics is None:
+        return
+    for key, text in (*_node_problems(spec.hydraulics), *_pump_problems(spec.hydraulics)):
+        location = spec.source_locations.get(
+            key, spec.source_locations.get("hydraulics", spec.path.name)
+        )
+        warnings.warn(f"{location}: {text}", CraneWarning, stacklevel=2)
+
+
+def flow_shortages(spec: MachineSpec) -> list[str]:
+    """Return a line for each pump whose valves take more flow together than it delivers.
+
+    Only valves that control a flow count, those with a margin. Most machines have such pumps.
+    """
+    messages = []
+    for name, supply in spec.hydraulics.pumps.items() if spec.hydraulics else ():
+        assert spec.hydraulics is not None
+        demand = full_opening_flow(spec.hydraulics, name)
+        if supply.flow > 0 and demand > _MAX_DEMAND_RATIO * supply.flow:
+            messages.append(
+                f"hydraulics: the valves of '{name}' take {demand * _LITRES_PER_MINUTE:.3g} "
+                f"l/min together, it gives {supply.flow * _LITRES_PER_MINUTE:.3g} l/min"
+            )
+    return messages
+
+
+def _node_problems(hydraulics: Hydraulics) -> Iterator[tuple[str, str]]:
+    connected, drained_nodes, fed_nodes = (
+        connected_nodes(hydraulics),
+        nodes_draining_to_tank(hydraulics),
+        nodes_fed_by_pumps(hydraulics),
+    )
+    valves = hydraulics.valves.values()
+    return_nodes = {node for x in valves for node in (x.return_a, x.return_b)} & {
+        *hydraulics.lines
+    }
+    kinds = {name: "line" for name in hydraulics.lines}
+    kinds |= {name: "accumulator" for name in hydraulics.accumulators}
+    for name, kind in kinds.items():
+        if name not in connected or (name in return_nodes and name not in drained_nodes):
+            continue  # has an error already
+        if name not in fed_nodes:
+            is_fed_from_tank = any(
+                x.kind == "check" and (x.source, x.target) == (TANK_NODE, name)
+                for x in hydraulics.elements.values()
+            )
+            check_valve_text = (
+                "only a check valve from the tank feeds it, " if is_fed_from_tank else ""
+            )
+            yield (
+                f"{kind} {name}",
+                f"no pump feeds the {kind} '{name}', {check_valve_text}add an element that "
+                f"leads into it",
+            )
+        elif name not in drained_nodes:
+            yield (
+                f"{kind} {name}",
+                f"what gets into the {kind} '{name}' never leaves it, add an orifice or a relief "
+                "valve that leads on to the tank",
+            )
+    for name in hydraulics.pumps:
+        if name in connected and name not in drained_nodes:
+            yield (
+                f"supply {name}",
+                f"no way leads from '{name}' to the tank, it only fills what it feeds, add a "
+                "relief valve, an orifice or a valve of a joint",
+            )
+
+
+def _pump_problems(hydraulics: Hydraulics) -> Iterator[tuple[str, str]]:
+    connected = connected_nodes(hydraulics)
+    for name, supply in hydraulics.pumps.items():
+        valves = [x for x in hydraulics.valves.values() if x.supply == name]
+        key = f"supply {name}"
+        if name == MAIN_PUMP and name not in connected:
+            yield key, f"nothing is joined to '{name}', let it feed a valve: the others need none"
+        if supply.control == "load-sensing" and not valves:
+            yield (
+                key,
+                f"'{name}' senses the load of its valves and has none, so that it stays at its "
+                "standby, let it feed a valve or choose another control",
+            )
+        if supply.control == "positive" and not valves:
+            yield (
+                key,
+                f"'{name}' gives what its valves ask for and has none, so that it gives nothing, "
+                "let it feed a valve or choose another control",
+            )
+        if supply.control == "negative" and not any(x.centre > 0 for x in valves):
+            yield (
+                key,
+                f"'{name}' senses the flow through open centres and no valve of it has one, so "
+                "that it always gives all, add 'centre' to its valves or choose another control",
+            )
+        has_controlled_pressure = supply.control != "fixed" and supply.relief > 0
+        if has_controlled_pressure and supply.relief <= supply.pressure:
+            yield (
+                key,
+                f"relief of '{name}' is {supply.relief:g} Pa, not above its pressure of "
+                f"{supply.pressure:g} Pa: what the pump gives flows off there, give a higher one",
+            )
+        modulus = hydraulics.oil.bulk_modulus
+        if valves and (unstable_band := unstable_frequency_range(supply, modulus)):
+            min_damping = math.ceil(100.0 * least_sensing_ratio(supply, modulus)) / 100.0
+            yield (
+                key,
+                f"'{name}' follows its loads so closely that it drives those that swing at "
+                f"{unstable_band[0]:.3g} to {unstable_band[1]:.3g} Hz: pressures may ring on, "
+                f"give 'sensing' {min_damping:g} or more (damping of the load-sensing line)",
+            )
+        # volume that it delivers into a closed line until its displacement is reduced
+        pressure_rise = supply.flow * supply.response * hydraulics.oil.bulk_modulus / supply.volume
+        if pressure_rise > _MAX_PRESSURE_RISE * supply.pressure and not _is_relieved(
+            hydraulics, name, valves
+        ):
+            yield (
+                key,
+                f"nothing relieves '{name}', which swings back within {supply.response:g} s: "
+                "once its valves close or what they feed stalls, its line rises by up to "
+                f"{pressure_rise:.3g} Pa over its {supply.pressure:.3g} Pa, give 'relief' [Pa]",
+            )
+
+
+def _is_relieved(hydraulics: Hydraulics, name: str, valves: Sequence[Valve]) -> bool:
+    """Whether a pump's line has an outlet other than closed valves and its slow slip."""
+    adjacent_elements = [
+        part for part in hydraulics.elements.values() if name in (part.source, part.target)
+    ]
+    return (
+        hydraulics.pumps[name].relief > 0
+        or any(valve.centre > 0 for valve in valves)
+        or any(
+            part.source == name or part.kind in ("orifice", "leak") for part in adjacent_elements
+        )
+    )

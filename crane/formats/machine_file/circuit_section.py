@@ -1,36 +1,40 @@
 """The section `hydraulics` of a machine file."""
 
+import csv
+import io
 import itertools
 import math
 import string
 import warnings
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any
 
-from crane.common.errors import CraneWarning, DescriptionError, suggest_names
+from crane.common.errors import CraneWarning, DescriptionError, InputError, suggest_names
+from crane.common.package_search import read_plain_file
 from crane.common.plausible_ranges import implausible_value_text
-from crane.description.circuit_schema import AREA_KEYS, BORE_KEYS, ORIFICE_KEYS, VALVE_TYPES
+from crane.description.circuit_schema import AREA_KEYS, BORE_KEYS, ORIFICE_KEYS
 from crane.description.findings import FollowUpError, UnknownNames, error_recovery, report_error
-from crane.formats.machine_file.flow_curves import read_curve
-from crane.formats.machine_file.tree_builder import TreeBuilder
+from crane.formats.machine_file.structure_sections import TreeBuilder
+from crane.formats.machine_file.yaml_parser import MAX_FILE_SIZE
 from crane.formats.machine_file.yaml_section import YamlSection
 from crane.hydraulics.circuit_elements import MAIN_PUMP, Supply
 from crane.hydraulics.components import (
     COUNTERBALANCE_KEYS,
     Cylinder,
-    Spool,
+    OpeningCurve,
     Valve,
 )
 from crane.hydraulics.hydraulic_circuit import (
     Hydraulics,
     Oil,
-    PDGains,
     check_relief_pressure,
     check_tank_pressure,
     connected_nodes,
     nodes_draining_to_tank,
 )
 
-_JOINTLY_CHECKED = ("tank", "relief")  # checked with other components
 _NAME_CHARACTERS = set(string.ascii_letters + string.digits + "_")
 _COMPENSATED_KEYS = ("flow", "margin", "meter_out")  # of compensated valves alone
 _NODE_SECTIONS = {"supplies": "supply", "lines": "line", "accumulators": "accumulator"}
@@ -47,49 +51,55 @@ def read_hydraulics(
     section = top.section("hydraulics")
     if section is None:
         return None
-    supply, oil = _read_supply_and_oil(section)
-    driving_joints = _driving_joints(section)
+    supply, oil = None, Oil()
+    with error_recovery():
+        if (oil_section := section.section("oil")) is not None:
+            oil = read_component(oil_section, oil_section.values())
+    with error_recovery():
+        supply_section = section.section("supply")
+        if supply_section is None:
+            raise section.error_at(None, "'hydraulics' has no 'supply', give its pressure")
+        supply = read_component(supply_section, supply_section.values())
+        supply_section.create(check_tank_pressure, supply, oil)
+    for key in ("cylinders", "motors"):
+        section.apply_common_item(key, section.item_names(key))
+    for key in ("valves", "control"):
+        section.apply_common_item(
+            key, [*section.item_names("cylinders"), *section.item_names("motors")]
+        )
+    driving_joints = section.known_item_names("cylinders") + section.known_item_names("motors")
+    check_joint = partial(check_active_joint, active)
 
     def read_cylinder(joint: str, item: YamlSection) -> Cylinder:
-        check_active_joint(joint, item, active)
-        cylinder = _read_cylinder(joint, item, tree)
-        _check_relief(item, supply, cylinder)
-        return cylinder
+        return _read_cylinder(joint, item, tree, supply)
 
     def read_motor(joint: str, item: YamlSection) -> Cylinder:
-        check_active_joint(joint, item, active)
         if joint in cylinders:
             raise item.error_at(None, f"'{joint}' has a cylinder and a motor, keep one of them")
-        motor = _read_motor(joint, item)
-        _check_relief(item, supply, motor)
-        return motor
+        return _read_motor(joint, item, supply)
 
-    def read_valve(joint: str, item: YamlSection) -> Valve:
-        check_active_joint(joint, item, active)
-        return _read_valve(joint, item)
-
-    def read_gains(joint: str, item: YamlSection) -> PDGains:
-        check_active_joint(joint, item, active)
-        return read_component(item, item.values())
-
-    cylinders = section.read_map("cylinders", read_cylinder)
-    cylinders |= section.read_map("motors", read_motor)
-    valves = section.read_map("valves", read_valve)
+    cylinders = section.read_map("cylinders", read_cylinder, check_joint)
+    cylinders |= section.read_map("motors", read_motor, check_joint)
+    valves = section.read_map("valves", _read_valve, check_joint)
     joints_by_component = {"cylinder": driving_joints, "valve": section.known_item_names("valves")}
     named_joints = (*driving_joints, *joints_by_component["valve"])
     for joint, component in itertools.product(named_joints, ("cylinder", "valve")):
         if joint not in joints_by_component[component]:
-            problem = f"'{joint}' has no {component}, add it"
-            report_error(section.error_at(f"{component}s", problem))
-    control = section.read_map("control", read_gains)
+            report_error(
+                section.error_at(f"{component}s", f"'{joint}' has no {component}, add it")
+            )
+    control = section.read_map(
+        "control", lambda _, item: read_component(item, item.values()), check_joint
+    )
     gains = section.known_item_names("control")
     are_names_known = not isinstance(gains + driving_joints, UnknownNames)
     if are_names_known and gains and driving_joints and {*gains} != {*driving_joints}:
         listed = ", ".join(driving_joints)
         report_error(section.error_at("control", f"give gains of all of {listed}, or none"))
     if not driving_joints:
-        problem = "'hydraulics' drives nothing, give cylinders and valves"
-        report_error(section.error_at(None, problem))
+        report_error(
+            section.error_at(None, "'hydraulics' drives nothing, give cylinders and valves")
+        )
     network = _read_network(section)
     lacks_gains = control and not cylinders.keys() <= control.keys()
     if supply is None or lacks_gains or not cylinders.keys() == valves.keys() <= set(active):
@@ -106,25 +116,6 @@ def read_hydraulics(
     )
     _check_connections(section, circuit)
     return circuit
-
-
-def _read_supply_and_oil(section: YamlSection) -> tuple[Supply | None, Oil]:
-    """The first pump, None where it is refused, and the oil."""
-    supply, oil, supply_section = None, Oil(), None
-    with error_recovery():
-        supply_section = section.section("supply")
-        if supply_section is None:
-            raise section.error_at(None, "'hydraulics' has no 'supply', give its pressure")
-        supply = read_supply(supply_section)
-    with error_recovery():
-        oil_section = section.section("oil")
-        if oil_section is not None:
-            oil = read_component(oil_section, oil_section.values())
-    if supply is not None and supply_section is not None:
-        with error_recovery():
-            supply_section.create(check_tank_pressure, supply, oil)
-            _warn_about_unit(supply_section, "tank", supply.tank)
-    return supply, oil
 
 
 def circuit_locations(top: YamlSection) -> dict[str, str]:
@@ -162,15 +153,15 @@ def _check_connections(section: YamlSection, circuit: Hydraulics) -> None:
         report_error(DescriptionError(problem), harmless=True)
 
 
-def check_active_joint(joint: str, item: YamlSection, active: tuple[str, ...]) -> None:
-    """Raise for an item of a joint that is not active.
+def check_active_joint(active: tuple[str, ...], joint: str, location: str) -> None:
+    """Raise for a joint that is not active.
 
     Raises:
         DescriptionError: With file and line, and the joints that are.
     """
     if joint not in active:
-        raise item.error_at(
-            None, f"'{joint}' is not an active joint, {suggest_names(active, joint)}"
+        raise DescriptionError(
+            f"{location}: '{joint}' is not an active joint, {suggest_names(active, joint)}"
         )
 
 
@@ -188,7 +179,7 @@ def read_component(
     assert section.schema.content is not None
     component = section.create(section.schema.content, **values, **constants)
     for name, value in values.items():
-        if name in section and isinstance(value, float) and name not in _JOINTLY_CHECKED:
+        if name in section and isinstance(value, float):
             _warn_about_unit(section, name, value, is_rotary)
     return component
 
@@ -199,8 +190,11 @@ def _warn_about_unit(
     """Warn about a number that is possible and hardly in its SI unit."""
     text = implausible_value_text(key, value, is_rotary, section.schema.component)
     if text and math.isfinite(value):
-        message = f"{section.source_location(key)}: '{key}' of {section.title} {text}"
-        warnings.warn(message, CraneWarning, stacklevel=2)
+        warnings.warn(
+            f"{section.source_location(key)}: '{key}' of {section.title} {text}",
+            CraneWarning,
+            stacklevel=2,
+        )
 
 
 def _check_relief(section: YamlSection, supply: Supply | None, cylinder: Cylinder) -> None:
@@ -208,38 +202,35 @@ def _check_relief(section: YamlSection, supply: Supply | None, cylinder: Cylinde
     if supply is None:
         return
     section.create(check_relief_pressure, supply, cylinder)
-    _warn_about_unit(section, "relief", cylinder.relief)
     if 0 < cylinder.relief <= supply.pressure and not implausible_value_text(
         "relief", cylinder.relief
     ):
-        message = (
-            f"{section.source_location('relief')}: 'relief' of {section.title} is "
-            f"{cylinder.relief:g} Pa, not above the supply's {supply.pressure:g} Pa: what the "
-            "pump gives flows off there before it can press, give a higher one"
+        warnings.warn(
+            (
+                f"{section.source_location('relief')}: 'relief' of {section.title} is "
+                f"{cylinder.relief:g} Pa, not above the supply's {supply.pressure:g} Pa: what the "
+                "pump gives flows off there before it can press, give a higher one"
+            ),
+            CraneWarning,
+            stacklevel=2,
         )
-        warnings.warn(message, CraneWarning, stacklevel=2)
 
 
-def _driving_joints(section: YamlSection) -> tuple[str, ...]:
-    """Joints with a cylinder or motor; common items are applied."""
-    for key in ("cylinders", "motors"):
-        section.apply_common_item(key, section.item_names(key))
-    for key in ("valves", "control"):
-        section.apply_common_item(
-            key, [*section.item_names("cylinders"), *section.item_names("motors")]
-        )
-    return section.known_item_names("cylinders") + section.known_item_names("motors")
-
-
-def _read_cylinder(joint: str, item: YamlSection, tree: TreeBuilder) -> Cylinder:
+def _read_cylinder(
+    joint: str, item: YamlSection, tree: TreeBuilder, supply: Supply | None
+) -> Cylinder:
     if missing_limit := tree.missing_limit_text(joint):
-        problem = f"joint '{joint}' {missing_limit}, a cylinder needs the limits of its stroke"
-        report_error(item.error_at(None, problem))
+        report_error(
+            item.error_at(
+                None, f"joint '{joint}' {missing_limit}, a cylinder needs the limits of its stroke"
+            )
+        )
     is_rotary = joint in tree.joints and tree.joints[joint].kind == "revolute"
     for key in (*BORE_KEYS, "count", "tube"):
         if is_rotary and key in item and (key != "tube" or item.number(key)):
-            problem = f"{item.title} turns its joint, give area_a and area_b [m3/rad]"
-            raise item.error_at(key, problem)
+            raise item.error_at(
+                key, f"{item.title} turns its joint, give area_a and area_b [m3/rad]"
+            )
     if "rod" in item and "bore" not in item:
         raise item.error_at("rod", f"'rod' of {item.title} goes with 'bore', give it")
     values = item.values()
@@ -255,26 +246,20 @@ def _read_cylinder(joint: str, item: YamlSection, tree: TreeBuilder) -> Cylinder
     if "bore" in item:
         bore, rod = values.pop("bore"), values.pop("rod", 0.0)
         if not bore > rod:
-            problem = f"'bore' of {item.title} is {bore:g} m, give more than the rod"
-            raise item.error_at("bore", problem)
+            raise item.error_at(
+                "bore", f"'bore' of {item.title} is {bore:g} m, give more than the rod"
+            )
         for key, value in (("bore", bore), ("rod", rod)):
             _warn_about_unit(item, key, value)
         area = count * math.pi / 4.0
         areas = {"area_a": area * bore**2, "area_b": area * (bore**2 - rod**2)}
     constants = {"joint": joint, "count": int(count), **areas, **holding_valves}
     cylinder: Cylinder = read_component(item, values, is_rotary, **constants)
+    _check_relief(item, supply, cylinder)
     return cylinder
 
 
-def read_supply(section: YamlSection) -> Supply:
-    """A pump."""
-    supply: Supply = read_component(section, section.values())
-    if "relief" in section:
-        _warn_about_unit(section, "relief", supply.relief)
-    return supply
-
-
-def _read_motor(joint: str, item: YamlSection) -> Cylinder:
+def _read_motor(joint: str, item: YamlSection, supply: Supply | None) -> Cylinder:
     """A motor as a cylinder with equal areas; its joint turns slower by the gear."""
     values = item.values()
     size = {key: values.pop(key, 1.0) for key in ("displacement", "gear", "volume")}
@@ -283,6 +268,7 @@ def _read_motor(joint: str, item: YamlSection) -> Cylinder:
     constants: dict[str, Any] = dict.fromkeys(AREA_KEYS, size["displacement"] * size["gear"])
     constants |= dict.fromkeys(("hose_a", "hose_b"), size["volume"])
     motor: Cylinder = read_component(item, values, joint=joint, motor=True, **constants)
+    _check_relief(item, supply, motor)
     return motor
 
 
@@ -293,8 +279,6 @@ def _read_network(section: YamlSection) -> dict[str, Any]:
         if not name or not set(name) <= _NAME_CHARACTERS:
             kind = item.schema.title
             raise item.error_at(None, f"a {kind} is called '{name}', use letters, digits, _")
-        if item.schema.content is Supply:
-            return read_supply(item)
         return read_component(item, item.values())
 
     network: dict[str, Any] = {
@@ -309,10 +293,6 @@ def _read_network(section: YamlSection) -> dict[str, Any]:
 
 def _read_valve(joint: str, item: YamlSection) -> Valve:
     kind = item.text("type")
-    if kind not in VALVE_TYPES:
-        raise item.error_at(
-            "type", f"valve type '{kind}' is unknown, {suggest_names(VALVE_TYPES, kind)}"
-        )
     for name in _COMPENSATED_KEYS:
         if kind != "compensated" and name in item:
             raise item.error_at(name, f"'{name}' is for valves of type 'compensated', remove it")
@@ -332,22 +312,113 @@ def _read_valve(joint: str, item: YamlSection) -> Valve:
         constants |= {"c1": inlet, "c2": outlet, "c3": outlet, "c4": inlet}
         edge_keys = edge_keys[len(ORIFICE_KEYS) :]
     for name in edge_keys:
-        curve = read_curve(item, name)
+        curve = _read_curve(item, name)
         if curve is None:
             values[name] = item.number(name)
         else:
             constants[name], constants["curves"][name] = curve
     if (second_section := item.section("spool_b", f"'spool_b' of {item.title}")) is not None:
-        constants["spool_b"] = _read_second_spool(joint, second_section, item)
+        shared: dict[str, Any] = {
+            key: item.number(key)
+            for key in second_section.schema.keys
+            if key not in second_section
+        }
+        constants["spool_b"] = read_component(
+            second_section, second_section.values(), joint=joint, **shared
+        )
     valve: Valve = read_component(item, values, **constants)
     return valve
 
 
-def _read_second_spool(joint: str, section: YamlSection, valve: YamlSection) -> Spool:
-    """A second spool, whose keys are by default those of the first one."""
-    values = section.values()
-    shared: dict[str, Any] = {
-        key: valve.number(key) for key in section.schema.keys if key not in section
-    }
-    spool: Spool = read_component(section, values, joint=joint, **shared)
-    return spool
+def _read_curve(item: YamlSection, key: str) -> tuple[float, OpeningCurve] | None:
+    """A valve's edge: its coefficient when wide open, and its share over |u|.
+
+    `[[u, c], ...]`, or a mapping with `flow: [[u, Q], ...]` at a pressure `drop`,
+    c = Q / sqrt(drop), or `area: [[u, A], ...]`, c = discharge A sqrt(2 / density), or `file`, a
+    CSV with the columns u and flow (with `drop`), area or coefficient; or `coefficient` and
+    `shape`. None where it is a number.
+
+    Raises:
+        DescriptionError: With file and line.
+    """
+    value = item.raw_value(key)
+    if not isinstance(value, list | dict):
+        return None
+    try:
+        if isinstance(value, list):
+            return _normalize_curve(_read_pairs(item, key))
+        inner = item.section(key, f"'{key}' of {item.title}")
+        assert inner is not None
+        if "shape" in inner:
+            return inner.number("coefficient"), OpeningCurve(tuple(_read_pairs(inner, "shape")))
+        given_keys = [name for name in ("flow", "area", "file") if name in inner]
+        if len(given_keys) != 1:
+            raise InputError("give one of flow, area, file, or coefficient and shape")
+        quantity = given_keys[0]
+        if quantity == "file":
+            quantity, points = _read_csv_table(inner.file("file"))
+        else:
+            points = _read_pairs(inner, quantity)
+        return _normalize_curve([(u, x * _coefficient_factor(inner, quantity)) for u, x in points])
+    except InputError as error:
+        raise item.error_at(key, f"'{key}' of {item.title}: {error}") from None
+
+
+def curve_data(coefficient: float, curve: OpeningCurve) -> dict[str, object]:
+    """A curve as a machine file has it, to the last bit."""
+    return {"coefficient": coefficient, "shape": [list(point) for point in curve.points]}
+
+
+def _normalize_curve(points: Sequence[tuple[float, float]]) -> tuple[float, OpeningCurve]:
+    coefficient = max((value for _, value in points), default=0.0)
+    return coefficient, OpeningCurve(
+        tuple((u, value / coefficient if coefficient > 0 else value) for u, value in points)
+    )
+
+
+def _read_pairs(item: YamlSection, key: str) -> Sequence[tuple[float, float]]:
+    rows = item.rows(key)
+    if any(len(row) != 2 for row in rows):
+        raise InputError("give pairs [u, value]")
+    return tuple((u, value) for u, value in rows)
+
+
+def _read_csv_table(path: Path) -> tuple[str, Sequence[tuple[float, float]]]:
+    """What a file has over |u|, and its points."""
+    try:
+        rows = list(
+            csv.DictReader(
+                io.StringIO(read_plain_file(path, MAX_FILE_SIZE).decode("utf-8-sig"), newline=""),
+                skipinitialspace=True,
+            )
+        )
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path.name} cannot be read ({error}), give a CSV file") from None
+    names = [name for name in ("flow", "area", "coefficient") if rows and name in rows[0]]
+    if len(names) != 1 or "u" not in rows[0]:
+        raise InputError(
+            f"{path.name} has no columns u and flow, area or coefficient, name them in line 1"
+        )
+    points = []
+    for number, row in enumerate(rows, 2):
+        try:
+            pair = float(row["u"]), float(row[names[0]])
+        except (TypeError, ValueError):
+            pair = math.nan, math.nan
+        if not all(map(math.isfinite, pair)):
+            raise InputError(f"{path.name}:{number} has no two finite numbers, correct it")
+        points.append(pair)
+    return names[0], points
+
+
+def _coefficient_factor(section: YamlSection, quantity: str) -> float:
+    """Coefficient per what is given."""
+    if quantity == "coefficient":
+        return 1.0
+    if quantity == "flow":
+        drop = section.number("drop")
+        if not drop > 0:
+            raise InputError("'drop' is 0, give the pressure drop that the flows were measured at")
+        return 1.0 / math.sqrt(drop)
+    discharge = section.number("discharge")
+    return discharge * math.sqrt(2.0 / section.number("density"))

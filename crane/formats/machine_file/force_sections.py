@@ -1,8 +1,13 @@
-"""The sections of a machine file on forces along joints and between frames."""
+"""The sections of a machine file on forces: of joints, between frames, and external ones."""
 
+import dataclasses
 import warnings
+from typing import Any
 
-from crane.common.errors import CraneWarning
+from crane.common.errors import CraneWarning, InputError
+from crane.description.external_force_schema import CONTACT, CONTACT_LAW_KEYS, CUTTER, GROUND, LOAD
+from crane.description.external_forces import ExternalForce, PhasedWrench, Wrench
+from crane.description.findings import FollowUpError, error_recovery
 from crane.description.force_elements import (
     EndStop,
     ForceElement,
@@ -11,7 +16,9 @@ from crane.description.force_elements import (
     Rope,
     element_name,
 )
-from crane.formats.machine_file.tree_builder import TreeBuilder
+from crane.description.ground_contact import Contact, Ground
+from crane.description.soil_cutting import SOILS, Soil, SoilCutting
+from crane.formats.machine_file.structure_sections import TreeBuilder
 from crane.formats.machine_file.yaml_section import YamlSection
 
 
@@ -19,29 +26,22 @@ def read_friction(top: YamlSection, tree: TreeBuilder) -> dict[str, Friction]:
     """Friction by joint."""
 
     def read_law(joint: str, item: YamlSection) -> Friction:
-        tree.check_joint(joint, item.source_location())
         values = item.values()
         is_drive_intended = values.pop("is_driving", False)
         law = Friction(**values)
-        if not is_drive_intended:
-            _warn_about_drive(joint, law, item.source_location())
+        for kind in () if is_drive_intended else ("coulomb", "viscous"):
+            mean, offset = getattr(law, kind), getattr(law, f"{kind}_offset")
+            if abs(offset) > mean:
+                warnings.warn(
+                    f"{item.source_location()}: friction of '{joint}' drives the joint in one "
+                    f"direction (|{kind}_offset| {abs(offset):g} > {kind} {mean:g}), a constant "
+                    "force may hide in it; write drives: true if it is meant",
+                    CraneWarning,
+                    stacklevel=3,
+                )
         return law
 
-    return top.read_map("friction", read_law)
-
-
-def _warn_about_drive(joint: str, law: Friction, source_location: str) -> None:
-    """Warn about friction that drives its joint in one direction."""
-    for kind in ("coulomb", "viscous"):
-        mean, offset = getattr(law, kind), getattr(law, f"{kind}_offset")
-        if abs(offset) > mean:
-            warnings.warn(
-                f"{source_location}: friction of '{joint}' drives the joint in one direction "
-                f"(|{kind}_offset| {abs(offset):g} > {kind} {mean:g}), a constant force may hide "
-                "in it; write drives: true if it is meant",
-                CraneWarning,
-                stacklevel=3,
-            )
+    return top.read_map("friction", read_law, tree.check_joint)
 
 
 def read_forces(top: YamlSection, tree: TreeBuilder) -> tuple[ForceElement, ...]:
@@ -50,11 +50,12 @@ def read_forces(top: YamlSection, tree: TreeBuilder) -> tuple[ForceElement, ...]
     def read_element(item: YamlSection) -> ForceElement:
         between = tree.read_frame_pair(item) if "between" in item else None
         if between is None:
-            tree.read_joint_name(item)
+            tree.check_joint(item.text("joint"), item.source_location("joint"))
         element = ForceElement(**item.values("between"), between=between)
         if not (element.stiffness or element.damping or element.force):
-            problem = f"the {element_name(element)} does nothing, give stiffness, damping or force"
-            raise item.error_at(None, problem)
+            raise item.error_at(
+                None, f"the {element_name(element)} does nothing, give stiffness, damping or force"
+            )
         return element
 
     return top.read_items("forces", read_element)
@@ -74,22 +75,171 @@ def read_gas_springs(top: YamlSection, tree: TreeBuilder) -> tuple[GasSpring, ..
 
 def read_ropes(top: YamlSection, tree: TreeBuilder) -> tuple[Rope, ...]:
     """Ropes between frames."""
-
-    def read_rope(item: YamlSection) -> Rope:
-        return Rope(tree.read_frame_pair(item), **item.values("between"))
-
-    return top.read_items("ropes", read_rope)
+    return top.read_items(
+        "ropes", lambda item: Rope(tree.read_frame_pair(item), **item.values("between"))
+    )
 
 
 def read_end_stops(top: YamlSection, tree: TreeBuilder) -> tuple[EndStop, ...]:
     """Stops at the limits of joints."""
 
     def read_stop(joint: str, item: YamlSection) -> EndStop:
-        tree.check_joint(joint, item.source_location())
         if missing_limit := tree.missing_limit_text(joint):
             hint = "make it revolute" if missing_limit == "is continuous" else "give it both"
-            problem = f"joint '{joint}' {missing_limit}, a stop needs limits: {hint}"
-            raise item.error_at(None, problem)
+            raise item.error_at(
+                None, f"joint '{joint}' {missing_limit}, a stop needs limits: {hint}"
+            )
         return EndStop(joint, **item.values())
 
-    return tuple(top.read_map("end_stops", read_stop).values())
+    return tuple(top.read_map("end_stops", read_stop, tree.check_joint).values())
+
+
+def read_external_forces(
+    top: YamlSection, tree: TreeBuilder
+) -> tuple[Wrench | Contact | SoilCutting, ...]:
+    """External forces of a machine file."""
+    section, ground = top.section("ground"), None
+    contact_law = {key: GROUND.keys[key].default for key in CONTACT_LAW_KEYS}
+    if section is not None:
+        with error_recovery():
+            values = section.values()
+            contact_law |= {key: values.pop(key) for key in CONTACT_LAW_KEYS if key in values}
+            if "profile" in section:
+                values["profile"] = tuple(map(tuple, section.rows("profile")))
+            ground = section.create(Ground, **values)
+
+    def read_contact(item: YamlSection) -> Contact:
+        frame = _read_moving_frame(item, tree)
+        _check_section(top, item, "contacts without a ground", "ground", "{height: 0}")
+        return item.create(Contact, frame, ground, **contact_law | item.values("frame"))
+
+    return (
+        *read_loads(top, tree),
+        *top.read_items("contacts", read_contact),
+        *_read_cutters(top, tree, ground),
+    )
+
+
+def _read_moving_frame(item: YamlSection, tree: TreeBuilder) -> str:
+    frame: str = item.text("frame")
+    tree.check_link(frame, item.source_location("frame"), "the frame")
+    if not tree.is_movable(frame):
+        raise tree.unknown_name_error(
+            str(item.error_at("frame", f"'{frame}' does not move, a load on it does nothing"))
+        )
+    return frame
+
+
+def _check_section(
+    top: YamlSection, item: YamlSection, problem: str, key: str, example: str
+) -> None:
+    """Raise where a section that an item needs is absent."""
+    if key not in top:
+        raise item.error_at(None, f"{problem}, add '{key}: {example}'")
+
+
+def read_loads(
+    top: YamlSection, tree: TreeBuilder, allows_phases: bool = False
+) -> tuple[Wrench, ...]:
+    """The section `loads` of a machine or of a task, which may have phases."""
+
+    def read_wrench(item: YamlSection) -> Wrench:
+        if not allows_phases:
+            item.check_keys(LOAD.keys)
+        frame = _read_moving_frame(item, tree)
+        if "force" not in item and "moment" not in item:
+            raise item.error_at(None, f"the load on '{frame}' does nothing, give force or moment")
+        values = item.values("frame")
+        for key in ("force", "moment"):
+            rows = item.rows(key) if key in item else [[0.0, 0.0, 0.0]]
+            values[key] = rows[0] if len(rows) == 1 else rows
+        return item.create(PhasedWrench if "phases" in item else Wrench, frame, **values)
+
+    return top.read_items("loads", read_wrench)
+
+
+def _read_cutters(
+    top: YamlSection, tree: TreeBuilder, ground: Ground | None
+) -> tuple[SoilCutting, ...]:
+    section, soil = top.section("soil"), None
+    if section is not None:
+        with error_recovery():
+            soil = _read_soil(section)
+
+    def read_cutter(item: YamlSection) -> SoilCutting:
+        frame = _read_moving_frame(item, tree)
+        _check_section(top, item, "cutters without ground", "ground", "{height: 0}")
+        _check_section(top, item, "cutters without soil", "soil", "{kind: sandy loam}")
+        if soil is None:
+            raise FollowUpError("the soil is refused")
+        return item.create(SoilCutting, frame, soil, ground=ground, **item.values("frame"))
+
+    return top.read_items("cutters", read_cutter)
+
+
+def _read_soil(section: YamlSection) -> Soil:
+    """A soil of the table, or one of other parameters, or one of the table with some others."""
+    values = section.values()
+    kind = values.pop("kind", None)
+    if kind is None:
+        for key in ("unit_weight", "cohesion", "friction"):
+            values[key] = section.number(key)
+        return section.create(Soil, **values)
+    return section.create(dataclasses.replace, SOILS[kind], **values)
+
+
+def external_force_data(forces: tuple[ExternalForce, ...]) -> dict[str, Any]:
+    """The sections of external forces.
+
+    Raises:
+        InputError: One is a function, or there are several grounds or soils.
+    """
+    data: dict[str, Any] = {
+        "loads": [], "ground": None, "contacts": [], "soil": None, "cutters": []
+    }  # fmt: skip
+    grounds = {force.ground for force in forces if isinstance(force, Contact | SoilCutting)}
+    soils = {force.soil for force in forces if isinstance(force, SoilCutting)}
+    if len(grounds) > 1:
+        raise InputError("contacts and cutters have several grounds, a machine file has one")
+    if len(soils) > 1:
+        raise InputError("cutters are in several soils, a machine file has one")
+    for soil in soils:
+        data["soil"] = dataclasses.asdict(soil)
+    for ground in grounds:
+        data["ground"] = GROUND.values_of(ground) or {"height": 0.0}
+    for force in forces:
+        if type(force) is Wrench:
+            data["loads"].append(load_data(force))
+        elif type(force) is Contact:
+            data["contacts"].append(
+                (
+                    CONTACT.values_of(force, "name")
+                    | ({key: getattr(force, key) for key in CONTACT_LAW_KEYS})
+                )
+                | _name_data(force)
+            )
+        elif type(force) is SoilCutting:
+            data["cutters"].append(CUTTER.values_of(force, "name") | _name_data(force))
+        else:
+            raise InputError(
+                f"the load '{force.name}' is a {type(force).__name__}, which no file holds: leave "
+                "it out, or give a Wrench by time"
+            )
+    return data
+
+
+def load_data(force: Wrench) -> dict[str, Any]:
+    """A load as the file has it."""
+    data: dict[str, Any] = {"frame": force.frame, "axes": force.axes} | _name_data(force)
+    is_time_series = len(force.times) > 1
+    for key, part in (("force", force.values[:, :3]), ("moment", force.values[:, 3:])):
+        data[key] = part.tolist() if is_time_series else part[0].tolist()
+    return data | (
+        {("phases" if isinstance(force, PhasedWrench) else "times"): force.times.tolist()}
+        if is_time_series
+        else {}
+    )
+
+
+def _name_data(force: ExternalForce) -> dict[str, str]:
+    return {"name": force.name} if force.name != force.frame else {}

@@ -101,8 +101,11 @@ class _SchemaDefinitions:
         value = self._value(name, key, is_partial)
         if is_partial or (is_structure and key.default is None):
             value = _nullable(value)
-        has_default = isinstance(key.default, str | float) and key.default != ""
-        return {"description": text, **value} | ({"default": key.default} if has_default else {})
+        return {"description": text, **value} | (
+            {"default": key.default}
+            if (isinstance(key.default, str | float) and key.default != "")
+            else {}
+        )
 
     def _value(self, name: str, key: Key, is_partial: bool) -> dict[str, Any]:
         """The values that a key may have."""
@@ -149,5 +152,8 @@ def _number(key: NumberKey) -> dict[str, Any]:
 
 
 def _array(items: dict[str, Any], size: int | None) -> dict[str, Any]:
-    bounds = {} if size is None else {"minItems": size, "maxItems": size}
-    return {"type": "array", "items": items, **bounds}
+    return {
+        "type": "array",
+        "items": items,
+        **({} if size is None else {"minItems": size, "maxItems": size}),
+    }

@@ -1,6 +1,7 @@
 """Machine files and single URDFs, read and checked into a `MachineSpec`."""
 
 from collections.abc import Callable, Container, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,18 +28,18 @@ from crane.formats.machine_file.circuit_section import (
     circuit_locations,
     read_hydraulics,
 )
-from crane.formats.machine_file.estimation_section import read_estimation
-from crane.formats.machine_file.external_force_sections import read_external_forces
 from crane.formats.machine_file.force_sections import (
     read_end_stops,
+    read_external_forces,
     read_forces,
     read_friction,
     read_gas_springs,
     read_ropes,
 )
+from crane.formats.machine_file.identification_sections import read_estimation, read_sensors
 from crane.formats.machine_file.open_loop_warning import warn_about_open_loops
-from crane.formats.machine_file.sensor_section import read_sensors
 from crane.formats.machine_file.structure_sections import (
+    TreeBuilder,
     read_chains,
     read_couplings,
     read_drives,
@@ -46,8 +47,7 @@ from crane.formats.machine_file.structure_sections import (
     read_loops,
 )
 from crane.formats.machine_file.task_section import read_tasks
-from crane.formats.machine_file.tree_builder import TreeBuilder
-from crane.formats.machine_file.yaml_section import YamlSection
+from crane.formats.machine_file.yaml_section import YamlSection, parse_with_base
 from crane.formats.parallel_robots import is_parallel_robot, read_parallel_robot
 from crane.formats.robot_files import is_robot_file
 from crane.formats.urdf.urdf_reader import read_urdf
@@ -115,7 +115,7 @@ def read_plain_data(path: Path) -> dict[str, Any]:
     Raises:
         DescriptionError: As `read_machine_spec`.
     """
-    return YamlSection.read(path, MACHINE).to_plain_data()
+    return parse_with_base(path, MACHINE, ())
 
 
 def _read_machine(path: Path) -> MachineSpec:
@@ -199,8 +199,14 @@ def _read_supports(
     for link in names:
         tree.check_link(link, top.source_location("supports"), "the support")
         if tree.is_movable(link) and link not in contacts:
-            problem = f"support '{link}' moves, name links of the base or those of contacts"
-            raise tree.unknown_name_error(str(top.error_at("supports", problem)))
+            raise tree.unknown_name_error(
+                str(
+                    top.error_at(
+                        "supports",
+                        f"support '{link}' moves, name links of the base or those of contacts",
+                    )
+                )
+            )
     if names and len(names) < 3:
         raise top.error_at("supports", f"{len(names)} supports make no area, name three or more")
     return names
@@ -213,8 +219,9 @@ def _read_pins(top: YamlSection, tree: TreeBuilder, loops: Sequence[LoopSpec]) -
     def check_name(name: str, location: str) -> None:
         if name not in names:
             known = suggest_names(names, name)
-            problem = f"{location}: '{name}' under 'pins' is no joint or loop, {known}"
-            raise tree.unknown_name_error(problem)
+            raise tree.unknown_name_error(
+                f"{location}: '{name}' under 'pins' is no joint or loop, {known}"
+            )
 
     return top.value_map("pins", YamlSection.number, check_name)
 
@@ -251,8 +258,9 @@ def _read_tip(top: YamlSection, tree: TreeBuilder) -> str | None:
     with error_recovery(harmless=True):
         tree.check_link(tip, top.source_location("tip"), "the tip frame")
         if not tree.is_movable(tip):
-            problem = f"the tip frame '{tip}' does not move, choose another"
-            raise tree.unknown_name_error(str(top.error_at("tip", problem)))
+            raise tree.unknown_name_error(
+                str(top.error_at("tip", f"the tip frame '{tip}' does not move, choose another"))
+            )
     return tip
 
 
@@ -283,14 +291,10 @@ def _read_payload(top: YamlSection, tree: TreeBuilder, tip: str | None) -> Paylo
 
 
 def _read_control(top: YamlSection, active: tuple[str, ...]) -> dict[str, PIGains]:
-    def read_gains(joint: str, item: YamlSection) -> PIGains:
-        named_joints.append(joint)
-        with error_recovery():
-            check_active_joint(joint, item, active)
-        return PIGains(**item.values())
-
-    named_joints: list[str] = []
-    gains = top.read_map("control", read_gains)
+    gains = top.read_map(
+        "control", lambda _, item: PIGains(**item.values()), partial(check_active_joint, active)
+    )
+    named_joints = top.item_names("control")
     missing = [joint for joint in active if named_joints and joint not in named_joints]
     if missing:
         raise top.error_at("control", f"no gains for {', '.join(missing)}, give kp and ki of each")

@@ -21,6 +21,8 @@ from crane.description.circuit_schema import (
 )
 from crane.description.force_elements import Friction
 from crane.description.key_types import REQUIRED
+from crane.description.kinematic_tree import Tree
+from crane.description.machine_parameters import FieldPath, parameter_paths, value_at
 from crane.description.machine_schema import (
     COUPLING,
     FRICTION,
@@ -30,20 +32,13 @@ from crane.description.machine_schema import (
     TASK,
     VIA_POINT,
 )
-from crane.description.sensors import quantity_unit
-from crane.description.specification import Task
-from crane.formats.machine_file.estimation_section import estimation_data
-from crane.formats.machine_file.external_force_sections import external_force_data, load_data
-from crane.formats.machine_file.flow_curves import curve_data
+from crane.description.sensors import SENSOR_PARAMETERS, SENSOR_PREFIX, quantity_unit
+from crane.description.specification import LoopSpec, Task
+from crane.formats.machine_file.force_sections import external_force_data, load_data
+from crane.formats.machine_file.identification_sections import estimation_data
 from crane.formats.machine_file.machine_reader import read_machine_spec
-from crane.formats.machine_file.parameter_locations import (
-    MachineFileLocation,
-    UrdfLocation,
-    parameter_locations,
-)
 from crane.formats.machine_file.yaml_text import KeyPath, format_yaml
-from crane.formats.urdf_elements import add_joint, add_link
-from crane.formats.urdf_output import (
+from crane.formats.urdf.urdf_writer import (
     compound_drive_factors,
     copy_shapes,
     format_document,
@@ -51,9 +46,13 @@ from crane.formats.urdf_output import (
     rotor_inertias,
     with_floating_joints,
 )
+from crane.formats.urdf_elements import add_joint, add_link
 from crane.hydraulics.components import Cylinder, Valve
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.machine.machine import Machine
+
+_ELEMENT_PATHS = {"mass": "inertial/mass", "com": "inertial/origin", "tensor": "inertial/inertia",
+         "xyz": "origin", "rpy": "origin", "limits": "limit"}  # fmt: skip
 
 
 def write_machine(
@@ -109,20 +108,27 @@ class MachineDraft:
     """
 
     def __init__(self, machine: Machine, folder: str = ""):
-        self._machine, self._chain_division = machine, _ChainDivision(machine)
-        self._folder, self._comment = folder, origin_text(machine)
+        self._machine, self._folder, self._comment = machine, folder, origin_text(machine)
         self.data = _machine_data(machine)
         self.urdfs: dict[str, etree._Element] = {}
         self._line_notes: dict[KeyPath, str] = {}
-        self._element_notes: dict[str, list[tuple[etree._Element, str]]] = {}
+        self._element_notes: dict[etree._Element, list[str]] = {}
         self._header_notes: list[str] = []
-        for name in self._chain_division.names:
-            parent = (
-                {"parent": self._chain_division.parent_frames[name]}
-                if name in self._chain_division.parent_frames
-                else {}
-            )
-            self.add_chain(name, self._chain_division.chain_urdf(name), parent)
+        tree = with_floating_joints(machine)
+        chains = [chain for chain in machine.chains if chain.name != "payload"]
+        chain_of_attachment = {chain.attachment_name: chain.name for chain in chains[1:]}
+        self._chain_of_link = _chains_by_link(tree, chains[0].name, chain_of_attachment)
+        for chain in chains:
+            robot = etree.Element("robot", name=chain.name)
+            for link in tree.links.values():
+                if self._chain_of_link[link.name] == chain.name:
+                    add_link(robot, link)
+            for joint in tree.joints.values():
+                is_attachment = joint.name in chain_of_attachment
+                if self._chain_of_link[joint.child] == chain.name and not is_attachment:
+                    add_joint(robot, joint)
+            copy_shapes(robot, machine, [chain.name])
+            self.add_chain(chain.name, robot, {"parent": chain.parent} if self.urdfs else {})
         load = _payload_urdf(machine)
         self._payload_file = None if load is None else (load.name, load.read_bytes())
         if self._payload_file is not None:
@@ -130,76 +136,98 @@ class MachineDraft:
 
     def add_notes(self, notes: Mapping[str, str]) -> None:
         """Put words beside numbers; at the head where they do not stand in a line as they are."""
-        locations, changes = parameter_locations(self._machine), self._machine.parameter_changes
-        notes_by_element: dict[etree._Element, str] = {}
+        machine, changes = self._machine, self._machine.parameter_changes
+        paths = {
+            name: path
+            for name, path in parameter_paths(machine).items()
+            if path[0] != "friction" or path[1] in machine.friction
+        }
+        for quantity in machine.sensors:
+            for key in SENSOR_PARAMETERS:
+                paths[f"{SENSOR_PREFIX}{quantity}.{key}"] = "sensors", quantity, key
         for name, note in notes.items():
-            location = locations.get(name)
-            value = changes.get(name, None if location is None else location.value)
-            if location is not None and location.value == value:
-                if isinstance(location, MachineFileLocation) and self._write_explicitly(
-                    location.key_path, location.value
-                ):
-                    self._line_notes[location.key_path] = note
-                    continue
-                if (
-                    isinstance(location, UrdfLocation)
-                    and (element := self._find_element(location)) is not None
-                ):
-                    named = f"{name}: {note}"
-                    notes_by_element[element] = "; ".join(
-                        filter(None, (notes_by_element.get(element), named))
-                    )
-                    continue
-            self._header_notes.append(f"{name}{'' if value is None else f' = {value!r}'}: {note}")
-        for element, note in notes_by_element.items():
-            chain = element.getroottree().getroot().get("name")
-            self._element_notes.setdefault(chain, []).append((element, note))
+            path = paths.get(name)
+            written_value = None if path is None else value_at(machine, path)
+            value = changes.get(name, written_value)
+            if path is None or written_value != value or not self._place_note(path, name, note):
+                shown = "" if value is None else f" = {value!r}"
+                self._header_notes.append(f"{name}{shown}: {note}")
 
-    def _write_explicitly(self, key_path: KeyPath, value: float) -> bool:
-        """Write a number that is as by default, too; whether there is a place for it."""
+    def _place_note(self, path: FieldPath, name: str, note: str) -> bool:
+        """Put a note on the line of a number, written even if it is a default; whether it has one.
+
+        `payload.mass` has none: it is part of a link's mass, or of several.
+        """
+        machine, (section, key, *rest) = self._machine, path
+        if section == "tree" and rest[-1] != "rotor_inertia":
+            tag, part = ("link", rest[2]) if key == "links" else ("joint", rest[1])
+            xpath = f"{tag}[@name=$name]/{_ELEMENT_PATHS[str(part)]}"
+            elements = [
+                x for robot in self.urdfs.values() for x in robot.xpath(xpath, name=rest[0])
+            ]
+            for element in elements[:1]:
+                self._element_notes.setdefault(element, []).append(f"{name}: {note}")
+            return bool(elements)
+        key_path: KeyPath = path
+        if section == "tree":
+            key_path = "rotor_inertia", rest[0]
+        elif section == "pin_capacities":
+            key_path = "pins", key
+        elif section in ("gas_springs", "end_stops"):  # which are mappings in the file
+            key_path = str(section), value_at(machine, path[:2]).joint, *rest
         parent: Any = self.data
-        for key in key_path[:-1]:
-            if not isinstance(key, int) and key not in parent:
+        for step in key_path[:-1]:
+            if not isinstance(step, int) and step not in parent:
                 return False
-            parent = parent[key]
-        circuit = self._machine.hydraulics
-        if circuit is not None and key_path[-1] in ORIFICE_KEYS and "flow" in parent:
+            parent = parent[step]
+        if machine.hydraulics is not None and key_path[-1] in ORIFICE_KEYS and "flow" in parent:
             del parent["flow"], parent["meter_out"]
-            valve = circuit.valves[str(key_path[2])]
-            parent.update({key: getattr(valve, key) for key in ORIFICE_KEYS})
-        return bool(parent.setdefault(key_path[-1], value) == value)
+            valve = machine.hydraulics.valves[str(key_path[2])]
+            parent.update({edge: getattr(valve, edge) for edge in ORIFICE_KEYS})
+        value = value_at(machine, path)
+        if parent.setdefault(key_path[-1], value) != value:
+            return False
+        self._line_notes[key_path] = note
+        return True
 
-    def _find_element(self, location: UrdfLocation) -> etree._Element | None:
-        """Of a URDF, None where it has none of that name."""
-        for owner in self.urdf_of_link(location.link).iterfind(location.element_type):
-            if owner.get("name") == location.owner:
-                return owner.find(location.path)
-        return None
-
-    def add_chain(self, name: str, robot: etree._Element, extra_data: Mapping[str, str]) -> None:
+    def add_chain(
+        self, name: str, robot: etree._Element, extra_data: Mapping[str, str | None]
+    ) -> None:
         """Append a sub-chain; `extra_data` is what its entry says beside its name and file."""
         self.urdfs[name] = robot
-        file = self._path_from_file(f"{len(self.urdfs)}_{portable_file_name(name)}.urdf")
-        self.data["chains"].append({"name": name, "urdf": file, **extra_data})
+        self.data["chains"].append(
+            {
+                "name": name,
+                "urdf": self._path_from_file(f"{len(self.urdfs)}_{portable_file_name(name)}.urdf"),
+                **extra_data,
+            }
+        )
 
     def urdf_of_link(self, link: str) -> etree._Element:
         """The URDF that a link is in."""
-        return self.urdfs[self._chain_division.chain_of[link]]
+        return self.urdfs[self._chain_of_link[link]]
 
     def file_paths(self, file: str) -> list[str]:
         """Paths of all files from the folder on, that of the machine file first."""
-        urdfs = [chain["urdf"] for chain in self.data["chains"]]
-        return [file, *urdfs, *([self.data["payload"]["urdf"]] if self._payload_file else [])]
+        return [
+            file,
+            *[chain["urdf"] for chain in self.data["chains"]],
+            *([self.data["payload"]["urdf"]] if self._payload_file else []),
+        ]
 
     def write(self, folder: Path, file: str) -> None:
         """Write all into a folder, the machine file by this name."""
         (folder / self._folder).mkdir(exist_ok=True)
+        notes = {element: "; ".join(texts) for element, texts in self._element_notes.items()}
         for chain in self.data["chains"]:
-            name = chain["name"]
-            content = format_document(
-                self.urdfs[name], self._comment, self._element_notes.get(name, ())
+            robot = self.urdfs[chain["name"]]
+            (folder / chain["urdf"]).write_bytes(
+                format_document(
+                    robot,
+                    self._comment,
+                    [(x, text) for x, text in notes.items() if robot in x.iterancestors()],
+                )
             )
-            (folder / chain["urdf"]).write_bytes(content)
         if self._payload_file is not None:
             (folder / self.data["payload"]["urdf"]).write_bytes(self._payload_file[1])
         nonempty = {key: value for key, value in self.data.items() if value not in (None, [], {})}
@@ -215,42 +243,18 @@ class MachineDraft:
         return f"{self._folder}/{file}" if self._folder else file
 
 
-class _ChainDivision:
-    """The sub-chains, cut at their attachments again.
-
-    Args:
-        machine: The machine.
-    """
-
-    def __init__(self, machine: Machine):
-        self.machine, self.tree = machine, with_floating_joints(machine)
-        self.chains = [chain for chain in machine.chains if chain.name != "payload"]
-        self.names = [chain.name for chain in self.chains]
-        self.parent_frames = {chain.name: str(chain.parent) for chain in self.chains[1:]}
-        self._chain_of_attachment = {
-            chain.attachment_name: chain.name for chain in self.chains[1:]
-        }
-        root = self.tree.root_link
-        self.chain_of = {root: self.names[0]}
-        joints_by_parent, pending = self.tree.joints_by_parent(), [root]
-        while pending:
-            link = pending.pop()
-            for joint in joints_by_parent.get(link, ()):
-                chain_name = self._chain_of_attachment.get(joint.name, self.chain_of[link])
-                self.chain_of[joint.child] = chain_name
-                pending.append(joint.child)
-
-    def chain_urdf(self, chain: str) -> etree._Element:
-        """The URDF of a sub-chain."""
-        robot = etree.Element("robot", name=chain)
-        for link in self.tree.links.values():
-            if self.chain_of[link.name] == chain:
-                add_link(robot, link)
-        for joint in self.tree.joints.values():
-            if self.chain_of[joint.child] == chain and joint.name not in self._chain_of_attachment:
-                add_joint(robot, joint)
-        copy_shapes(robot, self.machine, [chain])
-        return robot
+def _chains_by_link(
+    tree: Tree, first: str, chain_of_attachment: Mapping[str, str]
+) -> dict[str, str]:
+    """The name of the chain of each link, by the attachments at which chains begin."""
+    chains, joints_by_parent = {tree.root_link: first}, tree.joints_by_parent()
+    pending = [tree.root_link]
+    while pending:
+        link = pending.pop()
+        for joint in joints_by_parent.get(link, ()):
+            chains[joint.child] = chain_of_attachment.get(joint.name, chains[link])
+            pending.append(joint.child)
+    return chains
 
 
 def _machine_data(machine: Machine) -> dict[str, Any]:
@@ -262,14 +266,15 @@ def _machine_data(machine: Machine) -> dict[str, Any]:
                 f"coupling '{coupling.name}' holds {next(iter(coupling.factors))} alone, lock "
                 "that joint instead"
             )
+    drives = machine.explicit_drives
+    has_plain_drives = drives and all(list(x.factors.values()) == [1.0] for x in drives)
     data: dict[str, Any] = {
         "chains": [],
-        "loops": [
-            LOOP.values_of(loop) | {"axis": [float(x) for x in loop.axis]}
-            for loop in equations.loops
-        ],
+        "loops": [loop_data(loop) for loop in equations.loops],
         "couplings": [COUPLING.values_of(coupling) for coupling in equations.couplings],
-        "active": _active_data(machine),
+        "active": [joint for motor in drives for joint in motor.factors]
+        if has_plain_drives
+        else list(machine.driven_joints),  # drives in surplus are among them
         "drives": compound_drive_factors(machine),
         "home": dict(zip(machine.joints, machine.home.tolist(), strict=True)),
         "friction": {joint: friction_data(law) for joint, law in machine.friction.items()},
@@ -289,13 +294,9 @@ def _machine_data(machine: Machine) -> dict[str, Any]:
     return {key: data[key] for key in MACHINE.keys if key in data}
 
 
-def _active_data(machine: Machine) -> list[str]:
-    """Joints under `active`: drives in surplus are among them."""
-    if machine.explicit_drives and all(
-        list(x.factors.values()) == [1.0] for x in machine.explicit_drives
-    ):
-        return [joint for motor in machine.explicit_drives for joint in motor.factors]
-    return list(machine.driven_joints)
+def loop_data(loop: LoopSpec) -> dict[str, Any]:
+    """An entry of `loops` in a machine file."""
+    return LOOP.values_of(loop) | {"axis": [float(x) for x in loop.axis]}
 
 
 def friction_data(law: Friction) -> dict[str, Any]:
@@ -349,8 +350,9 @@ def _motor_data(motor: Cylinder) -> dict[str, Any]:
                 f"{name} of the motor of '{motor.joint}' is {getattr(motor, name):g}, which a "
                 f"machine file has no motor with, leave it at {value:g}"
             )
-    size = {"displacement": motor.area_a, "volume": motor.hose_a}
-    return size | MOTOR.values_of(motor, "displacement", "gear", "volume")
+    return {"displacement": motor.area_a, "volume": motor.hose_a} | MOTOR.values_of(
+        motor, "displacement", "gear", "volume"
+    )
 
 
 def _valve_data(valve: Valve) -> dict[str, Any]:
@@ -358,25 +360,23 @@ def _valve_data(valve: Valve) -> dict[str, Any]:
     if valve.spool_b:
         values["spool_b"] = {name: getattr(valve.spool_b, name) for name in SPOOL.keys}
     for name, curve in valve.curves.items():
-        values[name] = curve_data(getattr(valve, name), curve)
+        values[name] = {
+            "coefficient": getattr(valve, name),
+            "shape": ([list(point) for point in curve.points]),
+        }
     if not valve.margin:
         return {"type": "sharing" if valve.sharing else "orifice"} | values
-    flow = None if valve.curves.keys() & {*ORIFICE_KEYS} else _exact_flow(valve)
     size = {"type": "compensated", "margin": valve.margin}
-    if flow is not None:
-        size |= {"flow": flow, "meter_out": valve.c2}
-        values = {name: value for name, value in values.items() if name not in ORIFICE_KEYS}
-    return size | values
-
-
-def _exact_flow(valve: Valve) -> float | None:
-    """The flow at full stroke that a compensated valve is read from to the last bit, if one is."""
-    if (valve.c1, valve.c2) != (valve.c4, valve.c3):
-        return None
+    is_symmetric = (valve.c1, valve.c2) == (valve.c4, valve.c3)
+    if not is_symmetric or valve.curves.keys() & {*ORIFICE_KEYS}:
+        return size | values
     root = math.sqrt(valve.margin)
     estimate = valve.c1 * root
-    candidates = (estimate, math.nextafter(estimate, 0.0), math.nextafter(estimate, math.inf))
-    return next((flow for flow in candidates if flow / root == valve.c1), None)
+    for flow in (estimate, math.nextafter(estimate, 0.0), math.nextafter(estimate, math.inf)):
+        if flow / root == valve.c1:  # so that it is read to the last bit
+            size |= {"flow": flow, "meter_out": valve.c2}
+            return size | {x: value for x, value in values.items() if x not in ORIFICE_KEYS}
+    return size | values
 
 
 def _payload_urdf(machine: Machine) -> Path | None:

@@ -10,17 +10,14 @@ import math
 import re
 import warnings
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pinocchio as pin
 
 from crane.common.errors import CraneWarning
-from crane.description.kinematic_tree import Joint, Tree
+from crane.description.kinematic_tree import Joint, Tree, body_of
 from crane.description.pinocchio_conversion import se3_from_xyz_rpy
 from crane.description.specification import MachineSpec
-
-if TYPE_CHECKING:
-    import pinocchio as pin
 
 _LOOP_END_PATTERN = re.compile(
     r"((?:closing_|closed?_?loop|loop_?clos).*?)_?([12AB])", re.IGNORECASE
@@ -31,26 +28,24 @@ _MAX_SHOWN = 4  # pairs in a line
 
 def warn_about_open_loops(spec: MachineSpec) -> None:
     """Warn of pairs of frames that are named like the two ends of a loop that nothing closes."""
-    parent_joints = {joint.child: joint for joint in spec.tree.joints.values()}
-    closed_pairs = {
-        frozenset(body_of(parent_joints, end) for end in (loop.predecessor, loop.successor))
-        for loop in spec.loops
-    }
+    parent_joints = spec.tree.parent_joints
+
+    def bodies(*links: str) -> set[str]:
+        return {body_of(parent_joints, link) for link in links}
+
+    closed_pairs = [bodies(loop.predecessor, loop.successor) for loop in spec.loops]
     pairs = [
-        (name, one, two)
-        for name, one, two in loop_end_pairs(spec.tree)
-        if body_of(parent_joints, one) != body_of(parent_joints, two)
-        and frozenset({body_of(parent_joints, one), body_of(parent_joints, two)})
-        not in closed_pairs
+        ends
+        for _, *ends in loop_end_pairs(spec.tree)
+        if len(bodies(*ends)) == 2 and bodies(*ends) not in closed_pairs
     ]
     if not pairs:
         return
     pair_texts = [
-        f"{one} and {two}{_gap_text(parent_joints, one, two)}"
-        for _, one, two in pairs[:_MAX_SHOWN]
+        f"{one} and {two}{_gap_text(parent_joints, one, two)}" for one, two in pairs[:_MAX_SHOWN]
     ]
     remainder_text = [f"{len(pairs) - _MAX_SHOWN} more"] if len(pairs) > _MAX_SHOWN else []
-    location = spec.tree.links[pairs[0][1]].source_location
+    location = spec.tree.links[pairs[0][0]].source_location
     warnings.warn(
         f"{location}: nothing closes what looks like {len(pairs)} loop{'s' * (len(pairs) > 1)}, "
         f"{', '.join(pair_texts + remainder_text)}: close them by crane add loops, paste what "
@@ -80,44 +75,19 @@ def loop_end_pairs(tree: Tree) -> list[tuple[str, str, str]]:
     ]
 
 
-def body_of(parent_joints: Mapping[str, Joint], link: str) -> str:
-    """The link that moves with a link, nearest to the root."""
-    seen = {link}
-    while link in parent_joints and not parent_joints[link].is_movable:
-        link = parent_joints[link].parent
-        if link in seen:
-            break
-        seen.add(link)
-    return link
-
-
 def _gap_text(parent_joints: Mapping[str, Joint], first: str, second: str) -> str:
     """How far two frames are apart with all joints at zero, in words."""
-    import pinocchio as pin
-
-    first_placement, second_placement = (
-        _placement_at_zero(parent_joints, first),
-        _placement_at_zero(parent_joints, second),
-    )
-    if first_placement is None or second_placement is None:
+    placements = []
+    for link in (first, second):
+        placement = pin.SE3.Identity()
+        while link in parent_joints:
+            joint = parent_joints[link]
+            placement = se3_from_xyz_rpy(joint.xyz, joint.rpy) * placement
+            link = joint.parent
+        placements.append(placement)
+    relative_placement = placements[0].actInv(placements[1])
+    if not np.isfinite(relative_placement.homogeneous).all():  # an origin is refused
         return ""
-    relative_placement = first_placement.actInv(second_placement)
     distance = float(np.linalg.norm(relative_placement.translation))
     angle = math.degrees(float(np.linalg.norm(pin.log3(relative_placement.rotation))))
     return f" ({1e3 * distance:.3g} mm and {angle:.3g} deg apart at zero)"
-
-
-def _placement_at_zero(parent_joints: Mapping[str, Joint], link: str) -> "pin.SE3 | None":
-    """Where a link is with all joints at zero, None where that cannot be said."""
-    import pinocchio as pin
-
-    placement, seen = pin.SE3.Identity(), {link}
-    while link in parent_joints:
-        joint = parent_joints[link]
-        if not np.isfinite((*joint.xyz, *joint.rpy)).all():  # which has been told
-            return None
-        placement, link = se3_from_xyz_rpy(joint.xyz, joint.rpy) * placement, joint.parent
-        if link in seen:
-            return None
-        seen.add(link)
-    return placement

@@ -1,14 +1,21 @@
 """The section `tasks` of a machine file."""
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 
-from crane.description.findings import UnknownNames, error_recovery
+from crane.common.errors import DescriptionError
+from crane.description.findings import error_recovery
 from crane.description.machine_schema import MOTIONS
-from crane.description.specification import ATTITUDE_COORDINATES, TIP_COORDINATES, Task, ViaPoint
-from crane.description.task_phases import Phase
-from crane.formats.machine_file.external_force_sections import read_loads
-from crane.formats.machine_file.tree_builder import TreeBuilder
+from crane.description.specification import (
+    ATTITUDE_COORDINATES,
+    TIP_COORDINATES,
+    Phase,
+    Task,
+    ViaPoint,
+)
+from crane.formats.machine_file.force_sections import read_loads
+from crane.formats.machine_file.structure_sections import TreeBuilder
 from crane.formats.machine_file.yaml_section import YamlSection
 
 
@@ -32,41 +39,40 @@ def read_tasks(
         item.check_exclusive_keys()
         lever_key = "phases" if has_phases else "joystick"
         if lever_key in item and not valves:
-            problem = f"task '{name}' moves levers of no valve, add 'hydraulics'"
-            raise item.error_at(lever_key, problem)
+            raise item.error_at(
+                lever_key, f"task '{name}' moves levers of no valve, add 'hydraulics'"
+            )
+        if tip is None and "tip" in item:
+            raise _missing_tip_error(name, item, "tip")
         if has_phases:
             task = _read_phased_task(name, item, spaces, tree, home)
+        elif "via" in item:
+            task = _read_via_task(name, item, active, tip)
         else:
-            read = _read_via_task if "via" in item else _read_task
-            task = read(name, item, spaces, tip)
+            task = _read_continuous_task(name, item, spaces)
         description = item.text("description")
-        loads = read_loads(item, tree, has_phases)
-        return dataclasses.replace(task, description=description, loads=loads)
+        return dataclasses.replace(
+            task, description=description, loads=read_loads(item, tree, has_phases)
+        )
 
     return top.read_map("tasks", read_task)
 
 
-def _read_task(
-    name: str, item: YamlSection, spaces: dict[str, tuple[str, ...]], tip: str | None
+def _read_continuous_task(
+    name: str, item: YamlSection, spaces: dict[str, tuple[str, ...]]
 ) -> Task:
     """A task of one of the spaces, each of which is given with the names of its coordinates."""
     duration = item.number("duration")
-    motions = {
-        space: section
-        for space in spaces
-        if (section := item.section(space, f"'{space}' of task '{name}'")) is not None
-    }
-    if not motions:
+    space = next((key for key in spaces if key in item), None)
+    motion = None if space is None else item.section(space, f"'{space}' of task '{name}'")
+    if space is None or motion is None:
         raise item.error_at(None, f"task '{name}' has none of {MOTIONS}, give one")
-    ((space, motion),) = motions.items()
-    if space == "tip":
-        _check_has_tip(name, item, "tip", tip)
-    if not isinstance(spaces[space], UnknownNames):
-        motion.check_keys(spaces[space])
+    motion.check_keys(spaces[space])
     if space == "joystick":
         levers = item.value_map(space, lambda part, joint: _read_lever(part, joint, duration))
-        start = _read_start(name, item, spaces["active"])
-        return Task(name, "", duration, space, {}, levers, start=start)
+        return Task(
+            name, "", duration, space, {}, levers, start=_read_start(name, item, spaces["active"])
+        )
     coefficients = {}
     for coordinate in spaces[space]:
         with error_recovery():
@@ -74,75 +80,61 @@ def _read_task(
     return Task(name, "", duration, space, coefficients)
 
 
-def _check_has_tip(name: str, item: YamlSection, key: str, tip: str | None) -> None:
-    if tip is None:
-        raise item.error_at(key, f"task '{name}' moves the tip, name its frame under 'tip:'")
+def _missing_tip_error(name: str, item: YamlSection, key: str) -> DescriptionError:
+    return item.error_at(key, f"task '{name}' moves the tip, name its frame under 'tip:'")
 
 
 def _read_start(name: str, item: YamlSection, active: tuple[str, ...]) -> dict[str, float]:
     """Active coordinates where levers begin."""
     title = f"'start' of task '{name}'"
-    section = item.section("start", title)
-    if section is not None and not isinstance(active, UnknownNames):
+    if (section := item.section("start", title)) is not None:
         section.check_keys(active)
     return item.value_map("start", YamlSection.number, title=title)
 
 
-def _read_via_task(
-    name: str, item: YamlSection, spaces: dict[str, tuple[str, ...]], tip: str | None
-) -> Task:
+def _read_via_task(name: str, item: YamlSection, active: tuple[str, ...], tip: str | None) -> Task:
     """A task through points, in the space of the coordinates that these name."""
-    active, attitude = spaces["active"], tuple(x for group in ATTITUDE_COORDINATES for x in group)
-    coordinate_names = active
-    if not isinstance(active, UnknownNames):
-        coordinate_names = (
-            *active,
-            *(x for x in (*TIP_COORDINATES, *attitude) if x not in active),
-        )
+    tip_coordinates = itertools.chain(TIP_COORDINATES, *ATTITUDE_COORDINATES)
+    known_keys = active + ("time", "rates", *(x for x in tip_coordinates if x not in active))
     title = f"via point of task '{name}'"
     points = list(item.list_items("via", title))
     for point in points:
-        if not isinstance(active, UnknownNames):
-            point.check_keys(("time", "rates", *coordinate_names))
+        point.check_keys(known_keys)
     if len(points) < 2:
         raise item.error_at(
             "via", f"task '{name}' has {len(points)} via points, give two at least"
         )
-    via_points = [_read_via_point(point, title, coordinate_names) for point in points]
+    via_points = [_read_via_point(point, title) for point in points]
     point_of_coordinate = {
         x: point for point, one in zip(points, via_points, strict=True) for x in one.point
     }
     joint_names = [x for x in point_of_coordinate if x in active]
     if joint_names and len(joint_names) < len(point_of_coordinate):
         other = next(x for x in point_of_coordinate if x not in active)
-        problem = f"task '{name}' mixes '{joint_names[0]}' with '{other}', name joints or x, y, z"
-        raise point_of_coordinate[other].error_at(other, problem)
+        raise point_of_coordinate[other].error_at(
+            other, f"task '{name}' mixes '{joint_names[0]}' with '{other}', name joints or x, y, z"
+        )
     for previous, via_point, point in zip(via_points, via_points[1:], points[1:], strict=False):
         if via_point.time <= previous.time:
             problem = f"times of task '{name}' go from {previous.time:g} to {via_point.time:g} s"
             raise point.error_at("time", f"{problem}, let them increase")
     if via_points[0].time != 0:
-        problem = (
-            f"task '{name}' begins at {via_points[0].time:g} s, give its first point the time 0"
+        raise points[0].error_at(
+            "time",
+            f"task '{name}' begins at {via_points[0].time:g} s, give its first point the time 0",
         )
-        raise points[0].error_at("time", problem)
     space, required = "active", active
     if not joint_names:
-        _check_has_tip(name, item, "via", tip)
-        space = "tip"
-        required = (
-            *TIP_COORDINATES,
-            *_attitude_coordinates(
-                name, point_of_coordinate, list(zip(points, via_points, strict=True))
-            ),
+        if tip is None:
+            raise _missing_tip_error(name, item, "via")
+        attitude = _attitude_coordinates(
+            name, point_of_coordinate, list(zip(points, via_points, strict=True))
         )
-    for point, via_point, which in (
-        (points[0], via_points[0], "first"),
-        (points[-1], via_points[-1], "last"),
-    ):
-        missing = [x for x in required if x not in via_point.point]
+        space, required = "tip", TIP_COORDINATES + attitude
+    for i, which in ((0, "first"), (-1, "last")):
+        missing = [x for x in required if x not in via_points[i].point]
         if missing:
-            raise point.error_at(None, f"the {which} {title} has no '{missing[0]}', add it")
+            raise points[i].error_at(None, f"the {which} {title} has no '{missing[0]}', add it")
     ordered = tuple(
         ViaPoint(one.time, {x: one.point[x] for x in required if x in one.point}, one.rates)
         for one in via_points
@@ -150,7 +142,7 @@ def _read_via_task(
     return Task(name, "", via_points[-1].time, space, {}, via=ordered)
 
 
-def _read_via_point(point: YamlSection, title: str, coordinate_names: tuple[str, ...]) -> ViaPoint:
+def _read_via_point(point: YamlSection, title: str) -> ViaPoint:
     """A via point with the coordinates that it names."""
     time = point.number("time")
     coordinates = {x: point.number(x) for x in point if x not in ("time", "rates")}
@@ -159,8 +151,7 @@ def _read_via_point(point: YamlSection, title: str, coordinate_names: tuple[str,
     rates = point.section("rates", f"'rates' of a {title}")
     if rates is None:
         return ViaPoint(time, coordinates)
-    if not isinstance(coordinate_names, UnknownNames):
-        rates.check_keys(x for x in coordinate_names if x in coordinates)
+    rates.check_keys(coordinates)
     return ViaPoint(time, coordinates, {x: rates.number(x) for x in rates})
 
 
@@ -176,8 +167,10 @@ def _attitude_coordinates(
     if not groups:
         return ()
     if len(groups) > 1:
-        problem = f"task '{name}' has an inclination and roll, pitch, yaw, give one of both"
-        raise point_of_coordinate["inclination"].error_at("inclination", problem)
+        raise point_of_coordinate["inclination"].error_at(
+            "inclination",
+            f"task '{name}' has an inclination and roll, pitch, yaw, give one of both",
+        )
     for point, via in points:
         for values in (via.point, via.rates):
             if 0 < sum(x in values for x in groups[0]) < len(groups[0]):
@@ -218,7 +211,6 @@ def _read_phased_task(
 ) -> Task:
     """A task of levers that are held until joints have reached their positions."""
     start_positions = _read_start(name, item, spaces["active"])
-    valves = spaces["joystick"]
     limits = {x: (joint.limits.lower, joint.limits.upper) for x, joint in tree.joints.items()}
     positions = {  # what is beyond the limits is told at home
         joint: position
@@ -228,26 +220,22 @@ def _read_phased_task(
     phases: list[Phase] = []
     for section in item.list_items("phases"):
         with error_recovery():
-            phase = _read_phase(section)
-            if not isinstance(valves, UnknownNames):
-                for part, joint, problem in phase.find_problems(valves, limits, positions):
-                    inner = section.section(part, part) if joint else None
-                    raise (inner or section).error_at(joint or part, problem)
+            phase_name, within = section.text("name"), section.number("within")
+            levers, until = (
+                section.value_map(
+                    key, YamlSection.number, title=f"'{key}' of phase '{phase_name}'"
+                )
+                for key in ("levers", "until")
+            )
+            phase = Phase(phase_name, levers, until, within)
+            for part, joint, problem in phase.find_problems(spaces["joystick"], limits, positions):
+                inner = section.section(part, part) if joint else None
+                raise (inner or section).error_at(joint or part, problem)
             positions |= phase.until
             phases.append(phase)
     if not phases and not item.raw_value("phases"):
         raise item.error_at("phases", f"task '{name}' has no phases, give one at least")
-    max_duration = sum(phase.within for phase in phases)
     return Task(
-        name, "", max_duration, "joystick", {}, start=start_positions,
+        name, "", sum(phase.within for phase in phases), "joystick", {}, start=start_positions,
         phases=tuple(phases), ramp=item.number("ramp"),
     )  # fmt: skip
-
-
-def _read_phase(section: YamlSection) -> Phase:
-    name, within = section.text("name"), section.number("within")
-    levers, until = (
-        section.value_map(key, YamlSection.number, title=f"'{key}' of phase '{name}'")
-        for key in ("levers", "until")
-    )
-    return Phase(name, levers, until, within)

@@ -47,8 +47,12 @@ class _StrictConstructor(yaml.constructor.SafeConstructor):
         try:
             return super().construct_object(node, deep)
         except (ValueError, KeyError, AttributeError, TypeError, OverflowError):
-            problem = f"'{node.value}' is no value of its kind, quote it if it is text"
-            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
+            raise yaml.constructor.ConstructorError(
+                None,
+                None,
+                f"'{node.value}' is no value of its kind, quote it if it is text",
+                node.start_mark,
+            ) from None
 
 
 class _StrictLoader(_StrictConstructor, yaml.SafeLoader):

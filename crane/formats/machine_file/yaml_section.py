@@ -16,7 +16,7 @@ from crane.hydraulics.circuit_elements import CircuitPathError, ComponentParamet
 Item = TypeVar("Item")
 
 
-def _parse_with_base(
+def parse_with_base(
     file: Path, schema: SectionSchema, including_files: tuple[Path, ...]
 ) -> LocatedMapping:
     """A machine file put over the one that it extends, which may extend another.
@@ -42,7 +42,7 @@ def _parse_with_base(
             EXTENDS_KEY, f"'{base_name}' is a variant of this file itself, extend another"
         )
     del variant[EXTENDS_KEY]
-    data = _parse_with_base(base_file, schema, including_files)
+    data = parse_with_base(base_file, schema, including_files)
     data.update_from_variant(variant)
     return data
 
@@ -57,7 +57,7 @@ class YamlSection(YamlValues):
         Raises:
             DescriptionError: A file is missing, not YAML, or not a mapping of these keys.
         """
-        section = cls(_parse_with_base(file, schema, ()), schema)
+        section = cls(parse_with_base(file, schema, ()), schema)
         section.check_keys(schema.keys)
         return section
 
@@ -73,8 +73,9 @@ class YamlSection(YamlValues):
             return None
         title = title or f"'{key}'"
         if not isinstance(value, LocatedMapping):
-            problem = f"{title} is {format_value(value)}, give a mapping 'name: value'"
-            raise self.error_at(key, problem)
+            raise self.error_at(
+                key, f"{title} is {format_value(value)}, give a mapping 'name: value'"
+            )
         spec = self._key(key)
         spec = next((x for x in getattr(spec, "types", ()) if isinstance(x, SectionKey)), spec)
         schema = SectionSchema(title, {}, others=getattr(spec, "item", Key()))
@@ -103,14 +104,32 @@ class YamlSection(YamlValues):
         except InputError as error:
             raise self.error_at(None, str(error)) from None
 
-    def read_map(self, key: str, read: "Callable[[str, YamlSection], Item]") -> dict[str, Item]:
+    def read_map(
+        self,
+        key: str,
+        read: "Callable[[str, YamlSection], Item]",
+        check_name: Callable[[str, str], None] = lambda name, location: None,
+    ) -> dict[str, Item]:
         """What is read of each mapping of a mapping, by name; an error ends only its item.
 
         Args:
             key: The key.
             read: Called with each name and mapping.
+            check_name: As for `value_map`.
         """
-        return self.value_map(key, lambda outer, name: read(name, outer._nonempty_item(name)))
+
+        def read_item(outer: YamlSection, name: str) -> Item:
+            spec = outer._key(name)
+            assert isinstance(spec, SectionKey)
+            title = f"{spec.section.title} '{name}'"
+            item = outer.section(name, title)
+            if item is None or not list(item):
+                raise outer.error_at(
+                    name, f"{title} is empty, its keys are {', '.join(spec.section.keys)}"
+                )
+            return read(name, item)
+
+        return self.value_map(key, read_item, check_name)
 
     def read_items(self, key: str, read: "Callable[[YamlSection], Item]") -> tuple[Item, ...]:
         """What is read of each mapping of a list."""
@@ -119,16 +138,6 @@ class YamlSection(YamlValues):
             with error_recovery():
                 found.append(read(item))
         return tuple(found)
-
-    def _nonempty_item(self, name: str) -> "YamlSection":
-        spec = self._key(name)
-        assert isinstance(spec, SectionKey)
-        title = f"{spec.section.title} '{name}'"
-        item = self.section(name, title)
-        if item is None or not list(item):
-            problem = f"{title} is empty, its keys are {', '.join(spec.section.keys)}"
-            raise self.error_at(name, problem)
-        return item
 
     def value_map(
         self,
@@ -171,16 +180,23 @@ class YamlSection(YamlValues):
         if value is None:
             return
         if not isinstance(value, list):
-            problem = f"'{key}' is {format_value(value)}, give a list, its items with '- '"
-            report_error(self.error_at(key, problem))
+            report_error(
+                self.error_at(
+                    key, f"'{key}' is {format_value(value)}, give a list, its items with '- '"
+                )
+            )
             self.is_complete = False
             return
         assert isinstance(spec, ListKey) and isinstance(spec.item, SectionKey)
         schema = spec.item.section
         for item in value:
             if not isinstance(item, LocatedMapping):
-                problem = f"'{key}' lists {format_value(item)}, write each item as {{key: value}}"
-                report_error(self.error_at(key, problem))
+                report_error(
+                    self.error_at(
+                        key,
+                        f"'{key}' lists {format_value(item)}, write each item as {{key: value}}",
+                    )
+                )
                 self.is_complete = False
                 continue
             section = YamlSection(item, schema, _item_title(title or schema.title, item))
@@ -220,10 +236,14 @@ class YamlSection(YamlValues):
         if outer is None:
             return ()
         names = self.item_names(key)
-        is_valid = isinstance(outer, LocatedMapping) and all(
-            isinstance(outer[x], LocatedMapping) for x in names
+        return (
+            names
+            if (
+                isinstance(outer, LocatedMapping)
+                and all(isinstance(outer[x], LocatedMapping) for x in names)
+            )
+            else UnknownNames()
         )
-        return names if is_valid else UnknownNames()
 
 
 def _item_title(title: str, item: LocatedMapping) -> str:
@@ -231,4 +251,4 @@ def _item_title(title: str, item: LocatedMapping) -> str:
     name = item.get("name", item.get("joint", item.get("between")))
     if isinstance(name, list) and all(isinstance(frame, str) for frame in name):
         return f"the {title.removesuffix(' of')} between {' and '.join(map(repr, name))}"
-    return f"{title} '{name}'" if isinstance(name, str) else f"a {title}"
+    return f"{title} '{name}'" if isinstance(name, str) else f"a {title.removesuffix(' of')}"

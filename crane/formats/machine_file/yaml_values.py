@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from crane.common.errors import DescriptionError, suggest_names
-from crane.description.findings import report_error
+from crane.description.findings import UnknownNames, error_recovery, report_error
 from crane.description.key_types import (
     REQUIRED,
     FileKey,
@@ -41,12 +41,6 @@ def as_boolean(value: Any) -> bool | None:
     return value if isinstance(value, bool) else None
 
 
-def _to_plain_data(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _to_plain_data(item) for key, item in value.items()}
-    return [_to_plain_data(item) for item in value] if isinstance(value, list) else value
-
-
 class YamlValues:
     """A mapping of a machine file, and its values that are no mappings.
 
@@ -74,11 +68,6 @@ class YamlValues:
         self.is_complete = True
         self._location = (data.file, data.line) if location is None else location
 
-    def to_plain_data(self) -> dict[str, Any]:
-        """All keys and values, without locations."""
-        plain: dict[str, Any] = _to_plain_data(self._data)
-        return plain
-
     def __iter__(self) -> Iterator[str]:
         return iter(self._data)
 
@@ -89,13 +78,19 @@ class YamlValues:
             DescriptionError: The nearest known key is named. Where findings are collected, the
                 value is read as if it had that name.
         """
+        if isinstance(names, UnknownNames):
+            return
         names = tuple(names)
         for key in [key for key in self._data if key not in names]:
             near = get_close_matches(key, names, 1, 0.75)
             near = near or [name for name in names if name.lower() == key.lower()]
             is_meant = bool(near) and near[0] not in self._data
-            problem = f"unknown key '{key}' in {self.title}, {suggest_names(names, key)}"
-            report_error(self.error_at(key, problem), harmless=True)
+            report_error(
+                self.error_at(
+                    key, f"unknown key '{key}' in {self.title}, {suggest_names(names, key)}"
+                ),
+                harmless=True,
+            )
             if is_meant:
                 self._data[near[0]] = self._data[key]
                 self._data.locations[near[0]] = self._data.locations[key]
@@ -178,48 +173,46 @@ class YamlValues:
             other = next((x for x in second if x in self._data and x != key), None)
             if key is not None and other is not None:
                 names = {"key": key, "other": other, "title": self.title}
-                place = None if first == second else key
-                raise self.error_at(place, problem.format_map(self._data | names))
+                raise self.error_at(
+                    (None if first == second else key), problem.format_map(self._data | names)
+                )
 
     def text(self, key: str) -> Any:
         """A non-empty string, None where there may be none; empty where its error is reported."""
-        try:
-            return self._read_text(key)
-        except DescriptionError as error:
-            report_error(error)
-            return ""
-
-    def _read_text(self, key: str) -> str | None:
-        spec, value = self._key(key), self._get_value(key)
-        if value is spec.default:
+        with error_recovery():
+            spec, value = self._key(key), self._get_value(key)
+            if value is spec.default:
+                return value
+            if not isinstance(value, str) or not value.strip():
+                raise self._value_error(key, format_value(value), "give text (or quote it)")
+            if not "".join(value.split()).isprintable():
+                raise self.error_at(
+                    key, f"'{key}' of {self.title} holds control characters, remove them"
+                )
+            self._check_choice(key, value)
             return value
-        if not isinstance(value, str) or not value.strip():
-            raise self._value_error(key, format_value(value), "give text (or quote it)")
-        if not "".join(value.split()).isprintable():
-            raise self.error_at(
-                key, f"'{key}' of {self.title} holds control characters, remove them"
-            )
-        return value
+        return ""
+
+    def _check_choice(self, key: str, value: str) -> None:
+        choices = self._key(key).choices
+        if choices and value not in choices:
+            known = suggest_names(choices, value)
+            raise self.error_at(key, f"'{key}' of {self.title}: '{value}' is unknown, {known}")
 
     def number(self, key: str) -> float:
         """A finite number within its bounds; NaN where its error is reported."""
-        try:
-            return self._read_bounded_number(key)
-        except DescriptionError as error:
-            report_error(error)
-            return math.nan
-
-    def _read_bounded_number(self, key: str) -> float:
-        number = self._read_number(key, self.raw_value(key))
-        spec = self._key(key)
-        spec = next((x for x in getattr(spec, "types", ()) if type(x) is NumberKey), spec)
-        if not isinstance(spec, NumberKey):
+        with error_recovery():
+            number = self._read_number(key, self.raw_value(key))
+            spec = self._key(key)
+            spec = next((x for x in getattr(spec, "types", ()) if type(x) is NumberKey), spec)
+            if not isinstance(spec, NumberKey):
+                return number
+            if spec.minimum is not None and number < spec.minimum:
+                raise self._value_error(key, f"{number:g}", f"give at least {spec.minimum:g}")
+            if number == 0 and spec.zero_error:
+                raise self.error_at(key, spec.zero_error.format(key=key, title=self.title))
             return number
-        if spec.minimum is not None and number < spec.minimum:
-            raise self._value_error(key, f"{number:g}", f"give at least {spec.minimum:g}")
-        if number == 0 and spec.zero_error:
-            raise self.error_at(key, spec.zero_error.format(key=key, title=self.title))
-        return number
+        return math.nan
 
     def _read_number(self, key: str, value: Any) -> float:
         number = as_float(value)
@@ -244,8 +237,11 @@ class YamlValues:
         """A list of finite numbers."""
         value = self.raw_value(key)
         if not isinstance(value, list | tuple) or not value:
-            shown = "empty" if value == [] else format_value(value)
-            raise self._value_error(key, shown, "give a list such as [0, 1]")
+            raise self._value_error(
+                key,
+                ("empty" if value == [] else format_value(value)),
+                "give a list such as [0, 1]",
+            )
         return tuple(self._read_number(key, item) for item in value)
 
     def rows(self, key: str) -> list[list[float]]:
@@ -254,8 +250,9 @@ class YamlValues:
         is_nested = isinstance(value, list | tuple) and any(isinstance(x, list) for x in value)
         rows = value if is_nested else [value]
         if not all(isinstance(row, list | tuple) and row for row in rows):
-            hint = "give a list such as [0, 0, 1], or one of such lists"
-            raise self._value_error(key, format_value(value), hint)
+            raise self._value_error(
+                key, format_value(value), "give a list such as [0, 0, 1], or one of such lists"
+            )
         return [[self._read_number(key, item) for item in row] for row in rows]
 
     def read_list(
@@ -281,6 +278,7 @@ class YamlValues:
         for item in value:
             if value.count(item) > 1:
                 raise self.error_at(key, f"'{key}' lists '{item}' twice, list it once")
+            self._check_choice(key, item)
         return tuple(value)
 
     def file(self, key: str) -> Path:

@@ -3,14 +3,14 @@
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from crane.common.errors import DescriptionError
+from crane.description.kinematic_tree import to_vector
 from crane.description.specification import Coupling, LoopSpec
-from crane.formats.mjcf.joint_effects import fixed_tendon_factors
+from crane.formats.mjcf.model_features import fixed_tendon_factors
 from crane.formats.mjcf.mujoco_file import MujocoFile, pose
 
 _DISTANCE_TOLERANCE = 1e-9  # relative
@@ -41,11 +41,6 @@ class MjcfFrames:
         self.used_names.add(name)
         self.placements[name], self.source_locations[name] = (body, placement), source_location
         return name
-
-    def remove_axis_site(self, link: str | None) -> None:
-        """Remove a site that only defines the axis of a hinge, as written files have it."""
-        if link is not None and link.endswith("_axis"):
-            self.placements.pop(link, None)
 
 
 @dataclass(frozen=True)
@@ -88,20 +83,22 @@ def read_equality_constraints(
         if not model.eq_active0[index]:
             mjcf.note_unsupported("constraints that are switched off", name)
             continue
-        if kind in ("CONNECT", "WELD") and _is_without_effect(mjcf, index, name):
+        ends = _constraint_ends(mjcf, frames, index, kind)
+        if any(model.body_mocapid[end.body] >= 0 for end in ends):
+            mjcf.note_unsupported("constraints to what a program moves (mocap)", name)
+            continue
+        if len({int(model.body_weldid[end.body]) for end in ends}) == 1:
+            mjcf.note_unsupported("constraints within one body", name)
             continue
         while name in names:
             name += "_"
         names.add(name)
         if kind == "CONNECT":
-            pending_connects.append(
-                (name, source_location, *_constraint_ends(mjcf, frames, index, kind))
-            )
+            pending_connects.append((name, source_location, ends[0], ends[1]))
         elif kind == "WELD":
-            first, second = _constraint_ends(mjcf, frames, index, kind)
             fixes_rotation = model.eq_data[index, _TORQUE_SCALE_INDEX] != 0
             loop_type = "fixed" if fixes_rotation else "spherical"
-            loops.append(_create_loop(name, loop_type, first, second, frames, source_location))
+            loops.append(_create_loop(name, loop_type, ends[0], ends[1], frames, source_location))
         elif kind in ("JOINT", "TENDON"):
             couplings.append(
                 _create_coupling(mjcf, name, source_location, kind, index, series_joints)
@@ -114,52 +111,27 @@ def read_equality_constraints(
     return tuple(_combine_connects(pending_connects, frames) + loops), tuple(couplings)
 
 
-def _constrained_objects(model: Any, index: int) -> tuple[int, int]:
-    return int(model.eq_obj1id[index]), int(model.eq_obj2id[index])
-
-
-def _is_without_effect(mjcf: MujocoFile, index: int, name: str) -> bool:
-    """Whether a connect or weld has no effect on the machine, which is then noted."""
-    model = mjcf.model
-    bodies = list(_constrained_objects(model, index))
-    if mjcf.enumeration_name("Obj", model.eq_objtype[index]) == "SITE":
-        bodies = [int(model.site_bodyid[site]) for site in bodies]
-    if any(model.body_mocapid[body] >= 0 for body in bodies):
-        mjcf.note_unsupported("constraints to what a program moves (mocap)", name)
-        return True
-    if len({int(model.body_weldid[body]) for body in bodies}) == 1:
-        mjcf.note_unsupported("constraints within one body", name)
-        return True
-    return False
-
-
 def _constraint_ends(
     mjcf: MujocoFile, frames: MjcfFrames, index: int, kind: str
-) -> tuple[_ConstraintEnd, _ConstraintEnd]:
-    """Return both ends of a connect or weld."""
+) -> list[_ConstraintEnd]:
+    """Return both ends of a connect or weld, none of other constraints."""
     model, data = mjcf.model, mjcf.model.eq_data[index]
-    objects = _constrained_objects(model, index)
+    objects = int(model.eq_obj1id[index]), int(model.eq_obj2id[index])
+    if kind not in ("CONNECT", "WELD"):
+        return []
     if mjcf.enumeration_name("Obj", model.eq_objtype[index]) == "SITE":
-        first, second = (
+        return [
             _ConstraintEnd(
                 int(model.site_bodyid[site]),
                 pose(model.site_quat[site], model.site_pos[site]),
                 frames.link_of_site[site],
             )
             for site in objects
-        )
-        return first, second
+        ]
+    placements = [pose(data[6:10], data[3:6]), pin.SE3(np.eye(3), data[:3].copy())]
     if kind == "CONNECT":
         placements = [pin.SE3(np.eye(3), data[i : i + 3].copy()) for i in (0, 3)]
-    else:
-        placements = [
-            pose(data[6:10], data[3:6]),
-            pin.SE3(np.eye(3), data[:3].copy()),
-        ]
-    first, second = (
-        _ConstraintEnd(body, place, None) for body, place in zip(objects, placements, strict=True)
-    )
-    return first, second
+    return [_ConstraintEnd(*end, None) for end in zip(objects, placements, strict=True)]
 
 
 def _create_loop(
@@ -186,10 +158,8 @@ def _combine_connects(
         pairs.setdefault((one.body, two.body), []).append(i)
     found: dict[int, LoopSpec] = {}
     for indices in pairs.values():
-        if (
-            len(indices) == 2
-            and (hinge := _combine_two_connects(connects, indices, frames)) is not None
-        ):
+        hinge = _combine_two_connects(connects, indices, frames) if len(indices) == 2 else None
+        if hinge is not None:
             found[indices[0]] = hinge
             continue
         for i in indices:
@@ -216,15 +186,17 @@ def _combine_two_connects(
     axes = [
         first.placement.rotation.T @ line for first, line in zip(first_ends, lines, strict=True)
     ]
-    if (
-        all(first.link for first in first_ends)
-        and np.abs(axes[1] - axes[0]).max() < _DISTANCE_TOLERANCE * length[0]
-    ):
-        for second in second_ends:
-            frames.remove_axis_site(second.link)
-        x, y, z = (float(value) for value in _round_to_frame_axis(axes[0] / length[0]))
+    is_one_axis = np.abs(axes[1] - axes[0]).max() < _DISTANCE_TOLERANCE * length[0]
+    if all(first.link for first in first_ends) and is_one_axis:
+        for site in [second.link or "" for second in second_ends]:
+            if site.endswith("_axis"):  # only defines an axis, as in written files
+                frames.placements.pop(site, None)
+        axis = axes[0] / length[0]
+        nearest = np.round(axis)
+        if np.abs(axis - nearest).max() < 1e-12:  # along an axis of the frame
+            axis = nearest
         links = [str(first.link) for first in first_ends]
-        return LoopSpec(shared, "revolute", links[0], links[1], (x, y, z), where)
+        return LoopSpec(shared, "revolute", links[0], links[1], to_vector(axis), where)
     ends = [
         _ConstraintEnd(
             first.body, pin.SE3(_rotation_along(line), first.placement.translation), None
@@ -234,33 +206,12 @@ def _combine_two_connects(
     return _create_loop(shared, "revolute", ends[0], ends[1], frames, where)
 
 
-def _round_to_frame_axis(axis: np.ndarray) -> np.ndarray:
-    """Return an axis, exactly along an axis of the frame if it is that to rounding."""
-    nearest = np.round(axis)
-    return nearest + 0.0 if np.abs(axis - nearest).max() < 1e-12 else axis
-
-
 def _rotation_along(direction: np.ndarray) -> np.ndarray:
     """Return a rotation (3, 3) whose third column has a direction."""
     third = direction / np.linalg.norm(direction)
     first = np.cross(np.eye(3)[np.argmin(np.abs(third))], third)
     first /= np.linalg.norm(first)
     return np.column_stack([first, np.cross(third, first), third])
-
-
-def _tendon_terms(
-    mjcf: MujocoFile, tendon: int, name: str, source_location: str
-) -> list[tuple[int, float]]:
-    """Return joints and factors of a fixed tendon, none for an absent tendon (index -1)."""
-    if tendon < 0:
-        return []
-    factors = fixed_tendon_factors(mjcf, tendon)
-    if factors is None:
-        raise DescriptionError(
-            f"{source_location}: the constraint '{name}' is about a tendon in space, use a "
-            "fixed one"
-        )
-    return list(factors.items())
 
 
 def _create_coupling(
@@ -272,31 +223,27 @@ def _create_coupling(
     series_joints: Mapping[int, list[str]],
 ) -> Coupling:
     """Return the coupling y - y_0 = a_0 + a_1 (x - x_0), where x and y are joints or tendons."""
-    model = mjcf.model
-    joint_sums = [
-        _tendon_terms(mjcf, i, name, source_location)
-        if kind == "TENDON"
-        else [(i, 1.0)] * (i >= 0)
-        for i in _constrained_objects(model, index)
-    ]
-    constant_coefficient, linear_coefficient, *higher_coefficients = (
-        float(x) for x in model.eq_data[index, :5]
-    )
+    model, label = mjcf.model, f"{source_location}: the constraint '{name}'"
+    joint_sums: list[dict[int, float]] = []  # of y and x, none for an absent object
+    for i in (int(model.eq_obj1id[index]), int(model.eq_obj2id[index])):
+        terms: dict[int, float] | None = {i: 1.0} if i >= 0 else {}
+        if kind == "TENDON" and i >= 0:
+            terms = fixed_tendon_factors(mjcf, i)
+        if terms is None:
+            raise DescriptionError(f"{label} is about a tendon in space, use a fixed one")
+        joint_sums.append(terms)
+    offset, linear_coefficient, *higher_coefficients = (float(x) for x in model.eq_data[index, :5])
     if any(higher_coefficients) and joint_sums[1]:
         raise DescriptionError(
-            f"{source_location}: the constraint '{name}' is not linear, leave the higher powers "
-            "of its polycoef away"
+            f"{label} is not linear, leave the higher powers of its polycoef away"
         )
     factors: dict[str, float] = {}
-    offset = constant_coefficient
-    for joints, sign in zip(joint_sums, (1.0, -linear_coefficient), strict=True):
-        for joint, factor in joints:
+    for factor_by_joint, sign in zip(joint_sums, (1.0, -linear_coefficient), strict=True):
+        for joint, factor in factor_by_joint.items():
             (part,) = series_joints[joint]
             factors[part] = factors.get(part, 0.0) + sign * factor
             offset += sign * factor * float(model.qpos0[model.jnt_qposadr[joint]])
     factors = {part: factor for part, factor in factors.items() if factor}
     if not factors:
-        raise DescriptionError(
-            f"{source_location}: the constraint '{name}' binds no joint, remove it"
-        )
+        raise DescriptionError(f"{label} binds no joint, remove it")
     return Coupling(name, factors, offset, source_location)

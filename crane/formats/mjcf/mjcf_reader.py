@@ -13,25 +13,23 @@ from crane.description.kinematic_tree import (
     Limits,
     Link,
     Tree,
+    joint_freedoms,
+    joint_series,
     parse_limit,
+    to_vector,
     with_rotor_inertias,
 )
-from crane.description.pinocchio_conversion import (
-    inertial_from_inertia,
-    to_vector,
-    xyz_rpy_from_se3,
-)
+from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
 from crane.description.specification import Chain, MachineSpec, source_locations
-from crane.formats.joint_series import joint_freedoms, joint_series
-from crane.formats.machine_file.tree_builder import TreeBuilder
+from crane.formats.machine_file.structure_sections import TreeBuilder
 from crane.formats.mjcf.equality_constraints import MjcfFrames, read_equality_constraints
-from crane.formats.mjcf.joint_effects import (
+from crane.formats.mjcf.model_features import (
     isotropic_rotor_inertia,
+    note_unsupported_features,
     read_drives,
     read_joint_effects,
 )
 from crane.formats.mjcf.mujoco_file import MujocoFile, pose
-from crane.formats.mjcf.unsupported_features import note_unsupported_features
 from crane.formats.urdf.urdf_reader import UrdfModel
 
 
@@ -130,7 +128,6 @@ class _MjcfReader:
         return name
 
     def _add_fixed_joint(self, link: str, parent: str, placement: pin.SE3) -> None:
-        """Add a joint that fixes a link to another."""
         name = f"{link}_fixed"
         while name in self.joints or name in self.names:
             name += "_"
@@ -140,7 +137,6 @@ class _MjcfReader:
         )
 
     def _read_body(self, body: int) -> None:
-        """Read a body with its joints."""
         model, name = self.model, self.mjcf.name("BODY", body)
         source_location = self.mjcf.source_location(name, "body")
         self.body_links.append(name)
@@ -163,23 +159,17 @@ class _MjcfReader:
         for joint in joints:
             if model.jnt_type[joint] == 0:
                 placement = pin.SE3.Identity()
-            anchor = model.jnt_pos[joint].copy()
-            anchor_offset = pin.SE3(np.eye(3), anchor - previous_anchor)
-            new_joints = self._read_joint(
-                joint, placement * anchor_offset if not series_joints else anchor_offset
-            )
+            offset = pin.SE3(np.eye(3), model.jnt_pos[joint] - previous_anchor)
+            previous_anchor = model.jnt_pos[joint].copy()
+            new_joints = self._read_joint(joint, offset if series_joints else placement * offset)
             self.series_joints[joint] = [part.name for part in new_joints]
             series_joints += new_joints
-            previous_anchor = anchor
         self.links[name] = Link(name, source_location, inertial_from_inertia(inertia))
         for i, part in enumerate(series_joints):
             last = i == len(series_joints) - 1
-            child = (
-                name
-                if last and not previous_anchor.any()
-                else self._unique_link_name(f"{name}_{i + 1}")
-            )
-            if child != name:
+            child = name
+            if not last or previous_anchor.any():
+                child = self._unique_link_name(f"{name}_{i + 1}")
                 self.links[child] = Link(
                     child, source_location, composite_joint=None if last else name
                 )
@@ -190,11 +180,9 @@ class _MjcfReader:
             self.joints[part.name] = dataclasses.replace(part, parent=parent, child=child)
             parent = child
         if parent != name:
-            self._add_fixed_joint(
-                name,
-                parent,
-                placement if not series_joints else pin.SE3(np.eye(3), -previous_anchor),
-            )
+            if series_joints:
+                placement = pin.SE3(np.eye(3), -previous_anchor)
+            self._add_fixed_joint(name, parent, placement)
 
     def _read_joint(self, joint: int, placement: pin.SE3) -> list[Joint]:
         """Return the joints with one freedom that a joint consists of, without their links."""
@@ -207,22 +195,20 @@ class _MjcfReader:
                 name, parts, xyz_rpy_from_se3(placement), ("", ""), source_location
             )
             return [part for part in series_parts if isinstance(part, Joint)]
-        axis = model.jnt_axis[joint].copy()
+        axis, joint_type = model.jnt_axis[joint].copy(), "revolute"
         offset = pin.SE3.Identity()
         reference_coordinate = float(model.qpos0[model.jnt_qposadr[joint]])
         if kind == "HINGE":
             offset.rotation = pin.AngleAxis(-reference_coordinate, axis).toRotationMatrix()
         else:
+            joint_type = "prismatic"
             offset.translation = -reference_coordinate * axis
         limits = Limits(source_location=source_location)
         if model.jnt_limited[joint]:
             lower, upper = (parse_limit(float(x)) for x in model.jnt_range[joint])
             limits = Limits(lower, upper, source_location=source_location)
-        joint_type = "revolute" if kind == "HINGE" else "prismatic"
-        xyz, rpy = xyz_rpy_from_se3(placement * offset)
-        return [
-            Joint(name, joint_type, "", "", source_location, xyz, rpy, to_vector(axis), limits)
-        ]
+        place = xyz_rpy_from_se3(placement * offset)
+        return [Joint(name, joint_type, "", "", source_location, *place, to_vector(axis), limits)]
 
     def _read_frames(self) -> MjcfFrames:
         """Return the frames of the sites."""
@@ -254,22 +240,15 @@ class _MjcfReader:
             if kind in ("BALL", "FREE"):
                 quaternion = qpos[first + translation_count : first + translation_count + 4]
                 values += _cardan_angles(pose(quaternion, np.zeros(3)).rotation)
-            home |= {
-                x: self._clip_to_limits(x, float(y))
-                for x, y in zip(joint_names, values, strict=True)
-                if y
-            }
+            home |= {x: float(y) for x, y in zip(joint_names, values, strict=True) if y}
+        for name, value in home.items():
+            limits = self.joints[name].limits
+            home[name] = min(max(value, limits.lower), limits.upper)
+            if home[name] != value:
+                self.mjcf.note_difference(
+                    "home is taken within the limits", f"{name} {value:g} as {home[name]:g}"
+                )
         return home
-
-    def _clip_to_limits(self, joint: str, value: float) -> float:
-        """Return a coordinate of home, clipped to the limits of its joint."""
-        limits = self.joints[joint].limits
-        clipped = min(max(value, limits.lower), limits.upper)
-        if clipped != value:
-            self.mjcf.note_difference(
-                "home is taken within the limits", f"{joint} {value:g} as {clipped:g}"
-            )
-        return clipped
 
     def _custom_text(self, name: str) -> str:
         """Return a `<text>` under `<custom>`, "" if there is none."""
@@ -290,14 +269,12 @@ class _MjcfReader:
         return []
 
     def _read_tip(self, tree: TreeBuilder) -> str | None:
-        tip = self._custom_text("tip")
+        if not (tip := self._custom_text("tip")):
+            return tree.single_leaf_link()
         if tip in tree.links and tree.is_movable(tip):
             return tip
-        if tip:
-            self.mjcf.note_unsupported(
-                f"the text 'tip', which names no moving body or site '{tip}'"
-            )
-        return None if tip else tree.single_leaf_link()
+        self.mjcf.note_unsupported(f"the text 'tip', which names no moving body or site '{tip}'")
+        return None
 
 
 def _cardan_angles(rotation: np.ndarray) -> list[float]:
@@ -305,8 +282,5 @@ def _cardan_angles(rotation: np.ndarray) -> list[float]:
     first = np.arctan2(-rotation[1, 2], rotation[2, 2])
     sine, cosine = np.sin(first), np.cos(first)
     second = np.arctan2(rotation[0, 2], cosine * rotation[2, 2] - sine * rotation[1, 2])
-    third = np.arctan2(
-        cosine * rotation[1, 0] + sine * rotation[2, 0],
-        cosine * rotation[1, 1] + sine * rotation[2, 1],
-    )
-    return [float(first), float(second), float(third)]
+    x, y = cosine * rotation[1, :2] + sine * rotation[2, :2]
+    return [float(first), float(second), float(np.arctan2(x, y))]

@@ -10,11 +10,15 @@ from lxml import etree
 
 from crane.common.atomic_output import replace_file
 from crane.common.errors import CraneWarning, InputError
-from crane.description.force_elements import ForceElement, Rope, element_name
-from crane.description.specification import Coupling, Drive, LoopSpec
-from crane.formats.conversion_notes import unsupported_sections, warn_about_unsupported
+from crane.description.force_elements import ForceElement, Friction, Rope, element_name
+from crane.description.specification import Coupling, LoopSpec
+from crane.formats.urdf.urdf_writer import (
+    format_document,
+    origin_text,
+    solve_coupling,
+    warn_about_unsupported,
+)
 from crane.formats.urdf_elements import finite_limits, format_numbers
-from crane.formats.urdf_output import format_document, origin_text, solve_coupling
 from crane.machine.machine import Machine
 
 _HINGE_POINT_DISTANCE = 0.1  # [m] between the two points that define a hinge
@@ -42,16 +46,14 @@ def write_mjcf(machine: Machine, path: str | Path) -> None:
         OutputError: The file cannot be written.
     """
     writer = _MjcfWriter(machine)
-    content = writer.build_content()
     with replace_file(path) as temporary_file:
-        temporary_file.write_bytes(content)
-    unsupported = unsupported_sections(machine)
+        temporary_file.write_bytes(writer.build_content())
     floating = [
         machine.joints[column + i]
         for column in machine.coordinates.floating_base_columns
         for i in range(6)
     ]
-    unsupported += [f"the friction of {joint}" for joint in floating if joint in machine.friction]
+    unsupported = [f"the friction of {joint}" for joint in floating if joint in machine.friction]
     unsupported += [
         f"the constant force on {x.joint}" for x in machine.forces if x.force and x.joint
     ]
@@ -97,7 +99,12 @@ class _MjcfWriter:
         add(self.root, "option", timestep="0.001", gravity="0 0 -9.81", integrator="implicitfast")
         self._add_texts()
         self.bodies[0] = add(self.root, "worldbody")
-        self._add_bodies()
+        pending = [(joint, self.bodies[0]) for joint in reversed(self._child_joints(0))]
+        while pending:  # parents before children
+            joint, parent = pending.pop()
+            series = self._joints_of_body(joint)
+            body = self.bodies[series[-1]] = self._add_body(series, parent)
+            pending += [(i, body) for i in reversed(self._child_joints(series[-1]))]
         if self.tree.root_link != "world":
             self._add_site(self.bodies[0], self.tree.root_link, pin.SE3.Identity())
         for frame in self.frames:
@@ -110,7 +117,10 @@ class _MjcfWriter:
         for coupling in equations.couplings:
             self._add_coupling(equality, tendons, coupling)
         for drive in self.machine.drives:
-            self._add_drive(actuator, tendons, drive)
+            target = {"joint": drive.name}
+            if dict(drive.factors) != {drive.name: 1.0}:
+                target = {"tendon": _add_fixed_tendon(tendons, drive.name, drive.factors)}
+            add(actuator, "motor", {"name": drive.name, **target})
         force_elements: list[ForceElement | Rope] = [*self.machine.forces, *self.machine.ropes]
         for item in force_elements:
             if item.between is not None:
@@ -123,7 +133,8 @@ class _MjcfWriter:
     def _add_texts(self) -> None:
         machine = self.machine
         texts = {"name": machine.name, "source": machine.source, "tip": machine.tip or ""}
-        if not machine.tip and len(self._leaf_links()) == 1:
+        parents = {joint.parent for joint in self.tree.joints.values()}
+        if not machine.tip and len(self.tree.links.keys() - parents) == 1:
             texts["tip"] = "none"
         if [drive.name for drive in machine.drives] != list(machine.active):
             # otherwise the drives determine the active joints
@@ -133,22 +144,9 @@ class _MjcfWriter:
             if data:
                 etree.SubElement(custom, "text", name=name, data=data)
 
-    def _leaf_links(self) -> list[str]:
-        parents = {joint.parent for joint in self.tree.joints.values()}
-        return [link for link in self.tree.links if link not in parents]
-
     def _child_joints(self, joint: int) -> list[int]:
         """Return the joints on the link that a joint moves."""
         return [i for i in self.joints if self.model.parents[i] == joint]
-
-    def _add_bodies(self) -> None:
-        """Add bodies with the series of joints that move each, parents before children."""
-        pending = [(joint, self.bodies[0]) for joint in reversed(self._child_joints(0))]
-        while pending:
-            joint, parent = pending.pop()
-            series = self._joints_of_body(joint)
-            body = self.bodies[series[-1]] = self._add_body(series, parent)
-            pending += [(i, body) for i in reversed(self._child_joints(series[-1]))]
 
     def _joints_of_body(self, joint: int) -> list[int]:
         """Return the joints of one body: a joint and those after it up to a link with mass."""
@@ -165,19 +163,14 @@ class _MjcfWriter:
         return series
 
     def _add_body(self, series: list[int], parent: etree._Element) -> etree._Element:
-        """Add a body with the series of joints that moves it."""
-        body_placement = pin.SE3.Identity()
+        placements = [pin.SE3.Identity()]
         for i in series:
-            body_placement = body_placement * self.model.jointPlacements[i]
-        name = self.moved_links[series[-1]]
-        body = etree.SubElement(
-            parent, "body", {"name": name} | _placement_attributes(body_placement)
-        )
+            placements.append(placements[-1] * self.model.jointPlacements[i])
+        attributes = {"name": self.moved_links[series[-1]]} | _placement_attributes(placements[-1])
+        body = etree.SubElement(parent, "body", attributes)
         _add_inertial(body, self.model.inertias[series[-1]])
-        joint_placement = pin.SE3.Identity()
-        for i in series:
-            joint_placement = joint_placement * self.model.jointPlacements[i]
-            self._add_joint(body, i, body_placement.actInv(joint_placement))
+        for i, placement in zip(series, placements[1:], strict=True):
+            self._add_joint(body, i, placements[-1].actInv(placement))
         return body
 
     def _add_joint(self, body: etree._Element, joint: int, placement: pin.SE3) -> None:
@@ -185,7 +178,12 @@ class _MjcfWriter:
         machine, name = self.machine, self.model.names[joint]
         column = self.model.joints[joint].idx_v
         if column in machine.coordinates.floating_base_columns:
-            self._add_free_joint(body, joint)
+            etree.SubElement(body, "freejoint", name=name)
+            data = self.model.createData()
+            configuration = machine.coordinates.configuration(machine.home)
+            pin.forwardKinematics(self.model, data, configuration)
+            *position, x, y, z, w = pin.SE3ToXYZQUAT(data.oMi[joint])  # in the world
+            self.home_coordinates += [float(value) for value in (*position, w, x, y, z)]
             return
         tree_joint = self.tree.joints[name]
         values = {
@@ -198,15 +196,13 @@ class _MjcfWriter:
             values |= {"limited": "true", "range": format_numbers(limits)}
         if tree_joint.rotor_inertia:
             values["armature"] = format_numbers([tree_joint.rotor_inertia])
-        friction = machine.friction.get(name)
+        friction = machine.friction.get(name, Friction())
         joint_elements = [item for item in machine.forces if item.joint == name]
         stiffness = sum(item.stiffness for item in joint_elements)
-        damping = sum(item.damping for item in joint_elements) + (
-            friction.viscous if friction else 0.0
-        )
+        damping = sum(item.damping for item in joint_elements) + friction.viscous
         if damping:
             values["damping"] = format_numbers([damping])
-        if friction and friction.coulomb:
+        if friction.coulomb:
             values["frictionloss"] = format_numbers([friction.coulomb])
         if stiffness:
             rest = sum(item.stiffness * item.rest for item in joint_elements) / stiffness
@@ -216,15 +212,6 @@ class _MjcfWriter:
             }
         etree.SubElement(body, "joint", values)
         self.home_coordinates.append(float(machine.home[column]))
-
-    def _add_free_joint(self, body: etree._Element, joint: int) -> None:
-        """Add a free joint, whose coordinates are the body's pose in the world."""
-        machine = self.machine
-        etree.SubElement(body, "freejoint", name=self.model.names[joint])
-        data = self.model.createData()
-        pin.forwardKinematics(self.model, data, machine.coordinates.configuration(machine.home))
-        *position, x, y, z, w = pin.SE3ToXYZQUAT(data.oMi[joint])
-        self.home_coordinates += [float(value) for value in (*position, w, x, y, z)]
 
     def _add_site(self, body: etree._Element, name: str, placement: pin.SE3) -> str:
         """Add a site under a unique name, and return the name."""
@@ -274,16 +261,14 @@ class _MjcfWriter:
     ) -> None:
         joints, derivatives, offset = solve_coupling(coupling)
         attributes = {"name": coupling.name, "solref": "0.002 1"}
-        if len(joints) <= 2:
-            named = {f"joint{i}": joint for i, joint in enumerate(joints, start=1)}
-            polynomial = format_numbers([offset, derivatives[0] if derivatives else 0.0, 0, 0, 0])
-            etree.SubElement(equality, "joint", {**attributes, **named, "polycoef": polynomial})
-            return
-        tendon = _add_fixed_tendon(tendons, coupling.name, coupling.factors)
-        polynomial = format_numbers([coupling.offset, 0, 0, 0, 0])
-        etree.SubElement(
-            equality, "tendon", {**attributes, "tendon1": tendon, "polycoef": polynomial}
-        )
+        coefficients = [offset, *(derivatives or [0.0]), 0, 0, 0]
+        tag = "joint"
+        if len(joints) > 2:
+            tag, coefficients = "tendon", [coupling.offset, 0, 0, 0, 0]
+            joints = [_add_fixed_tendon(tendons, coupling.name, coupling.factors)]
+        attributes |= {f"{tag}{i}": name for i, name in enumerate(joints, start=1)}
+        attributes["polycoef"] = format_numbers(coefficients)
+        etree.SubElement(equality, tag, attributes)
 
     def _add_spatial_tendon(
         self, tendons: etree._Element, item: ForceElement | Rope, links: tuple[str, str]
@@ -302,10 +287,8 @@ class _MjcfWriter:
             if slack_force < 0 or (slack_force and not item.stiffness):
                 self.unsupported.append(f"the constant force of the {name}")
             if item.stiffness:
-                rest = (
-                    max(slack_force, 0.0) / item.stiffness if item.force else max(item.rest, 0.0)
-                )
-                values = {"stiffness": [item.stiffness], "springlength": [rest]}
+                rest = slack_force / item.stiffness if item.force else item.rest
+                values = {"stiffness": [item.stiffness], "springlength": [max(rest, 0.0)]}
             if item.damping:
                 values["damping"] = [item.damping]
         if not values:
@@ -315,12 +298,6 @@ class _MjcfWriter:
             tendon.set(key, format_numbers(numbers))
         for link in links:
             etree.SubElement(tendon, "site", site=self._frame_site(link)[2])
-
-    def _add_drive(self, actuator: etree._Element, tendons: etree._Element, drive: Drive) -> None:
-        target = {"joint": drive.name}
-        if dict(drive.factors) != {drive.name: 1.0}:
-            target = {"tendon": _add_fixed_tendon(tendons, drive.name, drive.factors)}
-        etree.SubElement(actuator, "motor", {"name": drive.name, **target})
 
 
 def _add_tendon(tendons: etree._Element, tag: str, name: str) -> etree._Element:

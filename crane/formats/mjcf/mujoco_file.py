@@ -1,6 +1,7 @@
 """A MJCF file that MuJoCo compiles, with bounds on its size and lines of its elements."""
 
 import math
+import os
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -13,11 +14,6 @@ from lxml import etree
 from crane.common.errors import DescriptionError
 from crane.common.optional_libraries import import_optional_library
 from crane.formats.conversion_notes import ConversionNotes
-from crane.formats.mjcf.missing_meshes import (
-    MassMissingError,
-    compile_without_missing_files,
-    missing_file,
-)
 from crane.formats.xml_file import XmlFile
 
 MAX_COPIES = 10_000  # copied elements; MuJoCo's time to copy grows with the square
@@ -33,17 +29,23 @@ _MAX_ATTRIBUTE_VALUES = {"size": 10_000, "mesh": 1_000}  # for other attributes
 # bounded above, or not allocated
 _UNCHECKED_ATTRIBUTES = {"nuserdata", "memory", "njmax", "nconmax", "nstack"}
 _FLEXIBLE_ELEMENTS = ("flex", "flexcomp")
+_MISSING_FILE_PATTERN = re.compile(r"opening file '([^']*)'")  # in messages of MuJoCo
+_ELEMENT_PATTERN = re.compile(r"Element name '([^']*)'")
+_IMAGE_COLLECTIONS = ("materials", "textures", "skins")
+_DRAWN_COLLECTIONS = ("geoms", "sites", "tendons")  # with materials
+_AUTOMATIC_INERTIA = 2  # value of inertiafromgeom: for bodies without an <inertial>
 
 
-def count_elements(
-    xml: XmlFile, included: Mapping[str, int], models: Mapping[str, int]
+def _count_elements(
+    xml: XmlFile, element: etree._Element, included: Mapping[str, int], models: Mapping[str, int]
 ) -> tuple[int, int]:
-    """Count the elements of a file with its includes and copies, before MuJoCo creates them.
+    """Count the elements of an element with its includes and copies, before MuJoCo creates them.
 
     A few characters of MJCF can request copies that take days.
 
     Args:
         xml: The file.
+        element: The element.
         included: Number of elements of each included file, by its name in the `<include>`.
         models: Number of elements of each attached model, by name.
 
@@ -51,18 +53,8 @@ def count_elements(
         Number of all elements, and of copies among them.
 
     Raises:
-        DescriptionError: There are too many copies, or a size in the file is too large.
+        DescriptionError: There are too many copies.
     """
-    for element in xml.root.iter(*_FLEXIBLE_ELEMENTS):
-        raise xml.error_at(element, "flexible bodies are no machine's, leave out")
-    for element in xml.root.iter(*_SIZE_ATTRIBUTES, *_MAX_ATTRIBUTE_VALUES):
-        _check_sizes(xml, element)
-    return _count_below(xml, xml.root, included, models)
-
-
-def _count_below(
-    xml: XmlFile, element: etree._Element, included: Mapping[str, int], models: Mapping[str, int]
-) -> tuple[int, int]:
     total, copied_count = 1, 0
     if element.tag == "include":
         total += included.get(element.get("file", ""), 0)
@@ -71,33 +63,25 @@ def _count_below(
         total += copied_count
     for child in element:
         if isinstance(child.tag, str):
-            child_count, copied = _count_below(xml, child, included, models)
+            child_count, copied = _count_elements(xml, child, included, models)
             total, copied_count = total + child_count, copied_count + copied
-    if element.tag in ("replicate", "composite"):
-        repetitions = 1.0
-        for number in _read_numbers(element, "count"):
-            repetitions *= number if number > 1 else 1.0  # MuJoCo reports invalid counts
-        if total * repetitions > MAX_COPIES:
-            raise _too_many_copies_error(xml, element, total * repetitions)
-        copied_count += int(total * (repetitions - 1))
-        total = int(total * repetitions)
-    if copied_count > MAX_COPIES:
-        raise _too_many_copies_error(xml, element, copied_count)
+    repeated_count = 0.0
+    if element.tag in ("replicate", "composite"):  # MuJoCo reports invalid counts
+        repetitions = math.prod(max(1.0, x) for x in _read_numbers(element, "count"))
+        repeated_count = total * repetitions
+        if repeated_count <= MAX_COPIES:
+            copied_count += int(total * (repetitions - 1))
+            total = int(repeated_count)
+    if (count := max(copied_count, repeated_count)) > MAX_COPIES:
+        raise xml.error_at(
+            element,
+            f"<{element.tag}> stands for {count:.6g} elements by its copies, make at most "
+            f"{MAX_COPIES}",
+        )
     return total, copied_count
 
 
-def _too_many_copies_error(
-    xml: XmlFile, element: etree._Element, count: float
-) -> DescriptionError:
-    return xml.error_at(
-        element,
-        f"<{element.tag}> stands for {count:.6g} elements by its copies, make at most "
-        f"{MAX_COPIES}",
-    )
-
-
 def _check_sizes(xml: XmlFile, element: etree._Element) -> None:
-    """Raise for sizes from which MuJoCo would allocate too much."""
     keys, maximum = _SIZE_ATTRIBUTES.get(element.tag, ((), 0))
     product = math.prod(max(abs(x), 1.0) for key in keys for x in _read_numbers(element, key))
     if keys and product > maximum:
@@ -127,6 +111,40 @@ def _read_numbers(element: etree._Element, key: str) -> list[float]:
         return [float(word) for word in element.get(key, "").split()]
     except ValueError:
         return []
+
+
+def _remove_shapes(
+    spec: Any, name: str, moving_bodies: set[str], lighter_bodies: dict[str, str]
+) -> bool:
+    """Remove the meshes and height fields of a file with their geoms.
+
+    Args:
+        spec: The `MjSpec`.
+        name: Name of the file.
+        moving_bodies: Names of the bodies that can move.
+        lighter_bodies: Receives the moving bodies that lose mass, with the file.
+
+    Returns:
+        Whether there were any.
+    """
+    removed = [x for x in (*spec.meshes, *spec.hfields) if x.file and name.endswith(x.file)]
+    shapes = {x.name for x in removed}
+    for geom in [x for x in spec.geoms if shapes & {x.meshname, x.hfieldname}]:
+        if geom.parent.name in moving_bodies and _contributes_mass(spec.compiler, geom):
+            lighter_bodies.setdefault(geom.parent.name, name)
+        spec.delete(geom)
+    for item in removed:
+        spec.delete(item)
+    return bool(shapes)
+
+
+def _contributes_mass(settings: Any, geom: Any) -> bool:
+    inertia_mode = int(settings.inertiafromgeom)
+    is_explicit = inertia_mode == _AUTOMATIC_INERTIA and geom.parent.explicitinertial
+    lowest, highest = settings.inertiagrouprange
+    is_massless = geom.mass == 0 or (math.isnan(geom.mass) and geom.density == 0)
+    is_counted = lowest <= geom.group <= highest and not is_massless
+    return bool(inertia_mode and not is_explicit and is_counted)
 
 
 _MAX_SHOWN_NAMES = 6  # names in a line
@@ -159,12 +177,8 @@ class MujocoFile(ConversionNotes):
         mujoco.set_mju_user_warning(messages.append)  # by default it writes a file MUJOCO_LOG.TXT
         try:
             self.model: Any = self._compile()
-        except MassMissingError as error:
-            raise DescriptionError(
-                f"{self.source_location(error.body, 'body')}: body '{error.body}' has its mass "
-                f"from '{error.mesh}', which is not there: put the file there, or give the body "
-                "an <inertial>"
-            ) from None
+        except DescriptionError:
+            raise
         except Exception as error:  # ValueError, FatalError and others
             raise self._compilation_error(str(error) or type(error).__name__) from None
         finally:
@@ -173,14 +187,46 @@ class MujocoFile(ConversionNotes):
             self.warn(f"MuJoCo says {'; '.join(messages)}")
 
     def _compile(self) -> Any:
-        """Return the compiled model, without shapes and textures whose files are missing."""
+        """Return the compiled model, without shapes and textures whose files are missing.
+
+        A machine needs them only where MuJoCo computes the mass of a body from a mesh. A moving
+        body that has other mass is then lighter, which is noted; one without any other mass is an
+        error.
+        """
         path = str(self.file)
         try:
             return self._mujoco.MjModel.from_xml_path(path)
         except ValueError as error:
-            if not (name := missing_file(str(error))):
+            if not (missing := _MISSING_FILE_PATTERN.search(str(error))):
                 raise
-        model, files, lighter_bodies = compile_without_missing_files(self._mujoco, path, name)
+        spec = self._mujoco.MjSpec.from_file(path)
+        for item in (x for kind in _DRAWN_COLLECTIONS for x in getattr(spec, kind)):
+            item.material = ""
+        for kind in _IMAGE_COLLECTIONS:
+            for item in list(getattr(spec, kind)):
+                spec.delete(item)
+        moving_bodies = set[str]()
+        for i, body in enumerate(spec.bodies):  # parents before children
+            body.name, parent = body.name or f"body{i}", body.parent
+            if parent is not None and (len(body.joints) or parent.name in moving_bodies):
+                moving_bodies.add(body.name)
+        model, files, lighter_bodies = None, [missing[1]], dict[str, str]()
+        while model is None:
+            is_removed = _remove_shapes(spec, files[-1], moving_bodies, lighter_bodies)
+            try:
+                model = spec.compile()
+            except ValueError as error:
+                missing = _MISSING_FILE_PATTERN.search(str(error))
+                element = _ELEMENT_PATTERN.search(str(error))
+                if not missing and element and (mesh := lighter_bodies.get(element[1])):
+                    raise DescriptionError(
+                        f"{self.source_location(element[1], 'body')}: body '{element[1]}' has its "
+                        f"mass from '{mesh}', which is not there: put the file there, or give the "
+                        "body an <inertial>"
+                    ) from None
+                if not missing or (not is_removed and files[-1] != files[0]):
+                    raise
+                files.append(missing[1])
         self.note_unsupported(
             "meshes and pictures that are not there", *(Path(x).name for x in files)
         )
@@ -210,11 +256,7 @@ class MujocoFile(ConversionNotes):
         for part in xml.root.iter("include", "model"):
             name = part.get("file", "")
             other = self._files[0].file.parent / name
-            try:
-                is_there = bool(name) and other.is_file()
-            except (OSError, ValueError):  # such as a name that is too long
-                is_there = False
-            if not is_there:
+            if not name or not os.path.isfile(other):  # also for invalid names
                 raise xml.error_at(
                     part, f"there is no file '{name[:100]}' to {part.tag}, check the path"
                 )
@@ -224,7 +266,11 @@ class MujocoFile(ConversionNotes):
             else:
                 stem = part.get("name") or other.stem
                 models[stem] = self._read_with_includes(other, included_by)
-        self._element_counts[file], _ = count_elements(xml, included, models)
+        for element in xml.root.iter(*_FLEXIBLE_ELEMENTS):
+            raise xml.error_at(element, "flexible bodies are no machine's, leave out")
+        for element in xml.root.iter(*_SIZE_ATTRIBUTES, *_MAX_ATTRIBUTE_VALUES):
+            _check_sizes(xml, element)
+        self._element_counts[file], _ = _count_elements(xml, xml.root, included, models)
         return self._element_counts[file]
 
     def _compilation_error(self, text: str) -> DescriptionError:
@@ -279,10 +325,9 @@ class MujocoFile(ConversionNotes):
     @property
     def disabled_features(self) -> set[str]:
         """Names of the parts of MuJoCo's model that the file disables, such as CONTACT."""
-        bits = self._mujoco.mjtDisableBit.__members__
         return {
             name.partition("_")[2]
-            for name, bit in bits.items()
+            for name, bit in self._mujoco.mjtDisableBit.__members__.items()
             if name.startswith("mjDSBL_") and self.model.opt.disableflags & int(bit)
         }
 

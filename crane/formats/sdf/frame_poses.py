@@ -7,8 +7,7 @@ parent model. The pose of a model with a placement frame P is that of P: X_SM = 
 
 import pinocchio as pin
 
-from crane.formats.sdf.model_scope import MergedFrame, ModelScope, find_scope
-from crane.formats.sdf.sdf_element import SdfElement
+from crane.formats.sdf.model_scope import ModelScope, SdfElement, find_scope
 
 _MODEL_FRAME, _WORLD_FRAME = "__model__", "world"
 _MAX_DEPTH = 200  # of frames relative to each other
@@ -49,20 +48,22 @@ class SdfFramePoses:
     def _find_pose(self, scope: ModelScope, name: str, referrer: SdfElement) -> pin.SE3:
         inner, rest = find_scope(scope, name, referrer)
         if inner is not scope:
-            return self._nested_model_pose(scope, inner, referrer) * self.pose_in_scope(
-                inner, rest, referrer
-            )
+            model_pose = self.nested_model_pose(scope, inner, referrer)
+            return model_pose * self.pose_in_scope(inner, rest, referrer)
         if rest in scope.links:
             return self.element_pose(scope, scope.links[rest], scope.links[rest].base_frame)
         if rest in scope.frames:
-            return self._frame_pose(scope, scope.frames[rest])
+            frame = scope.frames[rest]
+            if frame.merged_model is not None:
+                return self._model_pose(scope, frame.merged_model, frame.base_frame)
+            return self.element_pose(scope, frame, attached_to(frame))
         if rest in scope.models:
             model = scope.models[rest]
             return self._model_pose(scope, model, model.item.base_frame)
         joint = scope.joints[rest]
         return self.element_pose(scope, joint, joint.text("child"))
 
-    def _nested_model_pose(
+    def nested_model_pose(
         self, scope: ModelScope, inner: ModelScope, referrer: SdfElement
     ) -> pin.SE3:
         """Return the pose of a model that is nested in a scope at any depth."""
@@ -74,11 +75,6 @@ class SdfFramePoses:
         for parent, name in reversed(steps):
             placement = placement * self.pose_in_scope(parent, name, referrer)
         return placement
-
-    def _frame_pose(self, scope: ModelScope, frame: SdfElement) -> pin.SE3:
-        if isinstance(frame, MergedFrame) and frame.merged_model is not None:
-            return self._model_pose(scope, frame.merged_model, frame.base_frame)
-        return self.element_pose(scope, frame, attached_to(frame))
 
     def _model_pose(self, scope: ModelScope, model: ModelScope, base: str) -> pin.SE3:
         """Return the pose of a model's frame in the parent scope."""
@@ -100,10 +96,6 @@ class SdfFramePoses:
         if relative == _MODEL_FRAME:
             relative = item.base_frame
         return self.pose_in_scope(scope, relative or default, item) * placement
-
-    def pose_in_top(self, scope: ModelScope, top: ModelScope) -> pin.SE3:
-        """Return the pose of a scope's frame relative to that of an ancestor."""
-        return self._nested_model_pose(top, scope, scope.item)
 
 
 def attached_to(frame: SdfElement) -> str:
@@ -138,10 +130,8 @@ def find_link(
         return inner, rest
     if rest in inner.frames:
         frame = inner.frames[rest]
-        merged = isinstance(frame, MergedFrame)
-        return find_link(
-            inner, _MODEL_FRAME if merged else attached_to(frame), referrer, depth + 1
-        )
+        base = attached_to(frame) if frame.merged_model is None else _MODEL_FRAME
+        return find_link(inner, base, referrer, depth + 1)
     if rest in inner.joints:
         return find_link(inner, inner.joints[rest].text("child"), referrer, depth + 1)
     if rest in inner.models:

@@ -3,42 +3,51 @@
 import dataclasses
 import math
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 from lxml import etree
 
 from crane.common.errors import CraneWarning
-from crane.common.package_search import find_file
 from crane.common.samples import Array
 from crane.description.kinematic_tree import Inertial
 from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
 from crane.formats.sdf.frame_poses import SdfFramePoses
-from crane.formats.sdf.model_scope import ModelScope, NoteFunction
-from crane.formats.sdf.sdf_element import SdfElement
+from crane.formats.sdf.model_scope import ModelScope, NoteFunction, SdfElement
 from crane.formats.urdf_elements import TENSOR_ATTRIBUTES, add_inertial, add_origin
-from crane.formats.visuals.mesh_files import read_meshes
+from crane.formats.visuals.mesh_files import find_mesh_file, read_meshes
 
 _DEFAULT_DENSITY = 1000.0  # [kg/m3], default of SDF
 
 
 def add_link_inertial(
-    element: etree._Element, scope: ModelScope, link: SdfElement, frames: SdfFramePoses
+    element: etree._Element,
+    scope: ModelScope,
+    link: SdfElement,
+    frames: SdfFramePoses,
+    is_moving: bool,
 ) -> None:
     """Add the `<inertial>` of a link, with the defaults of SDF: 1 kg, 1 kg m2.
 
     With `auto="true"` the inertia is that of the collisions, each of one density; if there is a
-    `<mass>`, scaled to it.
+    `<mass>`, scaled to it. A moving link without `<inertial>` is warned about.
 
     Raises:
         DescriptionError: A number is malformed, or the volume of a shape is unknown.
     """
     inertial_element = link.single_child("inertial")
-    if inertial_element is None:
-        inertial_element = link.wrap(etree.Element("inertial"), link.label)
-    tensor_element = inertial_element.single_child("inertia")
-    if tensor_element is None:
-        tensor_element = link.wrap(etree.Element("inertia"), link.label)
+    if inertial_element is None and is_moving:
+        warnings.warn(
+            f"{link.source_location}: {link.label} has no <inertial>, which SDF takes as 1 kg "
+            "and 1 kg m2: write what it has",
+            CraneWarning,
+            stacklevel=2,
+        )
+    inertial_element = inertial_element or link.wrap(etree.Element("inertial"), link.label)
+    tensor_element = inertial_element.single_child("inertia") or link.wrap(
+        etree.Element("inertia"), link.label
+    )
     if any(
         x.attribute("auto").lower() in ("true", "1") for x in (inertial_element, tensor_element)
     ):
@@ -49,17 +58,6 @@ def add_link_inertial(
         mass = inertial_element.number("mass", 1.0)
         inertial = Inertial(mass, *xyz_rpy_from_se3(placement), tuple(tensor))
     add_inertial(element, inertial)
-
-
-def warn_about_missing_inertial(link: SdfElement) -> None:
-    """Warn of a moving link without `<inertial>`."""
-    if link.single_child("inertial") is None:
-        warnings.warn(
-            f"{link.source_location}: {link.label} has no <inertial>, which SDF takes as 1 kg "
-            "and 1 kg m2: write what it has",
-            CraneWarning,
-            stacklevel=2,
-        )
 
 
 def _collision_inertial(
@@ -133,11 +131,10 @@ def _read_sizes(element: SdfElement, tag: str, count: int) -> tuple[float, ...]:
 
 
 def _mesh_inertia(mesh_element: SdfElement, density: float) -> pin.Inertia:
-    name = mesh_element.text("uri") or mesh_element.text("filename")
+    name, file = _find_mesh(mesh_element)
     if mesh_element.single_child("submesh") is not None:
         raise _unknown_volume_error(mesh_element, f"takes a part of the mesh '{name}'")
-    file = find_file(name, mesh_element.xml.file.parent) if name else None
-    if file is None or not file.is_file():
+    if file is None:
         raise _unknown_volume_error(mesh_element, f"has the mesh '{name}', which is not there")
     parts = read_meshes([file])[file]
     if isinstance(parts, str):
@@ -165,8 +162,7 @@ def _count_open_edges(triangles: Array) -> int:
     points = triangles.reshape(-1, 3)
     grid = float(np.ptp(points, axis=0).max()) * 1e-9 or 1.0
     _, index = np.unique(np.round(points / grid), axis=0, return_inverse=True)
-    corners = index.reshape(-1, 3)
-    directed_edges = np.concatenate([corners[:, [i, (i + 1) % 3]] for i in range(3)])
+    directed_edges = index.reshape(-1, 3)[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     directed_edges = directed_edges[directed_edges[:, 0] != directed_edges[:, 1]]
     sign = np.where(directed_edges[:, 0] < directed_edges[:, 1], 1, -1)
     _, edge = np.unique(np.sort(directed_edges, axis=1), axis=0, return_inverse=True)
@@ -219,12 +215,17 @@ def add_shapes(
         if child.tag not in ("visual", "collision"):
             continue
         shape = link.wrap(child, f"a {child.tag} of {link.label}")
-        if (geometry := _shape_element(shape, note)) is not None:
-            added = etree.SubElement(element, child.tag)
-            shape_pose = frames.element_pose(scope, shape, link.name)
-            add_origin(added, *xyz_rpy_from_se3(link_pose.actInv(shape_pose)))
-            etree.SubElement(added, "geometry").append(geometry)
-            _add_colour(added, shape)
+        if (geometry := _shape_element(shape, note)) is None:
+            continue
+        added = etree.SubElement(element, child.tag)
+        shape_pose = frames.element_pose(scope, shape, link.name)
+        add_origin(added, *xyz_rpy_from_se3(link_pose.actInv(shape_pose)))
+        etree.SubElement(added, "geometry").append(geometry)
+        material = shape.single_child("material") if child.tag == "visual" else None
+        if material is not None and (text := material.text("diffuse") or material.text("ambient")):
+            words = text.split()
+            rgba = " ".join([*words, "1"] if len(words) == 3 else words)
+            etree.SubElement(etree.SubElement(added, "material", name=""), "color", rgba=rgba)
 
 
 def _geometry_shape(item: SdfElement) -> SdfElement | None:
@@ -239,36 +240,22 @@ def _shape_element(item: SdfElement, note: NoteFunction) -> etree._Element | Non
     shape = _geometry_shape(item)
     if shape is None or (tag := shape.element.tag) in _WORLD_SHAPES:
         return None
+    made = etree.Element(tag)
     if tag == "mesh":
-        return _mesh_element(shape)
+        name, file = _find_mesh(shape)  # an absolute path: included models have other folders
+        made.set("filename", name if file is None else str(file))
+        if scale := shape.text("scale"):
+            made.set("scale", scale)
+        return made
     if tag not in _SIZE_ATTRIBUTES:
         note("shapes", tag)
         return None
-    made = etree.Element(tag)
     for key in _SIZE_ATTRIBUTES[tag]:
         made.set(key, shape.text(key, "1 1 1" if key == "size" else "1"))
     return made
 
 
-def _mesh_element(shape: SdfElement) -> etree._Element:
-    """Return a mesh by its absolute path, because included models have other folders."""
+def _find_mesh(shape: SdfElement) -> tuple[str, Path | None]:
+    """Return the name of a mesh, and its file if that exists."""
     name = shape.text("uri") or shape.text("filename")
-    file = find_file(name, shape.xml.file.parent) if name else None
-    is_file = file is not None and file.is_file()
-    made = etree.Element("mesh", filename=str(file) if is_file else name)
-    if scale := shape.text("scale"):
-        made.set("scale", scale)
-    return made
-
-
-def _add_colour(visual: etree._Element, item: SdfElement) -> None:
-    """Add the diffuse colour, else the ambient colour."""
-    material = item.single_child("material")
-    if material is None or visual.tag != "visual":
-        return
-    text = material.text("diffuse") or material.text("ambient")
-    if not text:
-        return
-    words = text.split()
-    rgba = " ".join([*words, "1"][:4] if len(words) == 3 else words)
-    etree.SubElement(etree.SubElement(visual, "material", name=""), "color", rgba=rgba)
+    return name, find_mesh_file(name, shape.xml.file.parent) if name else None

@@ -1,18 +1,140 @@
-"""Nested models of SDF, the names in each, and included files."""
+"""Elements of SDF, nested models with the names in each, and included files."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+import pinocchio as pin
+from lxml import etree
+
 from crane.common.errors import DescriptionError, suggest_names
 from crane.common.package_search import find_file
-from crane.formats.sdf.sdf_element import SdfElement
+from crane.description.pinocchio_conversion import rotation_from_rpy
+from crane.description.specification import unit_vector
 from crane.formats.xml_file import XmlFile
 
+_QUATERNION = "quat_xyzw"
 _MAX_DEPTH = 20  # of nested models
 _MAX_MODELS = 2000
 
 NoteFunction = Callable[[str, str], None]  # arguments: unsupported feature, name
+
+
+@dataclass(frozen=True)
+class SdfElement:
+    """An element of SDF in its file.
+
+    Attributes:
+        xml: The file.
+        element: The element.
+        label: Name of the element in errors.
+        base_frame: The frame that its poses are relative to by default.
+        merged_model: The model if it is the frame of one whose parts were merged into another.
+    """
+
+    xml: XmlFile
+    element: etree._Element
+    label: str
+    base_frame: str = "__model__"
+    merged_model: "ModelScope | None" = None
+
+    @property
+    def source_location(self) -> str:
+        """File and line."""
+        return self.xml.source_location(self.element)
+
+    @property
+    def name(self) -> str:
+        """Its name, "" without one."""
+        return self.attribute("name")
+
+    def attribute(self, key: str) -> str:
+        """Return an attribute without surrounding blanks, "" if there is none."""
+        return str(self.element.get(key, "")).strip()
+
+    def error(self, problem: str) -> DescriptionError:
+        """Return an error with the source location of the element."""
+        return self.xml.error_at(self.element, problem)
+
+    def wrap(self, element: etree._Element, label: str) -> "SdfElement":
+        """Return another element of the same file with the same base frame."""
+        return SdfElement(self.xml, element, label, self.base_frame)
+
+    def single_child(self, tag: str) -> "SdfElement | None":
+        """Return the child with a tag, None if there is none.
+
+        Raises:
+            DescriptionError: There are several.
+        """
+        child = self.xml.single_child(self.element, tag, self.label)
+        return None if child is None else self.wrap(child, self.label)
+
+    def text(self, tag: str, default: str = "") -> str:
+        """Return the text of a child."""
+        child = self.single_child(tag)
+        return default if child is None else (child.element.text or "").strip() or default
+
+    def numbers(self, tag: str, count: int, default: tuple[float, ...]) -> tuple[float, ...]:
+        """Return the numbers in the text of a child.
+
+        Args:
+            tag: Tag of the child.
+            count: How many numbers there have to be.
+            default: Result without a child or text.
+
+        Raises:
+            DescriptionError: The text is something else.
+        """
+        child = self.single_child(tag)
+        if child is None or not (child.element.text or "").strip():
+            return default
+        return child.parse_numbers(count, f"<{tag}>")
+
+    def number(self, tag: str, default: float) -> float:
+        """Return the number in the text of a child, which may be `inf`; see `numbers`."""
+        text = self.text(tag).lower()
+        if text.lstrip("+-") in ("inf", "infinity"):
+            return -math.inf if text.startswith("-") else math.inf
+        return self.numbers(tag, 1, (default,))[0]
+
+    def parse_numbers(self, count: int, description: str) -> tuple[float, ...]:
+        """Return the numbers in the text of this element."""
+        text = self.element.text or ""
+        return self.xml.parse_numbers(self.element, text, f"{description} of {self.label}", count)
+
+    def direction(self, tag: str) -> np.ndarray:
+        """Return the unit vector (3,) of a child, z without one.
+
+        Raises:
+            DescriptionError: It is zero or malformed.
+        """
+        unit = unit_vector(self.numbers(tag, 3, (0.0, 0.0, 1.0)))
+        if unit is None:
+            raise self.error(f"the axis of {self.label} is zero, give a direction")
+        return np.array(unit)
+
+    def read_pose(self) -> tuple[pin.SE3, str]:
+        """Return the pose, and the frame that it is relative to, "" for the default."""
+        child = self.single_child("pose")
+        if child is None:
+            return pin.SE3.Identity(), ""
+        attributes = child.element.attrib
+        relative_frame = attributes.get("relative_to", attributes.get("frame", "")).strip()
+        if not (child.element.text or "").strip():
+            return pin.SE3.Identity(), relative_frame
+        if attributes.get("rotation_format") == _QUATERNION:
+            *xyz, qx, qy, qz, qw = child.parse_numbers(7, "<pose>")
+            length = math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
+            if length == 0:
+                raise child.error(f"the pose of {self.label} has no rotation")
+            quaternion = pin.Quaternion(qw / length, qx / length, qy / length, qz / length)
+            return pin.SE3(quaternion.toRotationMatrix(), np.array(xyz)), relative_frame
+        *xyz, roll, pitch, yaw = child.parse_numbers(6, "<pose>")
+        if attributes.get("degrees", "").lower() in ("true", "1"):
+            roll, pitch, yaw = (math.radians(angle) for angle in (roll, pitch, yaw))
+        return pin.SE3(rotation_from_rpy((roll, pitch, yaw)), np.array(xyz)), relative_frame
 
 
 @dataclass
@@ -50,7 +172,7 @@ class ModelScope:
     @property
     def is_static(self) -> bool:
         """Whether all of it is fixed to the world."""
-        return self._element_with("static").is_true("static")
+        return self._element_with("static").text("static").lower() in ("true", "1")
 
     @property
     def pose_element(self) -> SdfElement:
@@ -81,14 +203,6 @@ class ModelScope:
             *(inner for model in self.models.values() for inner in model.nested_scopes()),
         ]
 
-    @property
-    def can_move(self) -> bool:
-        """Whether it has a movable joint."""
-        return not self.is_static and any(
-            joint.element.get("type") != "fixed"
-            for scope in self.nested_scopes() for joint in scope.joints.values()
-        )  # fmt: skip
-
 
 class ModelReader:
     """Reads models and the files that they include.
@@ -110,12 +224,11 @@ class ModelReader:
             DescriptionError: There is no model, or there are several worlds.
         """
         root = self.xml.root
-        version = sdf_version(self.xml)
         worlds = root.findall("world")
         if len(worlds) > 1:
             raise self.xml.error_at(worlds[1], f"{len(worlds)} worlds in one file, keep one")
-        top = worlds[0] if worlds else root
-        scope = ModelScope(SdfElement(self.xml, top, "the world"), "", None, version)
+        top = SdfElement(self.xml, worlds[0] if worlds else root, "the world")
+        scope = ModelScope(top, "", None, _parse_version(root.get("version", "")))
         self._read_children(scope, scope.item, 0)
         if not scope.models:
             raise self.xml.error_at(
@@ -124,28 +237,22 @@ class ModelReader:
         return scope
 
     def _read_children(self, scope: ModelScope, item: SdfElement, depth: int) -> None:
-        """Add the children of an element to a scope."""
         parts_by_tag = {"link": scope.links, "joint": scope.joints, "frame": scope.frames}
         for child in item.element:
             tag = child.tag
             part = item.wrap(child, f"{tag} '{child.get('name', '')}'")
-            if tag in parts_by_tag:
-                self._add_part(part, parts_by_tag[tag])
-            elif tag == "model":
+            if tag == "model":
                 self._add_model(scope, part, None, scope.version, depth)
             elif tag == "include":
                 self._read_include(scope, item.wrap(child, "an include"), depth)
-
-    def _add_part(self, part: SdfElement, same_kind: dict[str, SdfElement]) -> None:
-        name = part.name
-        if not name:
-            raise part.error(f'a {part.element.tag} has no name, add name="..."')
-        if name in same_kind:
-            raise part.error(
-                f"{part.label} is there twice (first in {same_kind[name].source_location}), "
-                f"rename one",
-            )
-        same_kind[name] = part
+            if tag not in parts_by_tag:
+                continue
+            if not part.name:
+                raise part.error(f'a {tag} has no name, add name="..."')
+            if (first := parts_by_tag[tag].setdefault(part.name, part)) is not part:
+                raise part.error(
+                    f"{part.label} is there twice (first in {first.source_location}), rename one"
+                )
 
     def _add_model(
         self,
@@ -163,8 +270,7 @@ class ModelReader:
         if not name:
             raise item.error('a model has no name, add name="..."')
         if name in parent_scope.models:
-            location = (include or item).source_location
-            raise DescriptionError(f"{location}: model '{name}' is there twice, rename one")
+            raise (include or item).error(f"model '{name}' is there twice, rename one")
         scope.prefix = f"{parent_scope.prefix}{name}::" if parent_scope.parent is not None else ""
         parent_scope.models[name] = scope
         self._read_children(scope, SdfElement(item.xml, item.element, item.label), depth + 1)
@@ -172,8 +278,10 @@ class ModelReader:
     def _read_include(self, scope: ModelScope, include: SdfElement, depth: int) -> None:
         """Add a model of another file; a missing model of a world is noted."""
         uri = include.text("uri")
-        file = self._find_model_file(uri, include)
-        if file is None:
+        file = find_file(uri, include.xml.file.parent) if uri else None
+        if file is not None and not file.is_file():
+            file = _file_from_config(file)
+        if file is None or not file.is_file():
             if scope.parent is None:
                 self._note_unsupported("models that are not found", uri)
                 return
@@ -181,7 +289,7 @@ class ModelReader:
                 f"there is no model '{uri}', say where it is: --packages FOLDER, packages=[...] "
                 "in Python",
             )
-        xml = self._open_file(file)
+        xml = self._open_file(file.resolve())
         models = xml.root.findall("model")
         if len(models) != 1:
             if scope.parent is None and (xml.root.find("light") is not None):
@@ -193,7 +301,7 @@ class ModelReader:
         if include.element.get("merge", "").lower() in ("true", "1"):
             self._merge_model(scope, item, include, depth)
             return
-        self._add_model(scope, item, include, sdf_version(xml), depth)
+        self._add_model(scope, item, include, _parse_version(xml.root.get("version", "")), depth)
 
     def _merge_model(
         self, scope: ModelScope, item: SdfElement, include: SdfElement, depth: int
@@ -202,32 +310,22 @@ class ModelReader:
         if depth > _MAX_DEPTH:
             raise item.error("models include each other without end, break it")
         name = f"_merged__{include.text('name') or item.name}__model__"
-        inner = ModelScope(
-            item, scope.prefix, scope, sdf_version(item.xml), include_element=include
-        )
+        version = _parse_version(item.xml.root.get("version", ""))
+        inner = ModelScope(item, scope.prefix, scope, version, include_element=include)
         self._read_children(inner, SdfElement(item.xml, item.element, item.label, name), depth + 1)
-        scope.frames[name] = MergedFrame.from_scope(inner)
+        placed = inner.pose_element
+        scope.frames[name] = SdfElement(
+            placed.xml, placed.element, placed.label, include.base_frame, inner
+        )
         for own_parts, merged_parts in (
             (scope.links, inner.links), (scope.joints, inner.joints), (scope.frames, inner.frames),
         ):  # fmt: skip
             for key, part in merged_parts.items():
-                if key in own_parts:
-                    raise DescriptionError(
-                        f"{include.source_location}: merging brings a second '{key}', rename one"
-                    )
-                own_parts[key] = part
+                if own_parts.setdefault(key, part) is not part:
+                    raise include.error(f"merging brings a second '{key}', rename one")
         scope.models |= inner.models
 
-    def _find_model_file(self, uri: str, include: SdfElement) -> Path | None:
-        """Return the SDF file of a URI, which names a file or the folder of a model."""
-        found = find_file(uri, include.xml.file.parent) if uri else None
-        if found is None or found.is_file():
-            return found
-        model_file = _file_from_config(found)
-        return model_file if model_file is not None and model_file.is_file() else None
-
     def _open_file(self, file: Path) -> XmlFile:
-        file = file.resolve()
         if file not in self._files:
             self._files[file] = xml = XmlFile(file)
             if xml.root.tag != "sdf":
@@ -237,38 +335,14 @@ class ModelReader:
         return self._files[file]
 
 
-@dataclass(frozen=True)
-class MergedFrame(SdfElement):
-    """The frame of a model whose parts were merged into another model."""
-
-    merged_model: ModelScope | None = None
-
-    @classmethod
-    def from_scope(cls, scope: ModelScope) -> "MergedFrame":
-        """Return the frame of a merged model."""
-        placed = scope.pose_element
-        base = (
-            scope.include_element.base_frame if scope.include_element is not None else "__model__"
-        )
-        return cls(placed.xml, placed.element, placed.label, base, scope)
-
-
-def _file_from_config(folder: Path) -> Path | None:
+def _file_from_config(folder: Path) -> Path:
     """Return the file of the newest version in model.config, else model.sdf."""
-    config = folder / "model.config"
-    if not config.is_file():
-        return folder / "model.sdf"
-    versions = {}
-    for element in XmlFile(config).root.iterfind("sdf"):
-        if name := (element.text or "").strip():
-            versions[_parse_version(element.get("version", ""))] = folder / name
-    existing = {version: file for version, file in versions.items() if file.is_file()}
+    config, existing = folder / "model.config", {}
+    for element in XmlFile(config).root.iterfind("sdf") if config.is_file() else ():
+        file = folder / (element.text or "").strip()
+        if file.is_file():
+            existing[_parse_version(element.get("version", ""))] = file
     return existing[max(existing)] if existing else folder / "model.sdf"
-
-
-def sdf_version(xml: XmlFile) -> tuple[int, int]:
-    """Return the SDF version of a file."""
-    return _parse_version(xml.root.get("version", ""))
 
 
 def _parse_version(text: str) -> tuple[int, int]:

@@ -14,8 +14,7 @@ import pinocchio as pin
 from crane.common.errors import suggest_names
 from crane.description.kinematic_tree import Limits, parse_limit
 from crane.formats.sdf.frame_poses import SdfFramePoses, find_link
-from crane.formats.sdf.model_scope import ModelScope
-from crane.formats.sdf.sdf_element import SdfElement
+from crane.formats.sdf.model_scope import ModelScope, SdfElement
 
 WORLD_NODE = "::world"  # not a possible name of a link
 _SINGLE_FREEDOM_TYPES = {
@@ -147,33 +146,41 @@ class SdfJoints:
         ends = self._end_node(scope, joint, "parent"), self._end_node(scope, joint, "child")
         if ends[0] == ends[1]:
             raise joint.error(f"{joint.label} joins '{ends[0]}' to itself")
-        child = joint.text("child")
         placement_in_scope = self._frames.element_pose(
-            scope, joint, "" if ends[1] == WORLD_NODE else child
+            scope, joint, "" if ends[1] == WORLD_NODE else joint.text("child")
         )
-        placement = self._frames.pose_in_top(scope, self._top) * placement_in_scope
+        scope_pose = self._frames.nested_model_pose(self._top, scope, scope.item)
+        placement = scope_pose * placement_in_scope
         tags = [] if kind in _AXISLESS_TYPES else ["axis"]
         if kind in (*_TWO_FREEDOM_TYPES, "gearbox"):
             tags = ["axis", "axis2"]
         axes = [self._read_axis(scope, joint, tag, placement_in_scope) for tag in tags]
         self._freedom_names[name] = [name]
-        if kind in _AXISLESS_TYPES:
-            self.edges.append(SdfJointEdge(name, kind, *ends, placement, joint))
-        elif kind in _SINGLE_FREEDOM_TYPES:
-            self.edges.append(
-                SdfJointEdge(name, _SINGLE_FREEDOM_TYPES[kind], *ends, placement, joint, axes[0])
-            )
+        if kind == "gearbox":
+            reference = self._end_node(scope, joint, "gearbox_reference_body")
+            first, second = (np.asarray(placement.rotation @ axis.direction) for axis in axes)
+            ratio = joint.number("gearbox_ratio", 1.0)
+            self.gearboxes.append(Gearbox(reference, ends, (first, second), ratio, joint))
         elif kind in _TWO_FREEDOM_TYPES:
             parts = [f"{name}_1", f"{name}_2"]
             self._freedom_names[name] = parts
             self._add_edge_pair(parts, ("revolute", "revolute"), ends, placement, joint, axes)
         elif kind == "screw":
-            self._add_screw(name, ends, placement, joint, axes[0])
+            axes.append(SdfAxis(joint, axes[0].direction))
+            parts = [name, f"{name}_slide"]
+            self._add_edge_pair(parts, ("revolute", "prismatic"), ends, placement, joint, axes)
+            travel_per_radian = joint.number("screw_thread_pitch", 0.0) / (2 * math.pi)
+            if joint.single_child("screw_thread_pitch") is None:
+                pitch = joint.number("thread_pitch", 1.0)  # [rad/m], positive if left-handed
+                travel_per_radian = -1.0 / pitch if pitch else 0.0
+            self.coupled_coordinates.append(
+                CoupledCoordinate(parts[1], name, travel_per_radian, 0.0, joint)
+            )
         else:
-            self._add_gearbox(scope, ends, placement, joint, axes)
+            edge_kind, axis = _SINGLE_FREEDOM_TYPES.get(kind, kind), axes[0] if axes else None
+            self.edges.append(SdfJointEdge(name, edge_kind, *ends, placement, joint, axis))
 
     def _end_node(self, scope: ModelScope, joint: SdfElement, tag: str) -> str:
-        """Return the node at an end of a joint."""
         name = joint.text(tag)
         if not name:
             raise joint.error(f"{joint.label} has no <{tag}>, add it")
@@ -193,14 +200,18 @@ class SdfJoints:
         limit, dynamics = (axis.single_child(x) or SdfElement(axis.xml, axis.element, axis.label)
                            for x in ("limit", "dynamics"))  # fmt: skip
         initial_position = axis.single_child("initial_position")
+        effort, velocity = (  # a negative one means none
+            math.inf if value < 0 else parse_limit(value)
+            for value in (limit.number(key, -1.0) for key in ("effort", "velocity"))
+        )
         return SdfAxis(
             axis,
             self._axis_direction(scope, axis, placement_in_scope),
             Limits(
                 parse_limit(limit.number("lower", -math.inf)),
                 parse_limit(limit.number("upper", math.inf)),
-                _maximum_or_infinity(limit.number("effort", -1.0)),
-                _maximum_or_infinity(limit.number("velocity", -1.0)),
+                effort,
+                velocity,
             ),
             damping=dynamics.number("damping", 0.0),
             friction=dynamics.number("friction", 0.0),
@@ -216,8 +227,9 @@ class SdfJoints:
         xyz = axis.direction("xyz")
         child = axis.single_child("xyz")
         frame_name = "" if child is None else child.attribute("expressed_in")
-        if not frame_name and (scope.version <= (1, 4) or axis.is_true("use_parent_model_frame")):
-            frame_name = axis.base_frame
+        is_in_model_frame = axis.text("use_parent_model_frame").lower() in ("true", "1")
+        if not frame_name and (scope.version <= (1, 4) or is_in_model_frame):
+            frame_name = "__model__"
         if not frame_name:
             return xyz
         frame_name = axis.base_frame if frame_name == "__model__" else frame_name
@@ -244,72 +256,29 @@ class SdfJoints:
         )  # fmt: skip
         self.edges += [dataclasses.replace(first, composite_joint=joint.name), second]
 
-    def _add_screw(
-        self,
-        name: str,
-        end_nodes: tuple[str, str],
-        placement: pin.SE3,
-        joint: SdfElement,
-        axis: SdfAxis,
-    ) -> None:
-        travel_per_radian = joint.number("screw_thread_pitch", 0.0) / (2 * math.pi)
-        if joint.single_child("screw_thread_pitch") is None:
-            pitch = joint.number("thread_pitch", 1.0)  # [rad/m], positive if left-handed
-            travel_per_radian = -1.0 / pitch if pitch else 0.0
-        slide = f"{name}_slide"
-        names = [name, slide]
-        self._add_edge_pair(names, ("revolute", "prismatic"), end_nodes, placement, joint,
-                   [axis, SdfAxis(joint, axis.direction)])  # fmt: skip
-        self.coupled_coordinates.append(
-            CoupledCoordinate(slide, name, travel_per_radian, 0.0, joint)
-        )
-
-    def _add_gearbox(
-        self,
-        scope: ModelScope,
-        end_nodes: tuple[str, str],
-        placement: pin.SE3,
-        joint: SdfElement,
-        axes: list[SdfAxis],
-    ) -> None:
-        first_direction, second_direction = (
-            np.asarray(placement.rotation @ axis.direction) for axis in axes
-        )
-        reference = self._end_node(scope, joint, "gearbox_reference_body")
-        ratio = joint.number("gearbox_ratio", 1.0)
-        directions = first_direction, second_direction
-        self.gearboxes.append(Gearbox(reference, end_nodes, directions, ratio, joint))
-
     def _read_mimic(self, scope: ModelScope, joint: SdfElement) -> None:
         """Read axes that mimic an axis of another joint."""
         own_freedoms = self._freedom_names.get(f"{scope.prefix}{joint.name}", [])
         for name, tag in zip(own_freedoms, ("axis", "axis2"), strict=False):
             axis = joint.single_child(tag)
             mimic = None if axis is None else axis.single_child("mimic")
-            if mimic is not None:
-                self.coupled_coordinates.append(self._coupled_coordinate(scope, name, mimic))
-
-    def _coupled_coordinate(
-        self, scope: ModelScope, name: str, mimic: SdfElement
-    ) -> CoupledCoordinate:
-        leader = mimic.attribute("joint")
-        parts = self._freedom_names.get(f"{scope.prefix}{leader}")
-        if parts is None:
-            names = [
-                x.removeprefix(scope.prefix)
-                for x in self._freedom_names
-                if x.startswith(scope.prefix)
-            ]
-            raise mimic.error(
-                f"{mimic.label} mimics the unknown joint '{leader}', "
-                f"{suggest_names(names, leader)}"
+            if mimic is None:
+                continue
+            leader = mimic.attribute("joint")
+            parts = self._freedom_names.get(f"{scope.prefix}{leader}")
+            if parts is None:
+                names = [
+                    x.removeprefix(scope.prefix)
+                    for x in self._freedom_names
+                    if x.startswith(scope.prefix)
+                ]
+                raise mimic.error(
+                    f"{mimic.label} mimics the unknown joint '{leader}', "
+                    f"{suggest_names(names, leader)}"
+                )
+            leader_part = parts[-1 if mimic.element.get("axis") == "axis2" else 0]
+            multiplier = mimic.number("multiplier", 1.0)
+            offset = mimic.number("offset", 0.0) - multiplier * mimic.number("reference", 0.0)
+            self.coupled_coordinates.append(
+                CoupledCoordinate(name, leader_part, multiplier, offset, mimic)
             )
-        second = mimic.element.get("axis", "axis") == "axis2"
-        multiplier = mimic.number("multiplier", 1.0)
-        offset = mimic.number("offset", 0.0) - multiplier * mimic.number("reference", 0.0)
-        return CoupledCoordinate(name, parts[-1 if second else 0], multiplier, offset, mimic)
-
-
-def _maximum_or_infinity(value: float) -> float:
-    """Return an effort or velocity limit; a negative value means none."""
-    return math.inf if value < 0 else parse_limit(value)

@@ -7,24 +7,22 @@ coordinate is that of SDF.
 """
 
 import dataclasses
+import warnings
+from collections.abc import Mapping
+from difflib import get_close_matches
 
 import pinocchio as pin
 from lxml import etree
 
-from crane.common.errors import DescriptionError, suggest_names
+from crane.common.errors import CraneWarning, DescriptionError, suggest_names
 from crane.common.package_search import load_options
 from crane.description.force_elements import ForceElement
-from crane.description.kinematic_tree import Joint, Limits
-from crane.description.pinocchio_conversion import to_vector, xyz_rpy_from_se3
+from crane.description.kinematic_tree import Joint, Limits, to_vector
+from crane.description.pinocchio_conversion import xyz_rpy_from_se3
 from crane.formats.conversion_notes import ConversionNotes
 from crane.formats.sdf.frame_poses import SdfFramePoses, canonical_link
-from crane.formats.sdf.link_elements import (
-    add_link_inertial,
-    add_shapes,
-    warn_about_missing_inertial,
-)
-from crane.formats.sdf.model_scope import ModelReader, ModelScope
-from crane.formats.sdf.sdf_element import SdfElement
+from crane.formats.sdf.link_elements import add_link_inertial, add_shapes
+from crane.formats.sdf.model_scope import ModelReader, ModelScope, SdfElement
 from crane.formats.sdf.sdf_joints import (
     WORLD_NODE,
     CoupledCoordinate,
@@ -34,13 +32,11 @@ from crane.formats.sdf.sdf_joints import (
 )
 from crane.formats.sdf.spanning_tree import (
     DisjointSets,
-    gear_followers,
+    breadth_first,
+    gear_couplings,
     ground_edges,
-    mark_geared_edges,
-    order_from_root,
     spanning_tree,
 )
-from crane.formats.sdf.unsupported_elements import note_unsupported_elements
 from crane.formats.urdf_elements import (
     add_friction,
     add_joint,
@@ -48,10 +44,33 @@ from crane.formats.urdf_elements import (
     finite_limits,
     format_numbers,
 )
-from crane.formats.xml_file import SourceLocations, XmlFile
+from crane.formats.xml_file import XmlFile, set_source_location
 
 _IDENTITY_TOLERANCE = 1e-15
 _MAX_SHOWN_NAMES = 4  # of unsupported elements in a warning
+# Children that are read, and those that simulators and viewers read.
+_KNOWN_CHILDREN: Mapping[str, set[str]] = {
+    "joint": {
+        "parent", "child", "axis", "axis2", "pose", "gearbox_ratio", "gearbox_reference_body",
+        "thread_pitch", "screw_thread_pitch", "physics", "sensor", "frame", "plugin",
+    },
+    "axis": {
+        "xyz", "limit", "dynamics", "mimic", "use_parent_model_frame", "initial_position",
+    },
+    "limit": {"lower", "upper", "effort", "velocity", "stiffness", "dissipation"},
+    "dynamics": {"damping", "friction", "spring_stiffness", "spring_reference"},
+    "inertial": {
+        "pose", "mass", "inertia", "density", "fluid_added_mass", "frame", "auto_inertia_params",
+    },
+    "inertia": {"ixx", "ixy", "ixz", "iyy", "iyz", "izz"},
+    "mimic": {"multiplier", "offset", "reference"},
+    "link": {
+        "pose", "inertial", "visual", "collision", "sensor", "plugin", "gravity", "self_collide",
+        "kinematic", "must_be_base_link", "velocity_decay", "enable_wind", "projector", "battery",
+        "light", "particle_emitter", "audio_sink", "audio_source", "frame", "max_contacts",
+    },
+}  # fmt: skip
+_NOTED_ELEMENTS = {"sensor": "sensors", "plugin": "plugins", "gripper": "grippers"}
 
 
 def translate_to_urdf(xml: XmlFile) -> tuple[XmlFile, tuple[ForceElement, ...]]:
@@ -80,7 +99,16 @@ def _choose_model(xml: XmlFile, world: ModelScope) -> ModelScope:
         )
     if len(names) == 1:
         return world.models[names[0]]
-    moving = [name for name, model in world.models.items() if model.can_move]
+    moving = [
+        name
+        for name, model in world.models.items()
+        if not model.is_static
+        and any(
+            joint.element.get("type") != "fixed"
+            for scope in model.nested_scopes()
+            for joint in scope.joints.values()
+        )
+    ]
     if len(moving) == 1:
         return world.models[moving[0]]
     if not moving:
@@ -97,7 +125,7 @@ class _SdfTranslation:
     def __init__(self, xml: XmlFile, world: ModelScope, top: ModelScope, notes: ConversionNotes):
         self._xml, self._top, self._notes = xml, top, notes
         self._frames = SdfFramePoses()
-        self._source_locations = SourceLocations(xml.file.name)
+        self._locations = {xml.file.name: 0}
         self._robot = etree.Element("robot", name=top.name)
         self._pose_in_world = self._frames.pose_in_scope(world, top.name, top.item)
         self._link_poses: dict[str, pin.SE3] = {WORLD_NODE: self._pose_in_world.inverse()}
@@ -113,48 +141,48 @@ class _SdfTranslation:
             item = self._top.item
             raise item.error(f"{item.label} is static: nothing in it moves")
         for scope in self._top.nested_scopes():
-            note_unsupported_elements(scope, self._notes)
-            for name, link in scope.links.items():
-                self._read_link(scope, name, link)
+            _note_unsupported_elements(scope, self._notes)
+            for name, link in ({} if scope.is_static else scope.links).items():
+                full_name = f"{scope.prefix}{name}"
+                self._links[full_name], self._scopes[full_name] = link, scope
+                pose_in_scope = self._frames.element_pose(scope, link, link.base_frame)
+                scope_pose = self._frames.nested_model_pose(self._top, scope, scope.item)
+                self._link_poses[full_name] = scope_pose * pose_in_scope
         if not self._links:
             canonical_link(self._top, self._top.item)  # raises
         joints = SdfJoints(self._top, self._frames)
-        edges, gears = mark_geared_edges(
-            [_fix_locked_joint(edge, self._notes) for edge in joints.edges],
-            joints.gearboxes,
-            _rigid_bodies(joints.edges),
-        )
+        edges = [_fix_locked_joint(edge, self._notes) for edge in joints.edges]
+        gears = gear_couplings(edges, joints.gearboxes, _rigid_bodies(joints.edges))
+        geared_names = {name for gear in gears for name in (gear.name, gear.leader)}
+        edges = [
+            dataclasses.replace(x, is_coupled=True) if x.name in geared_names else x for x in edges
+        ]
         edges += ground_edges(edges, self._top, self._links, self._link_poses, self._notes)
         for edge in edges:
             if edge.composite_joint:
                 self._link_poses[edge.child] = edge.placement
         tree = spanning_tree(edges, WORLD_NODE)
         self._add_links(edges)
-        tree_edges = order_from_root(tree, WORLD_NODE)
         driven_joints = _driven_joints(edges, joints.coupled_coordinates)
-        for edge, is_forward in tree_edges:
-            self._add_joint(edge, is_forward, driven_joints)
-        followers = [*joints.coupled_coordinates, *gear_followers(gears)]
-        self._add_mimics(followers, {edge.name for edge, _ in tree_edges})
-        tree_edge_ids = {id(edge) for edge, _ in tree_edges}
+        placed = {WORLD_NODE}
+        for edge in breadth_first(tree, DisjointSets(), WORLD_NODE):
+            self._add_joint(edge, edge.parent in placed, driven_joints)
+            placed |= {edge.parent, edge.child}
+        self._add_mimics([*joints.coupled_coordinates, *gears], {edge.name for edge in tree})
+        tree_edge_ids = {id(edge) for edge in tree}
         self._add_loops([edge for edge in edges if id(edge) not in tree_edge_ids], tree)
-        self._add_home()
+        if self._initial_positions:
+            state = etree.SubElement(self._robot, "group_state", name="home", group="all")
+            for name, axis in self._initial_positions:
+                initial = etree.SubElement(state, "joint", name=name, value=repr(axis.initial))
+                self._set_source_location(initial, axis.item)
         self._notes.warn_about_notes()
-        xml = XmlFile.from_root(self._xml.file, self._robot, self._source_locations.locations)
-        return xml, tuple(self._springs)
+        return XmlFile(self._xml.file, self._robot, self._locations), tuple(self._springs)
 
     def _set_source_location(self, element: etree._Element, item: SdfElement) -> etree._Element:
         for inner in element.iter(etree.Element):
-            self._source_locations.set_location(inner, item.source_location)
+            set_source_location(inner, item.source_location, self._locations)
         return element
-
-    def _read_link(self, scope: ModelScope, name: str, link: SdfElement) -> None:
-        if scope.is_static:
-            return
-        full_name = f"{scope.prefix}{name}"
-        self._links[full_name], self._scopes[full_name] = link, scope
-        pose_in_scope = self._frames.element_pose(scope, link, link.base_frame)
-        self._link_poses[full_name] = self._frames.pose_in_top(scope, self._top) * pose_in_scope
 
     def _add_links(self, edges: list[SdfJointEdge]) -> None:
         self._ground_link = self._unique_link_name("world")
@@ -163,10 +191,9 @@ class _SdfTranslation:
         bodies = _rigid_bodies(edges)
         for name, link in self._links.items():
             scope = self._scopes[name]
-            if bodies.representative(name) != bodies.representative(WORLD_NODE):
-                warn_about_missing_inertial(link)
+            is_moving = bodies.representative(name) != bodies.representative(WORLD_NODE)
             element = etree.SubElement(self._robot, "link", name=name)
-            add_link_inertial(element, scope, link, self._frames)
+            add_link_inertial(element, scope, link, self._frames, is_moving)
             add_shapes(element, scope, link, self._frames, self._notes.note_unsupported)
             self._set_source_location(element, link)
         for edge in edges:
@@ -186,21 +213,21 @@ class _SdfTranslation:
         parent, child = (edge.parent, edge.child) if is_forward else (edge.child, edge.parent)
         axis = edge.axis
         placement = xyz_rpy_from_se3(self._link_poses[parent].actInv(edge.placement))
-        joint = Joint(
-            edge.name,
-            {"ball": "spherical"}.get(edge.kind, edge.kind),
-            self._link_name(parent),
-            self._joint_child_link(edge, child),
-            "",
-            *placement,
-        )
+        kind = {"ball": "spherical"}.get(edge.kind, edge.kind)
+        ends = self._link_name(parent), self._joint_child_link(edge, child)
+        joint = Joint(edge.name, kind, *ends, "", *placement)
         if axis is not None:
             direction = to_vector(axis.direction if is_forward else -axis.direction)
             joint = dataclasses.replace(joint, axis=direction, limits=axis.limits)
         element = add_joint(self._robot, joint)
         if axis is not None:
             add_friction(element, axis.damping, axis.friction)
-            self._record_spring_and_start(edge.name, axis)
+            if axis.stiffness < 0:
+                raise axis.item.error(f"the spring of {axis.item.label} has a negative stiffness")
+            if axis.stiffness:
+                self._springs.append(ForceElement(edge.name, axis.stiffness, axis.reference))
+            if axis.initial is not None:
+                self._initial_positions.append((edge.name, axis))
             if driven_joints is not None:
                 element.set("independent", str(edge.name in driven_joints).lower())
         self._set_source_location(element, edge.item if axis is None else axis.item)
@@ -222,14 +249,6 @@ class _SdfTranslation:
             name += "_"
         self._link_poses[name] = pin.SE3.Identity()
         return name
-
-    def _record_spring_and_start(self, name: str, axis: SdfAxis) -> None:
-        if axis.stiffness < 0:
-            raise axis.item.error(f"the spring of {axis.item.label} has a negative stiffness")
-        if axis.stiffness:
-            self._springs.append(ForceElement(name, axis.stiffness, axis.reference))
-        if axis.initial is not None:
-            self._initial_positions.append((name, axis))
 
     def _add_mimics(self, followers: list[CoupledCoordinate], joints: set[str]) -> None:
         elements = {joint.get("name"): joint for joint in self._robot.iterfind("joint")}
@@ -263,8 +282,7 @@ class _SdfTranslation:
             loop = etree.SubElement(self._robot, "loop", name=edge.name, type=kind)
             for tag, link in (("predecessor", edge.parent), ("successor", edge.child)):
                 end = etree.SubElement(loop, tag, link=self._link_name(link))
-                offset = self._link_poses[link].actInv(edge.placement)
-                add_origin(end, *xyz_rpy_from_se3(offset))
+                add_origin(end, *xyz_rpy_from_se3(self._link_poses[link].actInv(edge.placement)))
             if edge.axis is not None:
                 etree.SubElement(loop, "axis", xyz=format_numbers(edge.axis.direction))
                 if finite_limits(edge.axis.limits) is not None:
@@ -274,14 +292,6 @@ class _SdfTranslation:
                         "friction and springs of joints that close loops", edge.name
                     )
             self._set_source_location(loop, edge.item)
-
-    def _add_home(self) -> None:
-        if not self._initial_positions:
-            return
-        state = etree.SubElement(self._robot, "group_state", name="home", group="all")
-        for name, axis in self._initial_positions:
-            joint = etree.SubElement(state, "joint", name=name, value=repr(axis.initial))
-            self._set_source_location(joint, axis.item)
 
 
 def _rigid_bodies(edges: list[SdfJointEdge]) -> DisjointSets:
@@ -314,3 +324,44 @@ def _driven_joints(
     without_effort = {name for name, axis in axis_of_joint.items() if not axis.limits.effort}
     with_effort = axis_of_joint.keys() - without_effort - coupled_names
     return with_effort if with_effort and without_effort else None
+
+
+def _note_unsupported_elements(scope: ModelScope, notes: ConversionNotes) -> None:
+    """Note elements of a model that no machine has, and warn of mistyped elements."""
+    item = scope.item
+    for element in item.element.iter(*_NOTED_ELEMENTS):
+        if next(element.iterancestors("model"), None) is item.element:  # not of a nested model
+            notes.note_unsupported(_NOTED_ELEMENTS[element.tag], element.get("name", ""))
+    for name, link in scope.links.items():
+        if link.text("gravity").lower() in ("0", "false"):
+            notes.note_difference(
+                "links without gravity have their weight", f"{scope.prefix}{name}"
+            )
+    for part in (*scope.links.values(), *scope.joints.values()):
+        for element in part.element.iter(etree.Element):
+            _warn_about_unknown_children(part, element)
+
+
+def _warn_about_unknown_children(part: SdfElement, element: etree._Element) -> None:
+    tags = _KNOWN_CHILDREN.get("axis" if element.tag == "axis2" else element.tag)
+    parent = element.getparent()
+    if tags is None or (parent is not None and parent.tag in ("ode", "physics", "sensor")):
+        return
+    for child in element:
+        name = child.tag
+        if not isinstance(name, str) or name in tags or name.startswith("{"):
+            continue
+        similar = get_close_matches(name.lower(), sorted(tags), 1, 0.75)
+        other_parents = [x for x, inside in _KNOWN_CHILDREN.items() if name in inside]
+        if similar or other_parents:
+            hint = (
+                f"did you mean <{similar[0]}>?"
+                if similar
+                else (f"it belongs into <{other_parents[0]}>")
+            )
+            warnings.warn(
+                f"{part.xml.source_location(child)}: unknown <{name}> in <{element.tag}> of "
+                f"{part.label}, it is left out, {hint}",
+                CraneWarning,
+                stacklevel=2,
+            )

@@ -1,8 +1,7 @@
 """The graph of links and joints of an SDF model: spanning tree, gears, joints to the ground."""
 
-import dataclasses
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pinocchio as pin
@@ -11,8 +10,7 @@ from crane.common.errors import CraneWarning
 from crane.common.package_search import load_options
 from crane.formats.conversion_notes import ConversionNotes
 from crane.formats.sdf.frame_poses import canonical_link
-from crane.formats.sdf.model_scope import ModelScope
-from crane.formats.sdf.sdf_element import SdfElement
+from crane.formats.sdf.model_scope import ModelScope, SdfElement
 from crane.formats.sdf.sdf_joints import (
     WORLD_NODE,
     CoupledCoordinate,
@@ -51,11 +49,8 @@ def _priority_class(edge: SdfJointEdge) -> int:
         return _PRIORITY_CLASSES - 1  # a ball is three equations, or three Cardan angles in a tree
     if axis.damping or axis.friction or axis.stiffness or axis.initial is not None:
         return 1
-    return (
-        2
-        if edge.composite_joint or np.isfinite([axis.limits.lower, axis.limits.upper]).all()
-        else 3
-    )
+    is_limited = np.isfinite([axis.limits.lower, axis.limits.upper]).all()
+    return 2 if edge.composite_joint or is_limited else 3
 
 
 def spanning_tree(edges: Sequence[SdfJointEdge], root: str) -> list[SdfJointEdge]:
@@ -68,11 +63,11 @@ def spanning_tree(edges: Sequence[SdfJointEdge], root: str) -> list[SdfJointEdge
     bodies, found = DisjointSets(), []
     for rank in range(_PRIORITY_CLASSES):
         some = [edge for edge in edges if _priority_class(edge) == rank]
-        found += _breadth_first(some, bodies, root)
+        found += breadth_first(some, bodies, root)
     return found
 
 
-def _breadth_first(
+def breadth_first(
     edges: Sequence[SdfJointEdge], bodies: DisjointSets, root: str
 ) -> list[SdfJointEdge]:
     """Return joints that join sets of nodes, the nearest to the root first, and join the sets."""
@@ -98,55 +93,31 @@ def _breadth_first(
     return found
 
 
-def order_from_root(edges: Iterable[SdfJointEdge], root: str) -> list[tuple[SdfJointEdge, bool]]:
-    """Return the joints of a tree from the root on, and whether each points away from the root."""
-    edges_by_node: dict[str, list[SdfJointEdge]] = {}
-    for edge in edges:
-        edges_by_node.setdefault(edge.parent, []).append(edge)
-        edges_by_node.setdefault(edge.child, []).append(edge)
-    found, seen, pending = [], {root}, [root]
-    for node in pending:
-        for edge in edges_by_node.get(node, ()):
-            other_end = edge.child if edge.parent == node else edge.parent
-            if other_end not in seen:
-                seen.add(other_end)
-                pending.append(other_end)
-                found.append((edge, edge.parent == node))
-    return found
-
-
 _PARALLEL_TOLERANCE = 1e-6
 
-GearAngles = tuple[Gearbox, list[tuple[str, float]]]  # name and sign of the joint of each angle
 
-
-def mark_geared_edges(
+def gear_couplings(
     edges: list[SdfJointEdge], gears: Sequence[Gearbox], bodies: DisjointSets
-) -> tuple[list[SdfJointEdge], list[GearAngles]]:
-    """Mark the joints that gearboxes couple.
+) -> list[CoupledCoordinate]:
+    """Return the couplings of gears: s_2 q_2 = -ratio s_1 q_1 with the signs s of both angles.
 
     Args:
         edges: All joints.
         gears: All gearboxes.
         bodies: Sets of links that are one body.
 
-    Returns:
-        All joints, and the joints of both angles of each gearbox.
-
     Raises:
         DescriptionError: No joint turns a link against the reference about the gear's axis.
     """
-    gear_angles: list[GearAngles] = []
+    found = []
     for gear in gears:
-        angles = [
+        (first, first_sign), (second, second_sign) = (
             _gear_angle(edges, gear, bodies, link, direction)
             for link, direction in zip(gear.links, gear.directions, strict=True)
-        ]
-        gear_angles.append((gear, angles))
-    bound_names = {name for _, angles in gear_angles for name, _ in angles}
-    return [
-        dataclasses.replace(x, is_coupled=True) if x.name in bound_names else x for x in edges
-    ], gear_angles
+        )
+        multiplier = -gear.ratio * first_sign / second_sign
+        found.append(CoupledCoordinate(second, first, multiplier, 0.0, gear.item))
+    return found
 
 
 def _gear_angle(
@@ -165,21 +136,12 @@ def _gear_angle(
         cosine = float(direction @ edge.placement.rotation @ edge.axis.direction)
         if abs(abs(cosine) - 1) > _PARALLEL_TOLERANCE:
             continue
-        is_forward = ends == required_bodies
-        return edge.name, float(np.sign(cosine)) * (1.0 if is_forward else -1.0)
+        return edge.name, float(np.sign(cosine)) * (1.0 if ends == required_bodies else -1.0)
     raise gear.item.error(
         f"{gear.item.label}: no joint turns '{link.removeprefix('::')}' against "
         f"'{gear.reference.removeprefix('::')}' "
         "about the gear's axis, name another gearbox_reference_body",
     )
-
-
-def gear_followers(gears: Sequence[GearAngles]) -> list[CoupledCoordinate]:
-    """Return the couplings of gears: s_2 q_2 = -ratio s_1 q_1 with the signs s of both angles."""
-    return [
-        CoupledCoordinate(second, first, -gear.ratio * first_sign / second_sign, 0.0, gear.item)
-        for gear, ((first, first_sign), (second, second_sign)) in gears
-    ]
 
 
 _MAX_LISTED = 4
@@ -207,9 +169,12 @@ def ground_edges(
     bodies = DisjointSets()
     for edge in edges:
         bodies.join(edge.parent, edge.child)
-    unattached = [
-        link for link in _root_candidates(edges, top, links) if bodies.join(WORLD_NODE, link)
-    ]
+    first = canonical_link(top, top.item)
+    canonical_name = "" if first is None else f"{first[0].prefix}{first[1]}"
+    children = {edge.child for edge in edges}
+    # first those that no joint moves and the canonical link
+    candidates = sorted(links, key=lambda link: (link in children, link != canonical_name))
+    unattached = [link for link in candidates if bodies.join(WORLD_NODE, link)]
     is_connected = any(WORLD_NODE in (edge.parent, edge.child) for edge in edges)
     is_floating = load_options().floating_root
     # a single part floats by the joints that machines of other formats get
@@ -235,13 +200,3 @@ def ground_edges(
             name += "_"
         added.append(SdfJointEdge(name, kind, WORLD_NODE, link, link_poses[link], links[link]))
     return added
-
-
-def _root_candidates(
-    edges: Sequence[SdfJointEdge], top: ModelScope, links: Mapping[str, SdfElement]
-) -> list[str]:
-    """Sort links: first those that no joint moves and the canonical link."""
-    first = canonical_link(top, top.item)
-    canonical_name = "" if first is None else f"{first[0].prefix}{first[1]}"
-    children = {edge.child for edge in edges}
-    return sorted(links, key=lambda link: (link in children, link != canonical_name))

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import warnings
-from collections.abc import Container, Mapping
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 
 from lxml import etree
@@ -12,9 +12,17 @@ from crane.common.errors import CraneWarning, suggest_names
 from crane.description.findings import FollowUpError, error_recovery, is_strict, report_error
 from crane.description.force_elements import Friction
 from crane.description.inertia_feasibility import inertia_problem
-from crane.description.kinematic_tree import Inertial, Joint, Limits, Link, parse_limit
-from crane.formats.joint_series import MULTI_FREEDOM_TYPES, joint_freedoms, joint_series
-from crane.formats.urdf.loop_elements import read_end_link, unknown_link_error
+from crane.description.kinematic_tree import (
+    MULTI_FREEDOM_TYPES,
+    Inertial,
+    Joint,
+    Limits,
+    Link,
+    joint_freedoms,
+    joint_series,
+    parse_limit,
+)
+from crane.formats.urdf.loop_elements import read_end_link
 from crane.formats.xml_file import XmlFile
 
 
@@ -77,7 +85,7 @@ def _read_inertial(xml: XmlFile, label: str, inertial: etree._Element, is_moved:
 
 
 def read_joint(
-    xml: XmlFile, name: str, element: etree._Element, end_links: tuple[str, str]
+    xml: XmlFile, name: str, element: etree._Element, end_links: tuple[str, str], is_cut: bool
 ) -> Joint:
     """Read a joint with one or no degree of freedom, except its limits.
 
@@ -86,11 +94,12 @@ def read_joint(
         name: Name of the joint.
         element: The `<joint>`.
         end_links: Parent and child link.
+        is_cut: Whether it closes a cycle.
     """
     label, kind = f"joint '{name}'", element.get("type")
-    xml.single_child(element, "mimic", label)
     xyz, rpy = xml.placement(element, label)
-    joint = Joint(name, kind, *end_links, xml.source_location(element), xyz, rpy)
+    place = xml.source_location(element)
+    joint = Joint(name, kind, *end_links, place, xyz, rpy, is_cut=is_cut)
     if kind == "fixed":
         return joint
     return dataclasses.replace(
@@ -219,10 +228,37 @@ def read_graph(
     """
     end_links = {name: _read_end_links(xml, name, joint, links) for name, joint in joints.items()}
     cut_joints: set[str] = set()
-    root = _find_root(xml, links, joints, end_links, cut_joints)
+    parents: dict[str, tuple[str, str]] = {}  # link -> parent, joint
+    for name, (parent, child) in end_links.items():
+        if child in parents:
+            problem = (
+                f"link '{child}' has two parents, joints '{parents[child][1]}' and '{name}': "
+                "keep one and close the other as a loop"
+            )
+            report_error(xml.error_at(joints[name], problem))
+            cut_joints.add(name)
+        elif child:
+            parents[child] = (parent, name)
+    roots = [name for name in links if name not in parents]
+    joined_count = len(parents)
+    while (repeated_link := _link_in_cycle(parents, links)) is not None:
+        closing_joint = parents[repeated_link][1]
+        problem = (
+            f"link '{repeated_link}' is its own ancestor: cut the ring of joints "
+            f"{_loop_text(parents, repeated_link)} at '{closing_joint}' and close it as a loop"
+        )
+        report_error(xml.error_at(joints[closing_joint], problem))
+        cut_joints.add(closing_joint)
+        del parents[repeated_link]
+    # joints with errors, each of which may have had one of the roots as its child
+    unplaced_count = len(xml.root.findall("joint")) - joined_count
+    if len(roots) - unplaced_count > 1:
+        listed = ", ".join(roots[:4]) + (", ..." if len(roots) > 4 else "")
+        problem = f"{len(roots)} links have no parent ({listed}): join all but one"
+        report_error(xml.error_at(links[roots[1]], problem))
     for name in cut_joints:
         end_links[name] = _NO_ENDS
-    return end_links, root, cut_joints
+    return end_links, roots[0] if roots else next(iter(links)), cut_joints
 
 
 def _read_end_links(
@@ -232,15 +268,9 @@ def _read_end_links(
     label, kinds = f"joint '{name}'", (*MOVABLE_TYPES, *MULTI_FREEDOM_TYPES, "fixed")
     kind = joint.get("type")
     if kind not in kinds:
-        report_error(
-            xml.error_at(
-                joint,
-                f"{label} has no type, {suggest_names(kinds)}"
-                if not kind
-                else f"{label} has the type '{kind}', which is not supported, "
-                f"{suggest_names(kinds, kind)}",
-            )
-        )
+        problem = f"the type '{kind}', which is not supported" if kind else "no type"
+        hint = suggest_names(kinds, kind or None)
+        report_error(xml.error_at(joint, f"{label} has {problem}, {hint}"))
         similar = get_close_matches(kind or "", kinds, 1, 0.75)
         joint.set("type", similar[0] if similar else "revolute")
         limit = joint.find("limit")
@@ -248,89 +278,27 @@ def _read_end_links(
             limit = etree.SubElement(joint, "limit")
         if limit.get("lower") is None and limit.get("upper") is None:
             limit.attrib.update({"lower": "-1", "upper": "1"})  # avoids a follow-up error
-    ends = []
-    for end in ("parent", "child"):
-        tag, link = read_end_link(xml, joint, end, label)
-        if not link:
-            report_error(
-                xml.error_at(joint, f'{label} has no {end} link, add <{end} link="..."/>')
-            )
-        elif link not in links:
-            report_error(
-                unknown_link_error(xml, tag, f"{label} has the unknown {end}", link, links)
-            )
-            link = ""
-        ends.append(link)
-    if ends[0] and ends[0] == ends[1]:
-        report_error(
-            xml.error_at(joint, f"{label} joins link '{ends[0]}' to itself, change one end")
-        )
+    _, parent = read_end_link(xml, joint, "parent", label, links, " link")
+    _, child = read_end_link(xml, joint, "child", label, links, " link")
+    if parent and parent == child:
+        problem = f"{label} joins link '{parent}' to itself, change one end"
+        report_error(xml.error_at(joint, problem))
         return _NO_ENDS
-    return ends[0], ends[1]
+    return parent, child
 
 
-def _find_root(
-    xml: XmlFile,
-    links: Mapping[str, etree._Element],
-    joints: Mapping[str, etree._Element],
-    end_links: EndLinks,
-    cut_joints: set[str],
-) -> str:
-    """Return the root link, and add the joints that are to be cut to `cut_joints`."""
-    parents: dict[str, tuple[str, str]] = {}  # link -> parent, joint
-    for name, (parent, child) in end_links.items():
-        if child in parents:
-            report_error(
-                xml.error_at(
-                    joints[name],
-                    f"link '{child}' has two parents, joints '{parents[child][1]}' and '{name}': "
-                    "keep one and close the other as a loop",
-                )
-            )
-            cut_joints.add(name)
-        elif child:
-            parents[child] = (parent, name)
-    roots = [name for name in links if name not in parents]
-    joined_count = len(parents)
+def _link_in_cycle(parents: Mapping[str, tuple[str, str]], links: Iterable[str]) -> str | None:
+    """Return the first link that occurs twice among the ancestors of a link, None without one."""
     visited = {""}  # links whose ancestors have been followed
-    for name in links:
-        seen, repeated_link = _ancestors(parents, name, visited)
-        visited |= seen
-        if repeated_link is None:
-            continue
-        closing_joint, ring = parents[repeated_link][1], _loop_text(parents, repeated_link)
-        report_error(
-            xml.error_at(
-                joints[closing_joint],
-                f"link '{repeated_link}' is its own ancestor: cut the ring of joints {ring} at "
-                f"'{closing_joint}' and close it as a loop",
-            )
-        )
-        cut_joints.add(closing_joint)
-        del parents[repeated_link]
-    # joints with errors, each of which may have had one of the roots as its child
-    unplaced_count = len(xml.root.findall("joint")) - joined_count
-    if len(roots) - unplaced_count > 1:
-        listed = ", ".join(roots[:4]) + (", ..." if len(roots) > 4 else "")
-        report_error(
-            xml.error_at(
-                links[roots[1]], f"{len(roots)} links have no parent ({listed}): join all but one"
-            )
-        )
-    return roots[0] if roots else next(iter(links))
-
-
-def _ancestors(
-    parents: Mapping[str, tuple[str, str]], link: str, visited: Container[str]
-) -> tuple[set[str], str | None]:
-    """Return a link and its ancestors up to a visited one, and the link that occurs twice."""
-    seen = {link}
-    while link in parents and link not in visited:
-        link = parents[link][0]
+    for link in links:
+        seen: set[str] = set()
+        while link in parents and link not in visited and link not in seen:
+            seen.add(link)
+            link = parents[link][0]
         if link in seen:
-            return seen, link
-        seen.add(link)
-    return seen, None
+            return link
+        visited |= seen
+    return None
 
 
 def _loop_text(parents: Mapping[str, tuple[str, str]], link: str) -> str:

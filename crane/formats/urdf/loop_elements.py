@@ -20,7 +20,7 @@ alone. The proposal may still change, so it is read only on request.
 """
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from lxml import etree
@@ -28,9 +28,8 @@ from lxml import etree
 from crane.common.errors import CraneError, suggest_names
 from crane.common.package_search import URDF_CONSTRAINT, asked
 from crane.description.findings import FollowUpError, error_recovery, report_error
-from crane.description.kinematic_tree import Joint
+from crane.description.kinematic_tree import MULTI_FREEDOM_TYPES, Joint, joint_freedoms
 from crane.description.specification import Coupling, LoopSpec
-from crane.formats.joint_series import MULTI_FREEDOM_TYPES, joint_freedoms, series_joint_names
 from crane.formats.xml_file import XmlFile
 
 # Types of URDF+, whose "continuous" is a revolute joint without limits, and cylindrical.
@@ -71,30 +70,20 @@ def _read_loop(
     label, source_location = f"loop '{name}'", xml.source_location(element)
     kind = element.get("type", "")
     if kind not in _LOOP_TYPES:
-        problem = f"the unknown type '{kind}'" if kind else "no type"
-        report_error(
-            xml.error_at(
-                element, f"{label} has {problem}, {suggest_names(_LOOP_TYPES, kind or None)}"
-            )
-        )
+        report_error(_loop_type_error(xml, element, label, kind, _LOOP_TYPES))
     end_joints = []
     for end in ("predecessor", "successor"):
-        tag, link = read_end_link(xml, element, end, label)
-        if not link:
-            report_error(xml.error_at(element, f'{label} has no {end}, add <{end} link="..."/>'))
-            continue
-        if link not in links:
-            report_error(
-                unknown_link_error(xml, tag, f"{label} has the unknown {end}", link, links)
-            )
+        tag, link = read_end_link(xml, element, end, label, links)
         frame = f"{name}_{end}"
         if frame in links:
             problem = f"link '{frame}' has the name of a frame of {label}, rename one"
             report_error(xml.error_at(links[frame], problem))
+        if tag is None:
+            continue
         xyz, rpy = xml.placement(tag, f"the {end} of {label}")
         end_joints.append(Joint(f"{frame}_fixed", "fixed", link, frame, source_location, xyz, rpy))
     axis = xml.direction(element, label, _DEFAULT_AXIS)
-    known_ends = [end for end in end_joints if end.parent in links and end.child not in links]
+    known_ends = [end for end in end_joints if end.parent and end.child not in links]
     if kind not in _LOOP_TYPES or len(known_ends) < 2:
         raise FollowUpError(f"{label} is not complete")
     kind = "revolute" if kind == "continuous" else kind
@@ -103,25 +92,46 @@ def _read_loop(
     ), end_joints
 
 
-def read_end_link(
-    xml: XmlFile, element: etree._Element, tag: str, label: str
-) -> tuple[etree._Element | None, str]:
-    """Return the child with a tag, and the link that it names, "" for none."""
-    child = xml.single_child(element, tag, label)
-    return child, "" if child is None else child.get("link", "").strip()
-
-
-def unknown_link_error(
-    xml: XmlFile,
-    tag: etree._Element,
-    problem: str,
-    link: str,
-    links: Mapping[str, etree._Element],
+def _loop_type_error(
+    xml: XmlFile, element: etree._Element, label: str, kind: str, known_types: Iterable[str]
 ) -> CraneError:
-    """Return the error about an unknown link, a follow-up error if a link has no name."""
-    if "link" in xml.unnamed_kinds:
-        return FollowUpError(f"link '{link}' may be the one without a name")
-    return xml.error_at(tag, f"{problem} '{link}', {suggest_names(links, link)}")
+    problem = f"the unknown type '{kind}'" if kind else "no type"
+    hint = suggest_names(known_types, kind.removesuffix("_joint") or None)
+    return xml.error_at(element, f"{label} has {problem}, {hint}")
+
+
+def read_end_link(
+    xml: XmlFile,
+    element: etree._Element,
+    tag: str,
+    label: str,
+    links: Mapping[str, etree._Element],
+    noun: str = "",
+) -> tuple[etree._Element | None, str]:
+    """Return the child with a tag, and the link that it names, "" after an error.
+
+    Args:
+        xml: The file.
+        element: The element.
+        tag: Tag of the child.
+        label: Name of the element in errors.
+        links: The `<link>` elements by name.
+        noun: Word after the tag in the error about a missing link.
+
+    Raises:
+        DescriptionError: No link is named, or an unknown one.
+    """
+    child = xml.single_child(element, tag, label)
+    link = "" if child is None else child.get("link", "").strip()
+    if not link:
+        problem = f'{label} has no {tag}{noun}, add <{tag} link="..."/>'
+        report_error(xml.error_at(element, problem))
+    elif link not in links and "link" in xml.unnamed_kinds:
+        report_error(FollowUpError(f"link '{link}' may be the one without a name"))
+    elif link not in links:
+        hint = suggest_names(links, link)
+        report_error(xml.error_at(child, f"{label} has the unknown {tag} '{link}', {hint}"))
+    return child, link if link in links else ""
 
 
 def independent_joints(
@@ -164,11 +174,10 @@ def independent_joints(
         kind = joint.get("type")
         if joint.get("independent") == "false":
             continue
-        names += (
-            series_joint_names(name, joint_freedoms(kind, (0.0, 0.0, 1.0)))
-            if kind in MULTI_FREEDOM_TYPES
-            else [name]
-        )
+        if kind in MULTI_FREEDOM_TYPES:
+            names += [f"{name}_{x[0]}" for x in joint_freedoms(kind, (0.0, 0.0, 1.0))]
+        else:
+            names.append(name)
     return tuple(names)
 
 
@@ -211,23 +220,6 @@ def _convert_to_loop(xml: XmlFile, element: etree._Element) -> None:
         raise xml.error_at(element, 'a constraint has no name, add name="..."')
     label = f"constraint '{name}'"
     xml.check_elements(element, _CHILDREN, _ATTRIBUTES, set(_ATTRIBUTES) - {"constraint"})
-    element.set("type", _loop_type(xml, element, label))
-    _check_axes(xml, element, label)
-    for end, tag in _END_TAGS.items():
-        child, link = read_end_link(xml, element, end, label)
-        if child is None or not link:
-            raise xml.error_at(element, f'{label} has no {end}, add <{end} link="..."/>')
-        if (origin := xml.single_child(element, f"{end}_origin", label)) is not None:
-            origin.tag = "origin"
-            child.append(origin)
-        child.tag = tag
-    for axis in element.findall("parent_axis"):
-        axis.tag = "axis"
-    element.tag = "loop"
-
-
-def _loop_type(xml: XmlFile, element: etree._Element, label: str) -> str:
-    """Return the loop type of a constraint."""
     kind = element.get("type", "")
     base_type = kind if kind == "link_joint" else kind.removesuffix("_joint")
     if base_type == "universal":
@@ -237,12 +229,20 @@ def _loop_type(xml: XmlFile, element: etree._Element, label: str) -> str:
             "a continuous joint about parent_axis, and close to that, with revolute",
         )
     if base_type not in _CONSTRAINT_TYPES:
-        problem = f"the unknown type '{kind}'" if kind else "no type"
-        raise xml.error_at(
-            element,
-            f"{label} has {problem}, {suggest_names(_CONSTRAINT_TYPES, base_type or None)}",
-        )
-    return _CONSTRAINT_TYPES[base_type]
+        raise _loop_type_error(xml, element, label, kind, _CONSTRAINT_TYPES)
+    element.set("type", _CONSTRAINT_TYPES[base_type])
+    _check_axes(xml, element, label)
+    for end, tag in _END_TAGS.items():
+        child = xml.single_child(element, end, label)
+        if child is None or not child.get("link", "").strip():
+            raise xml.error_at(element, f'{label} has no {end}, add <{end} link="..."/>')
+        if (origin := xml.single_child(element, f"{end}_origin", label)) is not None:
+            origin.tag = "origin"
+            child.append(origin)
+        child.tag = tag
+    for axis in element.findall("parent_axis"):
+        axis.tag = "axis"
+    element.tag = "loop"
 
 
 def _check_axes(xml: XmlFile, element: etree._Element, label: str) -> None:
@@ -298,22 +298,16 @@ def read_coupling(
     label = f"coupling '{name}'"
     kind = element.get("type", _COUPLING_TYPES[0])
     if kind not in _COUPLING_TYPES:
-        raise xml.error_at(
-            element,
-            f"{label} has the unknown type '{kind}', {suggest_names(_COUPLING_TYPES, kind)}",
-        )
+        hint = suggest_names(_COUPLING_TYPES, kind)
+        raise xml.error_at(element, f"{label} has the unknown type '{kind}', {hint}")
     parents = {
         child: (parent, joint) for joint, (parent, child) in end_links.items() if parent and child
     }
     paths = []
     for end in ("predecessor", "successor"):
-        tag, link = read_end_link(xml, element, end, label)
+        _, link = read_end_link(xml, element, end, label, links)
         if not link:
-            raise xml.error_at(element, f'{label} has no {end}, add <{end} link="..."/>')
-        if link not in links:
-            raise xml.error_at(
-                tag, f"{label} has the unknown {end} '{link}', {suggest_names(links, link)}"
-            )
+            raise FollowUpError(f"{label} is not complete")
         path = []
         while link in parents:
             link, joint = parents[link]
@@ -332,9 +326,8 @@ def read_coupling(
             )
     tag = xml.single_child(element, "ratio", label)
     ratio = 1.0 if tag is None else xml.number(tag, "value", f"the ratio of {label}")
-    factors = dict.fromkeys(reversed(successor_joints), 1.0) | dict.fromkeys(
-        predecessor_joints if ratio else (), -ratio
-    )
+    factors = dict.fromkeys(reversed(successor_joints), 1.0)
+    factors |= dict.fromkeys(predecessor_joints if ratio else (), -ratio)
     if not factors:
         raise xml.error_at(element, f"{label} binds no joint, name two links that move")
     return Coupling(name, factors, 0.0, xml.source_location(element))

@@ -65,29 +65,31 @@ def warn_about_unknown_elements(
             tag in known_tags or tag in _FOREIGN_ELEMENTS.get(parent, ()) or tag.startswith("{")
         ):
             found.setdefault((parent, tag), []).append(child)
-    unknown_groups = [
-        (
-            elements,
-            f"unknown <{tag}> in <{parent}>",
-            _suggest_element(tag, children[parent], attributes),
-        )
+    groups = [
+        (elements, parent, _suggest_element(tag, children[parent], attributes))
         for (parent, tag), elements in found.items()
     ]
-    unknown_groups.sort(key=lambda item: item[2].startswith("known"))  # likely mistakes first
-    for elements, what, hint in unknown_groups[:_MAX_WARNINGS]:
-        _warn_about_elements(xml, elements, what, f"it is left out, {hint}")
-    if remaining_groups := unknown_groups[_MAX_WARNINGS:]:
-        listed = ", ".join(
-            f"<{elements[0].tag}>" for elements, _, _ in remaining_groups[:_MAX_WARNINGS]
-        )
-        dots = ", ..." if len(remaining_groups) > _MAX_WARNINGS else ""
-        problem = f"{len(remaining_groups)} more unknown elements ({listed}{dots}) are left out"
-        warnings.warn(
-            f"{xml.source_location(remaining_groups[0][0][0])}: {problem}",
-            CraneWarning,
-            stacklevel=3,
-        )
-    _warn_about_incomplete_limits(xml, joints)
+    groups.sort(key=lambda item: item[2].startswith("known"))  # likely mistakes first
+    for elements, parent, hint in groups[:_MAX_WARNINGS]:
+        problem = f"unknown <{elements[0].tag}> in <{parent}>"
+        _warn_about_elements(xml, elements, problem, f", it is left out, {hint}")
+    if remaining := [elements[0] for elements, _, _ in groups[_MAX_WARNINGS:]]:
+        listed = ", ".join(f"<{element.tag}>" for element in remaining[:_MAX_WARNINGS])
+        dots = ", ..." if len(remaining) > _MAX_WARNINGS else ""
+        problem = f"{len(remaining)} more unknown elements ({listed}{dots}) are left out"
+        _warn_about_elements(xml, remaining[:1], problem, "")
+    incomplete = []
+    for name, joint in joints.items():
+        limit = joint.find("limit")
+        if limit is None or joint.get("type") == "fixed":
+            continue
+        missing = [key for key in ("effort", "velocity") if limit.get(key) is None]
+        if missing:
+            problem = f"the limit of joint '{name}' has no {' and no '.join(missing)}"
+            incomplete.append((limit, problem))
+    if incomplete:
+        hint = ", nothing is limited then: add it, 1e9 for no limit"
+        _warn_about_elements(xml, [limit for limit, _ in incomplete], incomplete[0][1], hint)
 
 
 def _is_inside_read_elements(element: etree._Element, children: Mapping[str, Set[str]]) -> bool:
@@ -116,27 +118,10 @@ def _suggest_element(tag: str, tags: Set[str], attributes: Mapping[str, Set[str]
     return f'did you mean {similar[0]}="..." of <{element_of_attribute[similar[0]]}>?'
 
 
-def _warn_about_incomplete_limits(xml: XmlFile, joints: Mapping[str, etree._Element]) -> None:
-    incomplete = []
-    for name, joint in joints.items():
-        limit = joint.find("limit")
-        if limit is None or joint.get("type") == "fixed":
-            continue
-        missing = [key for key in ("effort", "velocity") if limit.get(key) is None]
-        if missing:
-            problem = f"the limit of joint '{name}' has no {' and no '.join(missing)}"
-            incomplete.append((limit, problem))
-    if incomplete:
-        elements = [limit for limit, _ in incomplete]
-        _warn_about_elements(
-            xml, elements, incomplete[0][1], "nothing is limited then: add it, 1e9 for no limit"
-        )
-
-
 def _warn_about_elements(
     xml: XmlFile, elements: list[etree._Element], problem: str, hint: str
 ) -> None:
     count = f" ({len(elements)} such in this file)" if len(elements) > 1 else ""
     warnings.warn(
-        f"{xml.source_location(elements[0])}: {problem}{count}, {hint}", CraneWarning, stacklevel=4
+        f"{xml.source_location(elements[0])}: {problem}{count}{hint}", CraneWarning, stacklevel=4
     )

@@ -15,9 +15,8 @@ from crane.description.findings import (
     report_error,
 )
 from crane.description.force_elements import ForceElement, Friction
-from crane.description.kinematic_tree import Joint, Link, Tree
+from crane.description.kinematic_tree import MULTI_FREEDOM_TYPES, Joint, Link, Tree
 from crane.description.specification import Coupling, LoopSpec
-from crane.formats.joint_series import MULTI_FREEDOM_TYPES
 from crane.formats.robot_files import open_robot
 from crane.formats.urdf.link_joint_elements import (
     MOVABLE_TYPES,
@@ -129,8 +128,7 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
     Raises:
         DescriptionError: The file is wrong; the message has file and line.
     """
-    source = open_robot(file)
-    xml = source.xml
+    xml, springs = open_robot(file)
     record_parsed_file(xml)
     _check_elements(xml, edit)
     links, joints = _elements_by_name(xml, "link"), _elements_by_name(xml, "joint")
@@ -150,7 +148,11 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
         if joint.get("type") in MULTI_FREEDOM_TYPES:
             parts += _read_joint_series(xml, name, end_links[name], links, joints)
             continue
-        parts += _read_single_freedom_joint(xml, name, joint, end_links[name], name in cut)
+        with error_recovery():
+            single = read_joint(xml, name, joint, end_links[name], name in cut)
+            parts.append(single)  # without limits if they are wrong
+            limits = read_limits(xml, name, joint) if single.is_movable else single.limits
+            parts[-1] = dataclasses.replace(single, limits=limits)
         with error_recovery(harmless=True):
             friction[name] = read_friction(xml, name, joint)
     independent_names = independent_joints(xml, joints)
@@ -181,12 +183,11 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
         home_lines,
         read_tip(xml, links),
         is_complete=not xml.unnamed_kinds,
-        springs=source.springs,
+        springs=springs,
     )
 
 
 def _check_elements(xml: XmlFile, edit: Callable[[XmlFile], None] | None) -> None:
-    """Check names of elements and attributes, and edit the elements."""
     if xml.root.tag != "robot":
         raise xml.error_at(
             xml.root, f"a URDF starts with <robot>, this file with <{xml.root.tag}>"
@@ -199,19 +200,6 @@ def _check_elements(xml: XmlFile, edit: Callable[[XmlFile], None] | None) -> Non
         for element in xml.root.iterfind(tag):
             problem = f"<{tag}> is not read, URDF+ has <{replacement_tag}> for it: write one"
             report_error(xml.error_at(element, problem))
-
-
-def _read_single_freedom_joint(
-    xml: XmlFile, name: str, joint: etree._Element, end_links: tuple[str, str], is_cut: bool
-) -> list[Link | Joint]:
-    """Read a joint with one or no degree of freedom, without limits if they are wrong."""
-    joints: list[Link | Joint] = []
-    with error_recovery():
-        found = dataclasses.replace(read_joint(xml, name, joint, end_links), is_cut=is_cut)
-        joints = [found]
-        if found.is_movable:
-            joints = [dataclasses.replace(found, limits=read_limits(xml, name, joint))]
-    return joints
 
 
 def _read_joint_series(
@@ -344,14 +332,12 @@ def read_tip(xml: XmlFile, links: Mapping[str, etree._Element]) -> str | None:
     if not tips:
         return None
     link = str(tips[0].get("parent_link", "")).strip()
-    if not link:
-        raise xml.error_at(
-            tips[0], f'the tip has no link, write parent_link="LINK", {suggest_names(links)}'
-        )
     if link not in links:
-        raise xml.error_at(
-            tips[0], f"the tip is the unknown link '{link}', {suggest_names(links, link)}"
+        problem = (
+            f"is the unknown link '{link}'" if link else ('has no link, write parent_link="LINK"')
         )
+        hint = suggest_names(links, link or None)
+        raise xml.error_at(tips[0], f"the tip {problem}, {hint}")
     return link
 
 

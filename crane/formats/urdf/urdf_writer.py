@@ -1,15 +1,23 @@
-"""Write a machine as one URDF: with the loop elements of URDF+, or as a plain tree."""
+"""Write a machine as one URDF: with the loop elements of URDF+, or as a plain tree.
 
+Here are also the parts that writers of several formats share: shapes, couplings, drives, the
+document, and the warning about what is left out.
+"""
+
+import copy
 import dataclasses
+import re
+import warnings
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from lxml import etree
 
 from crane.common.atomic_output import replace_file
-from crane.common.errors import InputError
+from crane.common.errors import CraneWarning, InputError, format_one_line
 from crane.description.kinematic_tree import Tree
 from crane.description.specification import Coupling, LoopSpec
-from crane.formats.conversion_notes import unsupported_sections, warn_about_unsupported
+from crane.formats.robot_files import open_robots
 from crane.formats.urdf_elements import (
     add_friction,
     add_joint,
@@ -17,15 +25,7 @@ from crane.formats.urdf_elements import (
     add_origin,
     format_numbers,
 )
-from crane.formats.urdf_output import (
-    compound_drive_factors,
-    copy_shapes,
-    format_document,
-    origin_text,
-    rotor_inertias,
-    solve_coupling,
-    with_floating_joints,
-)
+from crane.formats.visuals.mesh_files import find_mesh_file
 from crane.machine.machine import Machine
 
 
@@ -78,13 +78,15 @@ def write_urdf_plus(machine: Machine, path: str | Path) -> None:
         tip = {"name": "tip", "parent_link": machine.tip, "group": "all"}
         etree.SubElement(robot, "end_effector", tip)
     copy_shapes(robot, machine)
-    unsupported = unsupported_sections(machine)
-    unsupported += ["springs and forces"] if machine.forces else []
-    unsupported += ["ropes"] if machine.ropes else []
-    unsupported += ["rotor inertias"] if rotor_inertias(machine) else []
-    unsupported += ["drives along several joints"] if compound_drive_factors(machine) else []
     with replace_file(path) as temporary_file:
         temporary_file.write_bytes(format_document(robot, origin_text(machine)))
+    sections = {
+        "springs and forces": machine.forces,
+        "ropes": machine.ropes,
+        "rotor inertias": rotor_inertias(machine),
+        "drives along several joints": compound_drive_factors(machine),
+    }
+    unsupported = [name for name, section in sections.items() if section]
     warn_about_unsupported(machine, "URDF+", unsupported)
 
 
@@ -121,9 +123,8 @@ def _add_coupling(machine: Machine, robot: etree._Element, coupling: Coupling) -
             f"coupling '{coupling.name}' of {len(joints)} joints has no place in URDF+, write a "
             "machine file"
         )
-    others = [name for name in machine.joints if name != joints[0]]
     # the joint that a held joint mimics has no effect
-    other = joints[1] if derivatives else others[0]
+    other = [*joints[1:], *(name for name in machine.joints if name != joints[0])][0]
     (follower,) = (j for j in robot.iterfind("joint") if j.get("name") == joints[0])
     multiplier = format_numbers([derivatives[0] if derivatives else 0.0])
     mimic = {"joint": other, "multiplier": multiplier, "offset": format_numbers([offset])}
@@ -143,24 +144,19 @@ def _coupling_ends(
     All joints on the path to the successor have the factor of the first joint, and all joints on
     the path to the predecessor have one other factor.
     """
-    model = machine.model
-    successor_joints = [joints[0]] + [
-        x for x, slope in zip(joints[1:], derivatives, strict=True) if slope == -1
-    ]
-    predecessor_joints = [x for x in joints if x not in successor_joints]
-    ratios = {
-        slope for x, slope in zip(joints[1:], derivatives, strict=True) if x in predecessor_joints
-    }
+    model, slopes = machine.model, dict(zip(joints, [-1.0, *derivatives], strict=True))
+    ratios = {slope for slope in slopes.values() if slope != -1}
     if len(ratios) > 1:
         return None
-    joint_paths = [
-        sorted(model.getJointId(x) for x in way) for way in (predecessor_joints, successor_joints)
+    joint_paths = [  # indices rise from parent to child
+        sorted(model.getJointId(x) for x, slope in slopes.items() if (slope == -1) == is_successor)
+        for is_successor in (False, True)
     ]
-    for path in joint_paths:  # indices rise from parent to child
-        if any(model.parents[b] != a for a, b in zip(path, path[1:], strict=False)):
-            return None
-    top_joints = [model.parents[way[0]] for way in joint_paths if way]
-    if len(set(top_joints)) > 1:
+    top_joints = [model.parents[path[0]] for path in joint_paths if path]
+    is_chain = all(
+        model.parents[b] == a for x in joint_paths for a, b in zip(x, x[1:], strict=False)
+    )
+    if len(set(top_joints)) > 1 or not is_chain:
         return None
     joints_of_ends = [path[-1] if path else top_joints[0] for path in joint_paths]
     links = [
@@ -194,3 +190,148 @@ def robot_description(machine: Machine) -> str:
         _add_joint_friction(add_joint(robot, joint), machine, joint.name)
     copy_shapes(robot, machine, uris=True)
     return format_document(robot, origin_text(machine)).decode()
+
+
+def with_floating_joints(machine: Machine) -> Tree:
+    """Return the tree with a floating joint in place of the six joints of each floating base."""
+    links, joints = dict(machine.tree.links), dict(machine.tree.joints)
+    for column in machine.coordinates.floating_base_columns:
+        series = [joints.pop(name) for name in machine.joints[column : column + 6]]
+        for joint in series[:-1]:
+            del links[joint.child]
+        name = series[0].floating_joint
+        joints[name] = dataclasses.replace(
+            series[0], name=name, kind="floating", child=series[-1].child
+        )
+    return Tree(links, joints)
+
+
+def copy_shapes(
+    robot: etree._Element,
+    machine: Machine,
+    chains: Iterable[str] | None = None,
+    uris: bool = False,
+) -> None:
+    """Copy visuals, collisions and materials of a machine's URDFs to the links of the same names.
+
+    Args:
+        robot: The `<robot>` that receives them.
+        machine: The machine.
+        chains: Names of the chains to copy from, all if not given.
+        uris: Whether to name meshes by URIs, as ROS requires, instead of paths.
+    """
+    targets = {link.get("name"): link for link in robot.iterfind("link")}
+    materials: dict[str, etree._Element] = {}
+    with open_robots(machine, chains) as sources:
+        shapes = [
+            (xml.file.parent, link.get("name", "").strip(), shape)
+            for xml in sources
+            for link in xml.root.iterfind("link")
+            for shape in (*link.iterfind("visual"), *link.iterfind("collision"))
+        ]
+        for material in (x for xml in sources for x in xml.root.iterfind("material")):
+            materials.setdefault(material.get("name", ""), copy.deepcopy(material))
+        for folder, name, shape in shapes:
+            if name in targets:
+                targets[name].append(_with_mesh_paths(shape, folder, uris))
+    for material in reversed(materials.values()):
+        robot.insert(0, material)
+
+
+def _with_mesh_paths(shape: etree._Element, folder: Path, uris: bool) -> etree._Element:
+    """Return a copy of a shape that names its mesh by an absolute path or URI if the file exists.
+
+    As a URI, a mesh of a package keeps its `package://` name, which other computers can resolve.
+    """
+    shape = copy.deepcopy(shape)
+    for mesh in shape.iter("mesh"):
+        name = mesh.get("filename", "")
+        if uris and name.startswith("package://"):
+            continue
+        if (file := find_mesh_file(name, folder)) is not None:
+            mesh_path = file.resolve()
+            mesh.set("filename", mesh_path.as_uri() if uris else str(mesh_path))
+    return shape
+
+
+def solve_coupling(coupling: Coupling) -> tuple[list[str], list[float], float]:
+    """Solve a coupling for its first joint: q_0 = sum slope_i q_i + offset.
+
+    Returns:
+        Names of all joints, slopes of the joints after the first, offset.
+    """
+    joints, factors = list(coupling.factors), list(coupling.factors.values())
+    slopes = [-factor / factors[0] + 0.0 for factor in factors[1:]]
+    return joints, slopes, coupling.offset / factors[0] + 0.0
+
+
+def format_document(
+    robot: etree._Element, comment: str, element_notes: Sequence[tuple[etree._Element, str]] = ()
+) -> bytes:
+    """Return an indented XML document with a comment in its first line and beside elements."""
+    etree.indent(robot)
+    for element, note in element_notes:
+        comment_element = etree.Comment(f" {_comment_text(note)} ")
+        parent = element.getparent()
+        parent.insert(parent.index(element) + 1, comment_element)
+        comment_element.tail, element.tail = element.tail, "  "
+    header = f'<?xml version="1.0"?>\n<!-- {_comment_text(comment)} -->\n'
+    return header.encode() + etree.tostring(robot, encoding="utf-8") + b"\n"
+
+
+def _comment_text(comment: str) -> str:
+    """Return a text that is allowed in an XML comment."""
+    return re.sub("-(?=-)", "- ", " ".join(format_one_line(comment).split())).strip(" -")
+
+
+def origin_text(machine: Machine) -> str:
+    """Return the comment that names the source of a written machine."""
+    return f"{machine.name}, written by crane; source: {machine.source or machine.path.name}"
+
+
+def compound_drive_factors(machine: Machine) -> dict[str, dict[str, float]]:
+    """Return the factors of all drives if one of them acts along several joints, else nothing."""
+    drives = {drive.name: dict(drive.factors) for drive in machine.drives}
+    is_plain = all(factors == {name: 1.0} for name, factors in drives.items())
+    return {} if is_plain else drives
+
+
+def rotor_inertias(machine: Machine) -> dict[str, float]:
+    """Return the rotor inertias that are not zero, by joint."""
+    joints = machine.tree.joints
+    return {x: joints[x].rotor_inertia for x in machine.joints if joints[x].rotor_inertia}
+
+
+def warn_about_unsupported(machine: Machine, format_name: str, others: Sequence[str]) -> None:
+    """Warn of parts of a machine that a written format cannot represent.
+
+    Those are the sections that only a machine file represents, and friction laws: other formats
+    have Coulomb and viscous friction alone.
+
+    Args:
+        machine: The machine.
+        format_name: Name of the format.
+        others: Further parts.
+    """
+    names = [
+        f"the friction law of {joint}"
+        for joint, law in machine.friction.items()
+        if law.coulomb_offset or law.viscous_offset or law.stiction or (
+            law.coulomb and law.smoothing
+        )
+    ]  # fmt: skip
+    sections = {
+        "gas springs": machine.gas_springs,
+        "end stops": machine.end_stops,
+        "tasks": machine.tasks,
+        "gains": machine.control,
+        "hydraulics": machine.hydraulics,
+    }
+    names += [name for name, section in sections.items() if section]
+    if listed := ", ".join([*names, *others]):
+        warnings.warn(
+            f"{machine.name}: {format_name} has no place for {listed}, left out (a machine "
+            "file has)",
+            CraneWarning,
+            stacklevel=3,
+        )

@@ -5,10 +5,9 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -69,7 +68,7 @@ def read_meshes(files: Iterable[Path]) -> dict[Path, tuple[MeshPart, ...] | str]
         if cached is None:
             entry_names[file] = name
         else:
-            found[file] = _parse_answer(cached)
+            found[file], _ = _parse_answer(cached)
     for _ in range(_MAX_ATTEMPTS):
         remaining_triangles = mesh_process.MAX_TRIANGLES - sum(
             len(part.faces)
@@ -79,12 +78,10 @@ def read_meshes(files: Iterable[Path]) -> dict[Path, tuple[MeshPart, ...] | str]
         )
         answers = _run_mesh_process(list(entry_names), remaining_triangles) if entry_names else []
         for (file, name), answer in zip(list(entry_names.items()), answers, strict=False):
-            found[file] = _parse_answer(answer)
+            found[file], is_self_contained = _parse_answer(answer)
             del entry_names[file]
-            is_self_contained = len(answer) <= _MAX_CACHED_SIZE and _answer_header(answer).get(
-                "alone"
-            )
-            if name is not None and is_self_contained and name == _cache_entry_name(file):
+            is_small = len(answer) <= _MAX_CACHED_SIZE
+            if name and is_small and is_self_contained and name == _cache_entry_name(file):
                 file_cache.write_entry(name, answer)
     return found | dict.fromkeys(
         entry_names, f"not tried after {_MAX_ATTEMPTS} that ended the reader"
@@ -116,55 +113,33 @@ def _run_mesh_process(files: list[Path], max_triangles: int) -> list[bytes]:
         output, status = completed.stdout, completed.returncode
     except subprocess.TimeoutExpired as late:
         output, status = late.stdout or b"", -signal.SIGTERM
-    answers = list(_split_answers(output))
+    answers, position = [], 0
+    while (end := output.find(b"\n", position)) >= 0:  # complete answers
+        parts = json.loads(output[position:end]).get("parts", ())
+        end += 1 + sum(8 * 3 * (part["vertices"] + part["faces"]) for part in parts)
+        if end > len(output):
+            break
+        answers.append(output[position:end])
+        position = end
     if len(answers) < len(files):
-        is_too_slow = status in (-signal.SIGTERM, -getattr(signal, "SIGXCPU", 0))
-        reason = (
-            f"reading it takes more than {mesh_process.MAX_SECONDS} s"
-            if is_too_slow
-            else "damaged"
-        )
+        reason = "damaged"
+        if status in (-signal.SIGTERM, -getattr(signal, "SIGXCPU", 0)):
+            reason = f"reading it takes more than {mesh_process.MAX_SECONDS} s"
         answers.append(json.dumps({"wrong": reason}).encode() + b"\n")
     return answers
 
 
-def _split_answers(output: bytes) -> Iterator[bytes]:
-    """Yield the complete answers of the process."""
-    position = 0
-    while (end := output.find(b"\n", position)) >= 0:
-        parts = json.loads(output[position:end]).get("parts", ())
-        end += 1 + sum(map(_part_size, parts))
-        if end > len(output):
-            break
-        yield output[position:end]
-        position = end
-
-
-def _answer_header(answer: bytes) -> dict[str, Any]:
-    head: dict[str, Any] = json.loads(answer[: answer.index(b"\n")])
-    return head
-
-
-def _parse_answer(answer: bytes) -> tuple[MeshPart, ...] | str:
-    """Return the triangles of an answer, or its error text."""
-    header = _answer_header(answer)
+def _parse_answer(answer: bytes) -> tuple[tuple[MeshPart, ...] | str, bool]:
+    """Return the triangles of an answer, or its error text, and whether no other file was read."""
+    position = answer.index(b"\n") + 1
+    header = json.loads(answer[:position])
     if "wrong" in header:
-        return str(header["wrong"])
-    return tuple(_parse_parts(header["parts"], answer, answer.index(b"\n") + 1))
-
-
-def _part_size(part: dict[str, Any]) -> int:
-    """Return the number of bytes of the triangles of a part."""
-    return 8 * 3 * int(part["vertices"] + part["faces"])
-
-
-def _parse_parts(
-    part_headers: list[dict[str, Any]], output: bytes, position: int
-) -> Iterator[MeshPart]:
-    """Yield the parts of an answer from a byte position on."""
-    for part in part_headers:
+        return str(header["wrong"]), False
+    parts = []
+    for part in header["parts"]:
         v, f = 3 * part["vertices"], 3 * part["faces"]
-        vertices = np.frombuffer(output, np.float64, v, position).reshape(-1, 3)
-        faces = np.frombuffer(output, np.int64, f, position + 8 * v).reshape(-1, 3)
-        yield MeshPart(vertices, faces, part["colour"] and tuple(part["colour"]))
-        position += _part_size(part)
+        vertices = np.frombuffer(answer, np.float64, v, position).reshape(-1, 3)
+        faces = np.frombuffer(answer, np.int64, f, position + 8 * v).reshape(-1, 3)
+        parts.append(MeshPart(vertices, faces, part["colour"] and tuple(part["colour"])))
+        position += 8 * (v + f)
+    return tuple(parts), bool(header.get("alone"))

@@ -44,7 +44,7 @@ def main() -> None:
             _send_answer(output, {"wrong": str(error)}, [])
         return
     for file in files:
-        _limit_resources()
+        limit_resources()
         try:
             header, arrays = _read_mesh(file, remaining)
             remaining -= sum(part["faces"] for part in header["parts"])
@@ -56,7 +56,7 @@ def main() -> None:
         _send_answer(output, header, arrays)
 
 
-def _limit_resources() -> None:
+def limit_resources() -> None:
     """Limit time for one more file, and memory, if the system supports it."""
     try:
         import resource

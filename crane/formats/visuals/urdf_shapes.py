@@ -108,12 +108,16 @@ class UrdfShapes:
 
 
 @dataclass(frozen=True)
-class _MeshReference:
-    """A mesh that is not read yet: its name, scale (3,) and file."""
+class _UnloadedMesh:
+    """A mesh on a link that is not read yet: its name, scale (3,) and file."""
 
+    link: str
     name: str
     scale: tuple[float, ...]
     file: Path | None
+    placement: Array
+    colour: Colour | None
+    source_location: str
 
 
 def read_shapes(
@@ -129,34 +133,16 @@ def read_shapes(
     reader = _ShapeReader(xml)
     shapes = {tag: reader.read_elements(tag) for tag in tags}
     meshes = read_meshes(
-        shape.shape.file
-        for unloaded in shapes.values()
-        for shape in unloaded
-        if isinstance(shape.shape, _MeshReference) and shape.shape.file is not None
+        shape.file
+        for found in shapes.values()
+        for shape in found
+        if isinstance(shape, _UnloadedMesh) and shape.file is not None
     )
-    return UrdfShapes(
-        {
-            tag: [
-                visual
-                for unloaded in found
-                for visual in reader.create_visuals(unloaded, meshes, replacement)
-            ]
-            for tag, found in shapes.items()
-        },
-        reader.missing_meshes,
-        tuple(dict.fromkeys(reader.problems)),
-    )
-
-
-@dataclass(frozen=True)
-class _UnloadedShape:
-    """A shape on a link, before its mesh is read."""
-
-    link: str
-    shape: Shape | _MeshReference
-    placement: Array
-    colour: Colour | None
-    source_location: str
+    visuals = {
+        tag: [x for shape in found for x in reader.create_visuals(shape, meshes, replacement)]
+        for tag, found in shapes.items()
+    }
+    return UrdfShapes(visuals, reader.missing_meshes, tuple(dict.fromkeys(reader.problems)))
 
 
 class _ShapeReader:
@@ -170,16 +156,15 @@ class _ShapeReader:
         with raise_errors():
             self._colours = {
                 material.get("name", "").strip(): colour
-                for material in reversed(
-                    list(xml.root.iter("material"))
-                )  # the first of a name applies
+                # the first of a name applies
+                for material in reversed(list(xml.root.iter("material")))
                 if (colour := self._read_colour(material)) is not None
             }
         self.problems.clear()  # reported for the visuals that use them
 
-    def read_elements(self, tag: str) -> list[_UnloadedShape]:
+    def read_elements(self, tag: str) -> list[Visual | _UnloadedMesh]:
         """Return the shapes of elements with a tag."""
-        found: list[_UnloadedShape] = []
+        found: list[Visual | _UnloadedMesh] = []
         for element in self.xml.root.iterfind(f"link/{tag}"):
             link = element.getparent().get("name", "").strip()
             try:
@@ -191,7 +176,7 @@ class _ShapeReader:
     @raise_errors()
     def _read_element(
         self, element: etree._Element, link: str, label: str
-    ) -> list[_UnloadedShape]:
+    ) -> Sequence[Visual | _UnloadedMesh]:
         xyz, rpy = self.xml.placement(element, label)
         self._check_distance(element, label, xyz)
         placement = _pose_matrix(xyz, rpy)
@@ -207,38 +192,34 @@ class _ShapeReader:
             shape_text = ", ".join(f"<{shape.tag}>" for shape in shapes[:4]) or "no shape"
             listed = ", ".join(f"<{shape}>" for shape in _SHAPE_TAGS)
             raise self.xml.error_at(element, f"{label} has {shape_text}, give one of {listed}")
-        source_location = self.xml.source_location(shapes[0])
-        return [
-            _UnloadedShape(link, shape, placement @ offset, colour, source_location)
-            for shape, offset in self._read_shape(shapes[0], label)
-        ]
-
-    def _read_shape(
-        self, shape: etree._Element, label: str
-    ) -> list[tuple[Shape | _MeshReference, Array]]:
-        """Return the parts of a shape, each with its pose (4, 4)."""
-        identity = np.eye(4)
+        shape = shapes[0]
         if shape.tag == "mesh":
-            name = shape.get("filename", "")
-            if not name:
+            if not (name := shape.get("filename", "")):
                 raise self.xml.error_at(shape, f'{label} names no mesh, add filename="..."')
             scale = self.xml.vector(shape, "scale", label, 3, (1.0, 1.0, 1.0))
-            folder = self.xml.file.parent
-            return [(_MeshReference(name, scale, find_mesh_file(name, folder)), identity)]
+            file, place = (
+                find_mesh_file(name, self.xml.file.parent),
+                self.xml.source_location(shape),
+            )
+            return [_UnloadedMesh(link, name, scale, file, placement, colour, place)]
+        return [
+            Visual(link, part, placement @ _pose_matrix((0.0, 0.0, z)), colour or DEFAULT_COLOUR)
+            for part, z in self._read_shape(shape, label)
+        ]
+
+    def _read_shape(self, shape: etree._Element, label: str) -> list[tuple[Shape, float]]:
+        """Return the parts of a shape, each with its coordinate z."""
         if shape.tag == "box":
             x, y, z = self._read_sizes(shape, "size", label, 3)
-            return [(BoxShape((x, y, z)), identity)]
+            return [(BoxShape((x, y, z)), 0.0)]
         (radius,) = self._read_sizes(shape, "radius", label, 1)
+        sphere = SphereShape(radius)
         if shape.tag == "sphere":
-            return [(SphereShape(radius), identity)]
+            return [(sphere, 0.0)]
         (length,) = self._read_sizes(shape, "length", label, 1)
-        parts: list[tuple[Shape | _MeshReference, Array]] = [
-            (CylinderShape(radius, length), identity)
-        ]
-        if shape.tag == "capsule":  # its length is between the centres of the spheres
-            for end in (-length / 2, length / 2):
-                parts.append((SphereShape(radius), _pose_matrix((0.0, 0.0, end))))
-        return parts
+        # the length of a capsule is between the centres of its spheres
+        ends = [(sphere, -length / 2), (sphere, length / 2)] if shape.tag == "capsule" else []
+        return [(CylinderShape(radius, length), 0.0), *ends]
 
     def _read_sizes(
         self, shape: etree._Element, key: str, label: str, count: int
@@ -277,53 +258,44 @@ class _ShapeReader:
 
     def create_visuals(
         self,
-        unloaded: _UnloadedShape,
+        mesh: Visual | _UnloadedMesh,
         meshes: Mapping[Path, tuple[MeshPart, ...] | str],
         replacement: BoxShape | None,
     ) -> list[Visual]:
         """Return a shape with the triangles of its mesh."""
-        shape = unloaded.shape
-        if not isinstance(shape, _MeshReference):
-            return [
-                Visual(unloaded.link, shape, unloaded.placement, unloaded.colour or DEFAULT_COLOUR)
-            ]
-        short_name = (
-            shape.name
-            if len(shape.name) < _MAX_NAME_LENGTH
-            else f"...{shape.name[-_MAX_NAME_LENGTH:]}"
-        )
-        mesh_label = f"{unloaded.source_location}: mesh '{short_name}'"
-        parts = () if shape.file is None else meshes[shape.file]
-        if shape.file is None:
-            self.missing_meshes.setdefault(short_name, unloaded.source_location)
+        if isinstance(mesh, Visual):
+            return [mesh]
+        name, colour = mesh.name, mesh.colour or DEFAULT_COLOUR
+        if len(name) >= _MAX_NAME_LENGTH:
+            name = f"...{name[-_MAX_NAME_LENGTH:]}"
+        mesh_label = f"{mesh.source_location}: mesh '{name}'"
+        parts = () if mesh.file is None else meshes[mesh.file]
+        if mesh.file is None:
+            self.missing_meshes.setdefault(name, mesh.source_location)
         elif isinstance(parts, str):
-            first_location = self._damaged_meshes.setdefault(short_name, unloaded.source_location)
+            first_location = self._damaged_meshes.setdefault(name, mesh.source_location)
             self.problems.append(
-                f"{first_location}: mesh file '{short_name}' cannot be read ({parts}), export "
+                f"{first_location}: mesh file '{name}' cannot be read ({parts}), export "
                 "it again; a box is drawn instead"
             )
-        elif any(_largest_coordinate(part, shape.scale) > _MAX_DISTANCE for part in parts):
+        elif any(_largest_coordinate(part, mesh.scale) > _MAX_DISTANCE for part in parts):
             self.problems.append(
                 f"{mesh_label} is far larger than a machine, scale it; a box is drawn instead"
             )
         else:
             return [
                 Visual(
-                    unloaded.link,
-                    MeshShape(part.vertices * shape.scale, part.faces),
-                    unloaded.placement,
-                    unloaded.colour or part.colour or DEFAULT_COLOUR,
+                    mesh.link,
+                    MeshShape(part.vertices * mesh.scale, part.faces),
+                    mesh.placement,
+                    mesh.colour or part.colour or DEFAULT_COLOUR,
                     mesh_label,
                 )
                 for part in parts
             ]
         if replacement is None:
             return []
-        return [
-            Visual(
-                unloaded.link, replacement, unloaded.placement, unloaded.colour or DEFAULT_COLOUR
-            )
-        ]
+        return [Visual(mesh.link, replacement, mesh.placement, colour)]
 
 
 def _largest_coordinate(part: MeshPart, scale: tuple[float, ...]) -> float:

@@ -1,13 +1,12 @@
 """Calibration of machines: parameters fitted to recordings through the simulation."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from crane.common.errors import CraneError, InputError, RecordingError, prefix_location
-from crane.common.errors import suggest_names as known_names
+from crane.common.errors import CraneError, InputError, RecordingError, check_name, prefix_location
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
@@ -33,14 +32,11 @@ from crane.identification.calibration.calibration_statistics import (
     CalibrationEstimate,
     estimate_with_profiles,
     score_tests,
-)
-from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt, Progress
-from crane.identification.calibration.parameter_selection import (
-    candidate_parameters,
     select_parameters,
 )
+from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt, Progress
 from crane.identification.calibration.recording_case import RecordingCase, recording_case
-from crane.identification.calibration.unknowns import Unknown, build_unknowns
+from crane.identification.calibration.unknowns import Unknown, build_unknowns, candidate_parameters
 from crane.machine.machine import Machine
 from crane.recordings.logs import read_log_columns
 from crane.recordings.recording import IDEAL_SENSORS, SENSORS_NOTE
@@ -123,8 +119,14 @@ def calibrate(
     automatic = AUTO in requested
     if requested.pop(AUTO, None) is not None:
         raise InputError(f"'{AUTO}' chooses parameters by itself, give it no start")
+    sensor_names = [name for name in requested if name.startswith(SENSOR_PREFIX)]
     for path, case in zip((*paths, *validation), cases, strict=True):
-        _check_sensor_parameters(path, case.table, requested)
+        if sensor_names and case.table.notes.get(SENSORS_NOTE) == IDEAL_SENSORS:
+            raise InputError(
+                f"{path}: '{sensor_names[0]}' cannot be fitted to quantities, which its note "
+                f"'{SENSORS_NOTE}: {IDEAL_SENSORS}' says they are: give the readings, or remove "
+                "the note if they are"
+            )
     variants = MachineVariants(machine)
     parameters = variants.values | sensor_parameters(cases[0].known_sensors)
     units = {
@@ -140,7 +142,7 @@ def calibrate(
     used_names = {name for x in unknowns for name in (x.name, *dict(x.members))}
     proposed = {x.name: x for x in candidate_parameters(machine, cases, parameters)}
     extras = [
-        replace(x, scale=proposed[x.name].std, prior=1.0)
+        replace(x, scale=proposed[x.name].scale, prior=1.0)
         for x in unknowns_for({x.name: (x.start, x.low, x.high) for x in proposed.values()})
         if not used_names & {x.name, *dict(x.members)}
     ]
@@ -201,17 +203,6 @@ def _read_cases(
     return cases
 
 
-def _check_sensor_parameters(path: str | Path, table: Table, fit: Iterable[str]) -> None:
-    """Check that sensor parameters are fitted to readings, not to ideal quantities."""
-    for name in fit:
-        if name.startswith(SENSOR_PREFIX) and table.notes.get(SENSORS_NOTE) == IDEAL_SENSORS:
-            raise InputError(
-                f"{path}: '{name}' cannot be fitted to quantities, which its note "
-                f"'{SENSORS_NOTE}: {IDEAL_SENSORS}' says they are: give the readings, or remove "
-                "the note if they are"
-            )
-
-
 def _machine_with_sensors(
     machine: Machine,
     known: Mapping[str, Sensor],
@@ -223,8 +214,7 @@ def _machine_with_sensors(
     for line in read_log_columns(Path(columns))[1] if columns is not None else ():
         name, unit = parse_heading(line.heading)
         if quantity_unit(machine.tree, name) is not None:
-            known_sensor = sensors.get(name, Sensor())
-            sensors[name] = replace(known_sensor, column=line.expression, unit=unit)
+            sensors[name] = replace(sensors.get(name, Sensor()), column=line.expression, unit=unit)
     sensor_changes = {
         name: value for name, value in changes.items() if name.startswith(SENSOR_PREFIX)
     }
@@ -241,11 +231,11 @@ def _read_case(
     try:
         compared = simulated_columns(machine, table)
         for name in sensors or ():
-            if name not in compared:
-                raise InputError(f"'{name}' cannot be compared, {known_names(compared, name)}")
+            check_name(name, compared, f"'{name}' cannot be compared")
         compared = compared if sensors is None else list(sensors)
-        known = known_sensors(table, machine)
-        return recording_case(machine, Path(path).name, table, known, compared, window)
+        return recording_case(
+            machine, Path(path).name, table, known_sensors(table, machine), compared, window
+        )
     except RecordingError as error:
         raise RecordingError(prefix_location(str(path), error)) from None
 
@@ -260,7 +250,10 @@ def _calibration_result(
     unknowns, z, covariance = problem.unknowns, estimate.z, estimate.covariance
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     values = problem.values(z)
-    correlation = _correlation_matrix(covariance, len(unknowns))
+    divisors = np.where(deviations > 0, deviations, np.inf)[: len(unknowns)]
+    correlation = covariance[: len(unknowns), : len(unknowns)] / np.outer(divisors, divisors)
+    pairs = np.argwhere(np.abs(np.tril(correlation, -1)) > _MAX_CORRELATION).tolist()
+    correlated = [(unknowns[j].name, unknowns[i].name, float(correlation[i, j])) for i, j in pairs]
     fitted = []
     for i, unknown in enumerate(unknowns):
         value, scale = values[unknown.name], unknown.scale
@@ -299,28 +292,12 @@ def _calibration_result(
         tuple(fitted),
         tuple(channels),
         problem.changes(z),
-        tuple(_correlated_pairs(unknowns, correlation)),
+        tuple(sorted(correlated, key=lambda pair: -abs(pair[2]))),
         problem.simulation_count,
         correlation=correlation,
         states=simulated_states(problem, z),
         is_lowest_minimum=estimate.is_lowest_minimum,
     )
-
-
-def _correlation_matrix(covariance: Array, count: int) -> Array:
-    """Correlations (n, n) of the first n unknowns; 0 if a variance is zero."""
-    deviations = np.sqrt(np.maximum(np.diag(covariance)[:count], 0.0))
-    divisors = np.where(deviations > 0, deviations, np.inf)
-    return covariance[:count, :count] / np.outer(divisors, divisors)
-
-
-def _correlated_pairs(
-    unknowns: Sequence[Unknown], correlation: Array
-) -> list[tuple[str, str, float]]:
-    """Strongly correlated pairs of parameters, with their correlation."""
-    pairs = np.argwhere(np.abs(np.tril(correlation, -1)) > _MAX_CORRELATION).tolist()
-    found = [(unknowns[j].name, unknowns[i].name, float(correlation[i, j])) for i, j in pairs]
-    return sorted(found, key=lambda pair: -abs(pair[2]))
 
 
 def simulated_states(problem: CalibrationProblem, z: Array) -> dict[str, Mapping[str, Array]]:

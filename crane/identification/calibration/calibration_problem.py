@@ -90,8 +90,7 @@ class CalibrationProblem:
 
     def fitted_machine(self, z: Array) -> Machine:
         """The machine and its sensors with the changed parameters."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             return self._variants.machine(self.changes(z))
 
     def simulated_machine(self, z: Array, friction_smoothing: float) -> Machine:
@@ -100,25 +99,20 @@ class CalibrationProblem:
             x: value for x, value in self.changes(z).items() if not x.startswith(SENSOR_PREFIX)
         }
         key = friction_smoothing, *changes.values()
-        if key not in self._machine_cache:
-            if len(self._machine_cache) >= _MAX_CACHED_MACHINES:
-                self._machine_cache.clear()
-            self._machine_cache[key] = self._build_machine(changes, friction_smoothing)
-        return self._machine_cache[key]
-
-    def _build_machine(self, changes: Mapping[str, float], friction_smoothing: float) -> Machine:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        if key in self._machine_cache:
+            return self._machine_cache[key]
+        if len(self._machine_cache) >= _MAX_CACHED_MACHINES:
+            self._machine_cache.clear()
+        with warnings.catch_warnings(action="ignore"):
             machine = self._variants.machine(changes) if changes else self.machine
-        if not friction_smoothing:
-            return machine
-        friction = dict(machine.friction)
-        for joint in (machine.joints[i] for i in find_stick_slip_columns(machine)):
-            law = friction.get(joint, Friction())
-            friction[joint] = replace(
-                law, smoothing=friction_smoothing * _FRICTION_SMOOTHING[machine.unit(joint)]
-            )
-        return machine.replace(friction=friction)
+        if friction_smoothing:
+            friction = dict(machine.friction)
+            for joint in (machine.joints[i] for i in find_stick_slip_columns(machine)):
+                width = friction_smoothing * _FRICTION_SMOOTHING[machine.unit(joint)]
+                friction[joint] = replace(friction.get(joint, Friction()), smoothing=width)
+            machine = machine.replace(friction=friction)
+        self._machine_cache[key] = machine
+        return machine
 
     def simulate_readings(self, case: RecordingCase, z: Array, training_only: bool) -> CubicSpline:
         """Simulated ideal readings of a recording's sensors over time.
@@ -135,8 +129,7 @@ class CalibrationProblem:
         inputs = self._inputs_with_start(case, z)
         machine = self.simulated_machine(z, self.smooth)
         step, steps = _step_size_and_count(case, _MAX_STEP, training_only)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             run = simulate(
                 machine, inputs.valve_drive(machine), inputs.initial, steps * step, step
             )
@@ -144,12 +137,9 @@ class CalibrationProblem:
 
     def _inputs_with_start(self, case: RecordingCase, z: Array) -> ReplayInputs:
         """Inputs with the start and the sensors of the unknowns."""
-        start_changes = (
-            case.start_std
-            * z[case.first_start_index : case.first_start_index + len(case.start_std)]
-        )
-        inputs, n = case.inputs, len(self.machine.active)
-        values = self.values(z)
+        start = slice(case.first_start_index, case.first_start_index + len(case.start_std))
+        start_changes = case.start_std * z[start]
+        inputs, n, values = case.inputs, len(self.machine.active), self.values(z)
         initial = inputs.initial
         if initial is not None:
             low, high = self.machine.lower, self.machine.upper
@@ -164,18 +154,14 @@ class CalibrationProblem:
             name: self._fitted_sensor(case, VALVE_SIGNAL_PREFIX + name, values).apply(x)
             for name, x in inputs.signals.items()
         }
-        pairs = start_changes.reshape(-1, 2)
+
+        def pressure(name: str, measured: float, change: float) -> float:
+            corrected = self._corrected_quantity(case, f"pressure_{name}", measured, values)
+            return max(corrected + change, 0.0)
+
+        pairs = start_changes.reshape(-1, 2).tolist()
         pressures = {
-            joint: (
-                max(
-                    self._corrected_quantity(case, f"pressure_{joint}_a", a, values) + float(da),
-                    0.0,
-                ),
-                max(
-                    self._corrected_quantity(case, f"pressure_{joint}_b", b, values) + float(db),
-                    0.0,
-                ),
-            )
+            joint: (pressure(f"{joint}_a", a, da), pressure(f"{joint}_b", b, db))
             for (joint, (a, b)), (da, db) in zip(inputs.pressures.items(), pairs, strict=True)
         }
         return replace(inputs, initial=initial, pressures=pressures, signals=signals)
@@ -186,12 +172,8 @@ class CalibrationProblem:
         """Sensor with its fitted parameters."""
         known = case.known_sensors.get(name, Sensor())
         names = [f"{SENSOR_PREFIX}{name}.{what}" for what in SENSOR_PARAMETER_DEFAULTS]
-        fitted_parameters = {x: values[x] for x in names if x in values}
-        return (
-            with_sensor_parameters({name: known}, fitted_parameters)[name]
-            if fitted_parameters
-            else known
-        )
+        fitted = {x: values[x] for x in names if x in values}
+        return with_sensor_parameters({name: known}, fitted)[name] if fitted else known
 
     def _corrected_quantity(
         self, case: RecordingCase, name: str, x: float, values: Mapping[str, float]
@@ -199,10 +181,6 @@ class CalibrationProblem:
         """Quantity x, corrected from the known sensor to the fitted one."""
         reading = case.known_sensors.get(name, Sensor()).apply(x)
         return self._fitted_sensor(case, name, values).invert(reading)
-
-    def _start_depends_on(self, name: str) -> bool:
-        """Whether the start depends on a sensor."""
-        return name in self.machine.active or name.startswith("pressure_")
 
     def _sensor_readings(
         self, case: RecordingCase, curve: CubicSpline, z: Array
@@ -215,7 +193,7 @@ class CalibrationProblem:
         undistorted = np.empty((len(time), len(delays)))
         for k, delay in enumerate(delays):
             undistorted[:, k] = curve(np.clip(time - delay, 0.0, last))[:, k]
-        min_derivative_smoothing: dict[int, Array] = {}
+        derivatives: dict[int, Array] = {}
         for i, unknown in enumerate(self.unknowns):
             if unknown.sensor not in case.sensors:
                 continue
@@ -229,8 +207,8 @@ class CalibrationProblem:
                 derivative[:, k] = (
                     -scales[k] * curve.derivative()(delayed_time)[:, k] * (time > delays[k])
                 )
-            min_derivative_smoothing[i] = derivative * unknown.scale
-        return undistorted * scales + zeros, min_derivative_smoothing
+            derivatives[i] = derivative * unknown.scale
+        return undistorted * scales + zeros, derivatives
 
     def residuals(self, case: RecordingCase, z: Array, training_only: bool = False) -> Array:
         """Residuals (N, k): simulated minus measured readings.
@@ -244,10 +222,8 @@ class CalibrationProblem:
         Raises:
             CraneError: See `simulate_readings`.
         """
-        return (
-            self._sensor_readings(case, self.simulate_readings(case, z, training_only), z)[0]
-            - case.measured
-        )
+        curve = self.simulate_readings(case, z, training_only)
+        return self._sensor_readings(case, curve, z)[0] - case.measured
 
     def linearize(
         self, case: RecordingCase, z: Array, fixed_unknowns: Set[int] = frozenset()
@@ -266,16 +242,18 @@ class CalibrationProblem:
         """
         self.simulation_count += 1
         friction_smoothing = max(self.smooth, self.slopes)
-        machine, inputs = (
-            self.simulated_machine(z, friction_smoothing),
-            self._inputs_with_start(case, z),
-        )
+        machine = self.simulated_machine(z, friction_smoothing)
+        inputs = self._inputs_with_start(case, z)
         drive, dynamics = inputs.valve_drive(machine), Dynamics(machine)
         step, steps = _step_size_and_count(case, _MAX_SENSITIVITY_STEP, True)
         start_unknowns = case.first_start_index + np.flatnonzero(case.start_std)
         varied_unknowns = [i for i in range(len(self.unknowns)) if i not in fixed_unknowns]
+        # compared sensors affect the simulation only if its start depends on them
+        output_sensors = {
+            x for x in case.sensors if x not in machine.active and not x.startswith("pressure_")
+        }
         simulated_unknowns = [
-            i for i in varied_unknowns if self._affects_simulation(case, self.unknowns[i].sensor)
+            i for i in varied_unknowns if self.unknowns[i].sensor not in output_sensors
         ]
         simulated_unknowns += start_unknowns.tolist()
         links = [link for link, _ in observed_frames(machine, case.sensors)]
@@ -290,26 +268,23 @@ class CalibrationProblem:
             return base, SimulationConstants(*(np.array(x) for x in zip(*every, strict=True)))
 
         motion = SimulationProblem(dynamics, drive, initial, steps, step)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            solution = integrate_sensitivities(
+        with warnings.catch_warnings(action="ignore"):
+            run_motion, derivatives = integrate_sensitivities(
                 motion,
                 case.sensors,
                 setup,
                 np.ones(len(simulated_unknowns)),
                 self.derivative_tolerance,
             )
-            run = recording_of(machine, drive, solution.time, solution.parts, "")
-        curve = CubicSpline(solution.time, read_simulation(machine, run, case.sensors))
+            run_time = run_motion.time[::2]
+            run = recording_of(machine, drive, run_time, run_motion.parts, "")
+        curve = CubicSpline(run_time, read_simulation(machine, run, case.sensors))
         readings, sensor_derivatives = self._sensor_readings(case, curve, z)
         jacobian = np.zeros((*readings.shape, self.unknown_count))
-        sensors = [self._fitted_sensor(case, name, self.values(z)) for name in case.sensors]
-        sensitivity_curve, last = (
-            CubicSpline(solution.time, solution.derivatives),
-            solution.time[-1],
-        )
-        for k, sensor in enumerate(sensors):
-            delayed_time = np.clip(case.inputs.time - sensor.delay, 0.0, last)
+        sensitivity_curve = CubicSpline(run_time, derivatives)
+        for k, name in enumerate(case.sensors):
+            sensor = self._fitted_sensor(case, name, self.values(z))
+            delayed_time = np.clip(case.inputs.time - sensor.delay, 0.0, run_time[-1])
             jacobian[:, k, simulated_unknowns] = (
                 sensor.scale * sensitivity_curve(delayed_time)[:, k]
             )
@@ -320,10 +295,6 @@ class CalibrationProblem:
         ):
             return self.residuals(case, z, training_only=True), jacobian
         return readings - case.measured, jacobian
-
-    def _affects_simulation(self, case: RecordingCase, sensor: str) -> bool:
-        """Whether an unknown of a sensor, or of the machine (""), affects the simulation."""
-        return not sensor or sensor not in case.sensors or self._start_depends_on(sensor)
 
     def _setup_derivative(
         self,

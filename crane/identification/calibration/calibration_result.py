@@ -374,7 +374,13 @@ def _residual_dependence(
     is_moving = np.abs(speed) > _REST_SPEED_SHARE * np.abs(speed).max()
     motion = {"speed": speed, "pressure": pressure, "direction": np.sign(speed) * is_moving}
     correlation_ratios = {what: correlation_ratio(residual, x) for what, x in motion.items()}
-    speed_unit = VELOCITY_UNITS[calibration.machine.unit(drive)]
     return ResidualDependence(
-        name, unit, residual, drive, speed_unit, chamber, motion, correlation_ratios
+        name,
+        unit,
+        residual,
+        drive,
+        VELOCITY_UNITS[calibration.machine.unit(drive)],
+        chamber,
+        motion,
+        correlation_ratios,
     )

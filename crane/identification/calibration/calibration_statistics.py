@@ -18,10 +18,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crane.common.errors import CraneError
+from crane.common.errors import CraneError, InputError
 from crane.common.samples import Array
 from crane.identification.calibration.calibration_problem import CalibrationProblem
-from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt
+from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt, Progress
 from crane.identification.calibration.unknowns import Unknown
 
 _LOWER_MINIMUM_SHARE = 5e-2  # relative difference of the cost of a lower minimum
@@ -37,6 +37,8 @@ _MIN_COMPONENT = 0.25  # relative to the largest component of a direction
 _MIN_COST_REDUCTION = 0.03  # of the cost, that is reported
 _MAX_REPORTED = 5  # results that are reported
 _MAX_STEP = 2.0  # standard deviations of a change
+# without stiffness the damping has no effect
+_STIFFNESS_SUFFIX, _DAMPING_SUFFIX = ".stiffness", ".damping"
 _MIN_INDEPENDENT_SHARE = 1e-6  # part of a derivative that is independent of the fitted parameters
 
 
@@ -241,7 +243,13 @@ class ScoreTestResult:
 def score_tests(
     search: LevenbergMarquardt, candidates: Sequence[Unknown], z: Array
 ) -> list[ScoreTestResult]:
-    """Score tests of parameters that are not fitted, at the minimum z (p,) of a search."""
+    """Score tests of parameters that are not fitted, in descending order of cost reduction.
+
+    Args:
+        search: A search at its minimum.
+        candidates: The parameters, with their standard deviations as scales.
+        z: (p,) the minimum.
+    """
     problem = search.problem
     if not candidates:
         return []
@@ -260,28 +268,10 @@ def score_tests(
         except CraneError:  # the tests are optional
             return []
         weighted = (derivatives * search.channel_weights(case)[:, :, None])[case.train_mask]
-        columns = weighted[:, :, count : count + candidate_count]
-        rows.append(columns.reshape(-1, candidate_count))
-    return score_test(candidates, search.jacobian, np.vstack(rows), search.residual, search.prior)
-
-
-def score_test(
-    candidates: Sequence[Unknown],
-    jacobian: Array,
-    candidate_jacobian: Array,
-    residual: Array,
-    prior: Array,
-) -> list[ScoreTestResult]:
-    """Score tests of parameters that are not fitted, in descending order of cost reduction.
-
-    Args:
-        candidates: The parameters, with their standard deviations as scales.
-        jacobian: (M, p) weighted derivatives by the fitted unknowns.
-        candidate_jacobian: (M, k) weighted derivatives by the candidates.
-        residual: (M,) weighted residuals.
-        prior: (p,) one over the standard deviations of the fitted unknowns.
-    """
-    inverse = np.linalg.pinv(jacobian.T @ jacobian + np.diag(prior**2), hermitian=True)
+        rows.append(weighted[:, :, count : count + candidate_count].reshape(-1, candidate_count))
+    jacobian, candidate_jacobian = search.jacobian, np.vstack(rows)
+    residual = search.residual
+    inverse = np.linalg.pinv(jacobian.T @ jacobian + np.diag(search.prior**2), hermitian=True)
     independent_columns = candidate_jacobian - jacobian @ (
         inverse @ (jacobian.T @ candidate_jacobian)
     )
@@ -299,5 +289,54 @@ def score_test(
         gain = -(2.0 * step * gradient + step**2 * size) / max(float(residual @ residual), 1e-300)
         value = candidate.start + candidate.scale * float(step)
         found.append(ScoreTestResult(candidate.name, value, float(gain)))
-    ranked = sorted(found, key=lambda one: -one.cost_reduction)
-    return [one for one in ranked if one.cost_reduction > _MIN_COST_REDUCTION][:_MAX_REPORTED]
+    return [
+        one
+        for one in sorted(found, key=lambda one: -one.cost_reduction)
+        if one.cost_reduction > _MIN_COST_REDUCTION
+    ][:_MAX_REPORTED]
+
+
+def select_parameters(
+    problem: CalibrationProblem, progress: Progress | None
+) -> tuple[CalibrationProblem, LevenbergMarquardt, list[str]]:
+    """Fit all parameters with their priors, and remove those without an effect.
+
+    A parameter is removed if it stays on a bound at the value of the machine: no air, no leakage,
+    no delay, or a rigid structure.
+
+    Args:
+        problem: Problem of all candidates; parameters without a prior are always kept.
+        progress: See `calibrate`.
+
+    Returns:
+        Problem of the kept parameters, a search that continues from the fit, and names of the
+        removed parameters.
+
+    Raises:
+        InputError: No parameter is kept.
+    """
+    search = LevenbergMarquardt(problem, progress)
+    z, unknowns = search.smoothed_minimum(), problem.unknowns
+    excluded = set()
+    for i, unknown in enumerate(unknowns):
+        rigid = dict(unknown.members).get(unknown.name) == 0.0 and unknown.start > 0.0
+        if unknown.prior and (z[i] == 0.0 or rigid and z[i] >= search.high[i]):
+            excluded.add(unknown.name)
+    excluded_springs = [
+        name.removesuffix(_STIFFNESS_SUFFIX)
+        for name in excluded
+        if name.endswith(_STIFFNESS_SUFFIX)
+    ]
+    excluded |= {x.name for x in unknowns if x.prior} & {
+        name + _DAMPING_SUFFIX for name in excluded_springs
+    }
+    included = [i for i, unknown in enumerate(unknowns) if unknown.name not in excluded]
+    if not included:
+        raise InputError("the recordings determine no parameter: move more, or name parameters")
+    reduced_problem = CalibrationProblem(
+        problem.machine, [unknowns[i] for i in included], problem.cases
+    )
+    reduced_problem.simulation_count = problem.simulation_count
+    initial_unknowns = np.concatenate([z[included], z[len(unknowns) :]])
+    names = [unknown.name for unknown in unknowns if unknown.name in excluded]
+    return reduced_problem, search.restricted_search(reduced_problem, initial_unknowns), names

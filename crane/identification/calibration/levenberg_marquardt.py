@@ -43,6 +43,7 @@ class LevenbergMarquardt:
 
     Attributes:
         problem: The calibration problem.
+        training_cases: Recordings with training data.
         channel_scales: Channel scales by sensor.
         jacobian: (M, p) weighted derivatives of the training data at the minimum.
         residual: (M,) weighted residuals, likewise.
@@ -62,6 +63,8 @@ class LevenbergMarquardt:
             [(x.high - x.start) / x.scale for x in unknowns] + [np.inf] * start_count
         )
         self.prior = np.array([x.prior for x in unknowns] + [1.0] * start_count)
+        self.training_cases = [case for case in problem.cases if case.train_mask.any()]
+        self._scale_bounds = self._channel_scale_bounds()
         self.channel_scales: dict[str, float] = {}
         self.jacobian = self.residual = self.blocks = np.zeros(0)
         self._iteration_count = iteration_count
@@ -88,11 +91,9 @@ class LevenbergMarquardt:
     def smoothed_minimum(self) -> Array:
         """Approximate minimum with smoothed friction, and the linearization there."""
         problem = self.problem
-        self.channel_scales = self._max_channel_scales()
-        problem.smooth, problem.derivative_tolerance = (
-            float(self._has_stiction),
-            _COARSE_DERIVATIVE_TOLERANCE,
-        )
+        self.channel_scales = {name: most for name, (_, most) in self._scale_bounds.items()}
+        problem.smooth = float(self._has_stiction)
+        problem.derivative_tolerance = _COARSE_DERIVATIVE_TOLERANCE
         z = self._best_initial_minimum(np.zeros(problem.unknown_count))
         self.channel_scales = self._updated_channel_scales(z)
         z = self._minimize(z, _INITIAL_COST_TOLERANCE)
@@ -117,21 +118,19 @@ class LevenbergMarquardt:
             self._progress(1.0)
         return z
 
-    def _max_channel_scales(self) -> dict[str, float]:
-        """Largest scale of each channel, by its variation and its noise."""
-        noise, spread = self._channel_noise(), self._channel_variation()
-        return {name: max(noise[name], _MAX_SCALE_SHARE * spread[name]) for name in noise}
-
     def _updated_channel_scales(self, z: Array) -> dict[str, float]:
-        """Channel scales by the residuals."""
-        noise, max_scales = self._channel_noise(), self._max_channel_scales()
-        residual_rms = self._channel_rms(
-            [self.problem.residuals(case, z) for case in self.training_cases]
-        )
-        return {
-            name: min(max(noise[name], residual_rms[name]), max_scales[name])
-            for name in residual_rms
-        }
+        """Channel scales by the residuals of the training data."""
+        residuals: dict[str, list[Array]] = {}
+        for case in self.training_cases:
+            residual = self.problem.residuals(case, z)[case.train_mask]
+            for name, x in zip(case.sensors, residual.T, strict=True):
+                residuals.setdefault(name, []).append(x)
+        scales = {}
+        for name, parts in residuals.items():
+            rms = max(float(np.sqrt(np.mean(np.concatenate(parts) ** 2))), _MIN_SCALE)
+            least, most = self._scale_bounds[name]
+            scales[name] = min(max(least, rms), most)
+        return scales
 
     def _best_initial_minimum(self, z: Array) -> Array:
         """The better of two minima: from the initial parameters, and from a fit to short parts.
@@ -140,8 +139,7 @@ class LevenbergMarquardt:
         """
         problem, count = self.problem, len(self.problem.unknowns)
         minima = [self._minimize(z, _INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING)]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             parts = [
                 x
                 for case in self.training_cases
@@ -149,10 +147,8 @@ class LevenbergMarquardt:
             ]
         if parts:
             part_problem = CalibrationProblem(problem.machine, problem.unknowns, parts)
-            part_problem.smooth, part_problem.derivative_tolerance = (
-                problem.smooth,
-                problem.derivative_tolerance,
-            )
+            part_problem.smooth = problem.smooth
+            part_problem.derivative_tolerance = problem.derivative_tolerance
             search = LevenbergMarquardt(part_problem, self._progress, self._iteration_count)
             search.channel_scales = self.channel_scales
             part_minimum = search._minimize(
@@ -166,50 +162,30 @@ class LevenbergMarquardt:
                 minima.append(self._minimize(z, _INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING))
         return min(minima, key=self._cost)
 
-    @property
-    def training_cases(self) -> list[RecordingCase]:
-        """Recordings with training data."""
-        return [case for case in self.problem.cases if case.train_mask.any()]
+    def _channel_scale_bounds(self) -> dict[str, tuple[float, float]]:
+        """Least and largest scale of each channel.
 
-    def _channel_noise(self) -> dict[str, float]:
-        """Noise of each channel, by third differences, with a lower bound by its digits."""
+        The least is its noise, by third differences, with a lower bound by its digits. The largest
+        is by the largest variation of all channels in the same unit: model errors depend on the
+        motion, not on the channel.
+        """
         variances: dict[str, list[float]] = {}
-        largest: dict[str, float] = {}
+        digits, variation = dict[str, float](), dict[str, float]()
+        units: dict[str, str] = {}
         for case in self.training_cases:
             for name, x in zip(case.sensors, case.measured.T, strict=True):
                 known_noise = case.known_sensors[name].noise if name in case.known_sensors else 0.0
                 variances.setdefault(name, []).append((known_noise or noise_std(x)) ** 2)
-                largest[name] = max(largest.get(name, 0.0), float(np.abs(x).max()))
-        return {
-            name: max(float(np.sqrt(np.mean(x))), _MIN_RELATIVE_SCALE * largest[name], _MIN_SCALE)
-            for name, x in variances.items()
-        }
-
-    def _channel_variation(self) -> dict[str, float]:
-        """Variation of each channel: the largest of all channels in the same unit.
-
-        Model errors depend on the motion, not on the channel.
-        """
-        variation_by_unit: dict[str, float] = {}
-        units: dict[str, str] = {}
-        for case in self.training_cases:
-            for name, x in zip(case.sensors, case.measured[case.train_mask].T, strict=True):
-                units[name] = case.table.units[name]
-                variation_by_unit[units[name]] = max(
-                    variation_by_unit.get(units[name], 1e-12), float(np.std(x))
-                )
-        return {name: variation_by_unit[unit] for name, unit in units.items()}
-
-    def _channel_rms(self, residuals: list[Array]) -> dict[str, float]:
-        """Root mean square residual of each channel over the training data."""
-        residuals_by_channel: dict[str, list[Array]] = {}
-        for case, residual in zip(self.training_cases, residuals, strict=True):
-            for name, x in zip(case.sensors, residual[case.train_mask].T, strict=True):
-                residuals_by_channel.setdefault(name, []).append(x)
-        return {
-            name: max(float(np.sqrt(np.mean(np.concatenate(x) ** 2))), _MIN_SCALE)
-            for name, x in residuals_by_channel.items()
-        }
+                smallest = _MIN_RELATIVE_SCALE * float(np.abs(x).max())
+                digits[name] = max(digits.get(name, _MIN_SCALE), smallest)
+                unit = units[name] = case.table.units[name]
+                spread = float(np.std(x[case.train_mask]))
+                variation[unit] = max(variation.get(unit, 1e-12), spread)
+        bounds = {}
+        for name, squares in variances.items():
+            least = max(float(np.sqrt(np.mean(squares))), digits[name])
+            bounds[name] = least, max(least, _MAX_SCALE_SHARE * variation[units[name]])
+        return bounds
 
     def channel_weights(self, case: RecordingCase) -> Array:
         """Weights (N, k): one over the channel scales, 0 for held-out data."""
@@ -223,36 +199,28 @@ class LevenbergMarquardt:
         Raises:
             CraneError: The machine is not valid, or its simulation fails.
         """
-        residuals = [
-            self.problem.residuals(case, z, training_only=True) * self.channel_weights(case)
-            for case in self.training_cases
-        ]
-        return np.concatenate(
-            [
-                left[case.train_mask].ravel()
-                for left, case in zip(residuals, self.training_cases, strict=True)
-            ]
-        )
+        parts = []
+        for case in self.training_cases:
+            residuals = self.problem.residuals(case, z, training_only=True)
+            parts.append((residuals * self.channel_weights(case))[case.train_mask].ravel())
+        return np.concatenate(parts)
 
     def _cost(self, z: Array) -> float:
         """Half the sum of squares, infinite if the simulation fails."""
         total = float(np.sum((self.prior * z) ** 2))
         for case in self.training_cases:
             try:
-                residual = self.problem.residuals(
-                    case, z, training_only=True
-                ) * self.channel_weights(case)
+                residual = self.problem.residuals(case, z, training_only=True)
             except CraneError:
                 return np.inf
-            total += float(np.sum(residual**2))
+            total += float(np.sum((residual * self.channel_weights(case)) ** 2))
         return 0.5 * total
 
     def _linearize(self, z: Array) -> None:
         rows, weighted, blocks = [], [], []
         for number, case in enumerate(self.training_cases):
             residual, derivatives = self.problem.linearize(case, z)
-            weights = self.channel_weights(case)
-            mask = case.train_mask
+            weights, mask = self.channel_weights(case), case.train_mask
             rows.append(
                 (derivatives * weights[:, :, None])[mask].reshape(-1, self.problem.unknown_count)
             )
@@ -278,7 +246,9 @@ class LevenbergMarquardt:
             while True:
                 trial = self._step(z, hessian, gradient, damping)
                 trial_cost = self._cost(trial)
-                self._report_progress()
+                self._iteration_count += 1
+                if self._progress is not None:
+                    self._progress(1.0 - 0.97**self._iteration_count)
                 if trial_cost < cost:
                     z, cost, damping = trial, trial_cost, max(damping * _DAMPING_DECREASE, 1e-9)
                     break
@@ -311,11 +281,6 @@ class LevenbergMarquardt:
             free &= ~outside
         return np.clip(z + step, self.low, self.high)
 
-    def _report_progress(self) -> None:
-        self._iteration_count += 1
-        if self._progress is not None:
-            self._progress(1.0 - 0.97**self._iteration_count)
-
     def covariance(self, z: Array) -> tuple[Array, int]:
         """Covariance (p, p) of the scaled unknowns, and the number of blocks.
 
@@ -324,11 +289,9 @@ class LevenbergMarquardt:
         """
         hessian = self.jacobian.T @ self.jacobian + np.diag(self.prior**2)
         inverse = np.linalg.pinv(hessian, rcond=1e-13, hermitian=True)
-        length, count = self._block_duration()
-        numbers = np.unique(np.floor(self.blocks / length), return_inverse=True)[1]
-        row_gradients = self.jacobian * self.residual[:, None]
+        numbers = np.unique(np.floor(self.blocks / self._block_duration()), return_inverse=True)[1]
         sums = np.zeros((numbers.max() + 1, len(z)))
-        np.add.at(sums, numbers, row_gradients)
+        np.add.at(sums, numbers, self.jacobian * self.residual[:, None])
         count = len(sums)
         meat = sums.T @ sums * (count / max(count - 1, 1)) + np.diag(self.prior**2)
         robust = inverse @ meat @ inverse
@@ -337,25 +300,20 @@ class LevenbergMarquardt:
         inflation = np.sqrt(np.maximum(np.diag(white) / np.maximum(np.diag(robust), 1e-300), 1.0))
         return robust * np.outer(inflation, inflation), count
 
-    def _block_duration(self) -> tuple[float, int]:
-        """Duration of a block [s], four correlation times of the residuals, and their number."""
-        correlation_time, duration = 0.0, 0.0
+    def _block_duration(self) -> float:
+        """Duration of a block [s], four correlation times of the residuals."""
+        correlation_time = duration = 0.0
+        start = 0
         for case in self.training_cases:
             time = case.inputs.time[case.train_mask]
             duration += float(time[-1] - time[0])
-        start = 0
-        for case in self.training_cases:
-            k, count = len(case.sensors), int(case.train_mask.sum())
-            rows = self.residual[start : start + k * count].reshape(count, k)
-            start += k * count
+            rows = self.residual[start : start + len(time) * len(case.sensors)]
+            start += len(rows)
             step = float(np.median(np.diff(case.inputs.time)))
-            for x in rows.T:
+            for x in rows.reshape(len(time), -1).T:
                 correlation_time = max(correlation_time, step * _correlation_time(x))
-        length = min(
-            max(4.0 * correlation_time, duration / _BLOCK_COUNT_RANGE[1]),
-            duration / _BLOCK_COUNT_RANGE[0],
-        )
-        return max(length, 1e-9), int(duration / length) if length else 1
+        fewest, most = _BLOCK_COUNT_RANGE
+        return max(min(max(4.0 * correlation_time, duration / most), duration / fewest), 1e-9)
 
 
 def _correlation_time(x: Array) -> float:

@@ -1,13 +1,20 @@
 """Unknowns of a calibration: machine parameters, common factors, sensor parameters."""
 
 import fnmatch
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from crane.common.errors import InputError, suggest_names
+import numpy as np
+
+from crane.common.errors import InputError, check_name
 from crane.description.machine_parameters import unknown_parameter_text
-from crane.description.sensors import SENSOR_PREFIX
+from crane.description.sensors import INCLINATION_PREFIX, SENSOR_PREFIX
 from crane.description.specification import MachineSpec
+from crane.hydraulics.components import Spool, Valve
+from crane.hydraulics.hydraulic_circuit import Hydraulics
+from crane.identification.calibration.recording_case import RecordingCase
+from crane.machine.machine import Machine
 
 SENSOR_PARAMETER_DEFAULTS = {"zero": 0.0, "scale": 1.0, "delay": 0.0}
 # scales of sensor zeros
@@ -19,6 +26,18 @@ _SIGNED_PARAMETERS = (
     "x", "y", "z", "roll", "pitch", "yaw", "xx", "xy", "xz", "yy", "yz", "zz", "neutral", "full",
     "lower", "upper", "coulomb_offset", "viscous_offset",
 )  # fmt: skip
+_MIN_SPOOL_STROKE = 0.05  # of the stroke of a spool, from which a valve counts as open
+_MIN_BANDWIDTH, _MAX_BANDWIDTH = 5.0, 200.0  # bandwidths of spools [1/s]
+_DELAY_STD, _MAX_DELAY = 0.1, 0.6  # standard deviation and largest value of delays [s]
+_INCLINATION_ZERO_STD = 0.05  # standard deviation of inclinometer zeros [rad]
+_PRESSURE_ZERO_STD = 2e5  # standard deviation of pressure sensor zeros [Pa]
+_GAS_VOLUME_SHARE = 5e-3  # of the volume of a chamber
+_LEAKAGE_FLOW_SHARE = 1e-2  # of the full flow of a valve at supply pressure
+# orifices of the spools of A and B, by direction
+_ORIFICES_BY_DIRECTION = {1: ("c1", "c2"), -1: ("c3", "c4")}
+# bounds of a stiffness, relative to that of the oil or the known one
+_MAX_STIFFNESS_REDUCTION, _MAX_STIFFNESS_INCREASE = 20.0, 4.0
+_FRICTION_FORCE_SHARE = 2e-2  # of the force of a cylinder at supply pressure
 
 
 @dataclass(frozen=True)
@@ -93,50 +112,47 @@ def _build_unknown(
     sensor_units: Mapping[str, str],
 ) -> Unknown:
     start, low, high = _read_bounds(name, given)
+    members: tuple[tuple[str, float], ...] = ()
+    sensor = ""
     if name.startswith(SENSOR_PREFIX):
-        column, _, what = name.removeprefix(SENSOR_PREFIX).rpartition(".")
-        if column not in sensor_units:
-            raise InputError(f"'{name}' is of no sensor, {suggest_names(sensor_units, column)}")
-        if what not in SENSOR_PARAMETER_DEFAULTS:
-            raise InputError(
-                f"'{name}': a sensor has no '{what}', "
-                f"{suggest_names(SENSOR_PARAMETER_DEFAULTS, what)}"
-            )
+        sensor, _, what = name.removeprefix(SENSOR_PREFIX).rpartition(".")
+        check_name(sensor, sensor_units, f"'{name}' is of no sensor")
+        check_name(what, SENSOR_PARAMETER_DEFAULTS, f"'{name}': a sensor has no '{what}'")
         described = parameters.get(name, SENSOR_PARAMETER_DEFAULTS[what])
-        size = _DELAY_SCALE if what == "delay" else _ZERO_SCALES.get(sensor_units[column], 1.0)
-        size = 0.05 if what == "scale" else size
-        initial = described if start is None else start
-        lower = (0.0 if what == "delay" else -float("inf")) if low is None else low
-        return _bounded_unknown(name, initial, lower, high, size, ((name, described),), column)
-    if "*" in name:
+        zero_scale = _ZERO_SCALES.get(sensor_units[sensor], 1.0)
+        scale = {"delay": _DELAY_SCALE, "scale": 0.05, "zero": zero_scale}[what]
+        if what == "delay" and low is None:
+            low = 0.0
+    elif "*" in name:
         found = {x: parameters[x] for x in fnmatch.filter(parameters, name) if parameters[x]}
         if not found:
             raise InputError(f"'{name}' matches no nonzero parameter of the machine")
-        initial = 1.0 if start is None else start
-        lower = _MIN_SHARE if low is None else low
-        return _bounded_unknown(name, initial, lower, high, 1.0, tuple(found.items()))
-    if name not in parameters:
+        described, scale, members = 1.0, 1.0, tuple(found.items())
+        low = _MIN_SHARE if low is None else low
+    elif name not in parameters:
         raise InputError(unknown_parameter_text(spec, parameters, name))
-    initial = parameters[name] if start is None else start
-    if name.endswith(".delay"):
-        lower = 0.0 if low is None else low
-        return _bounded_unknown(
-            name, initial, lower, high, _DELAY_SCALE, ((name, parameters[name]),)
-        )
-    signed = name.endswith(tuple("." + word for word in _SIGNED_PARAMETERS))
-    if not signed and initial >= 0:
-        low = _MIN_SHARE * initial if low is None else low
-    elif not signed:
-        high = _MIN_SHARE * initial if high is None else high
-    if initial:
-        size = abs(initial)
-    elif low is not None and high is not None:
-        size = high - low
     else:
-        raise InputError(f"'{name}' is 0 initially, give its range: '{name}=0,LOW~HIGH'")
-    if name.endswith((".x", ".y", ".z")):
-        size = min(size, 0.1)
-    return _bounded_unknown(name, initial, low, high, size, ((name, parameters[name]),))
+        described = parameters[name]
+        initial = described if start is None else start
+        scale = abs(initial)
+        if name.endswith(".delay"):
+            scale, low = _DELAY_SCALE, 0.0 if low is None else low
+        elif not name.endswith(tuple("." + word for word in _SIGNED_PARAMETERS)):
+            if initial >= 0:
+                low = _MIN_SHARE * initial if low is None else low
+            else:
+                high = _MIN_SHARE * initial if high is None else high
+        if not scale:
+            if low is None or high is None:
+                raise InputError(f"'{name}' is 0 initially, give its range: '{name}=0,LOW~HIGH'")
+            scale = high - low
+        if name.endswith((".x", ".y", ".z")):
+            scale = min(scale, 0.1)
+    start = float(described if start is None else start)
+    lower, upper = -math.inf if low is None else low, math.inf if high is None else high
+    if not lower < upper or not lower <= start <= upper:
+        raise InputError(f"'{name}': {start:g} does not lie within {lower:g} to {upper:g}")
+    return Unknown(name, start, lower, upper, scale, members or ((name, described),), sensor)
 
 
 def _read_bounds(name: str, given: object) -> tuple[float | None, float | None, float | None]:
@@ -150,17 +166,145 @@ def _read_bounds(name: str, given: object) -> tuple[float | None, float | None, 
     return start, low, high
 
 
-def _bounded_unknown(
-    name: str,
-    start: float,
-    low: float | None,
-    high: float | None,
-    scale: float,
-    members: tuple[tuple[str, float], ...] = (),
-    sensor: str = "",
+def candidate_parameters(
+    machine: Machine, cases: Sequence[RecordingCase], parameters: Mapping[str, float]
+) -> list[Unknown]:
+    """Candidates that recordings of a machine may determine.
+
+    Args:
+        machine: The machine.
+        cases: The recordings.
+        parameters: Parameters of the machine and its sensors by name.
+    """
+    found: list[Unknown] = []
+    for sensor in dict.fromkeys(name for case in cases for name in case.sensors):
+        found += _sensor_candidates(sensor, parameters)
+    hydraulics = machine.hydraulics
+    if hydraulics is None:
+        return found
+    for joint, valve in hydraulics.valves.items():
+        directions = {name: _opening_directions(name, hydraulics, cases) for name in valve.spools}
+        for name, spool in valve.spools.items():
+            if directions[name]:
+                orifice_slice = slice(None)
+                if len(directions) > 1:  # each spool has its own chamber
+                    orifice_slice = slice(0, 1) if spool is valve else slice(1, 2)
+                found += _spool_candidates(spool, parameters, directions[name], orifice_slice)
+        if any(directions.values()):
+            found += _cylinder_candidates(joint, machine, hydraulics, parameters)
+    if parameters.get("payload.mass", 0.0):
+        found.append(_positive_candidate("payload.mass", parameters["payload.mass"], 0.5, 3.0))
+    found.append(_positive_candidate("oil.bulk_modulus", hydraulics.oil.bulk_modulus, 0.5, 5.0))
+    return found
+
+
+def _candidate(
+    name: str, start: float, std: float, low: float = -np.inf, high: float = np.inf
 ) -> Unknown:
-    lower = -float("inf") if low is None else float(low)
-    upper = float("inf") if high is None else float(high)
-    if not lower < upper or not lower <= start <= upper:
-        raise InputError(f"'{name}': {start:g} does not lie within {lower:g} to {upper:g}")
-    return Unknown(name, float(start), lower, upper, scale, members, sensor)
+    """Candidate with the standard deviation of its value in a file as prior."""
+    return Unknown(name, start, low, high, std, prior=1.0)
+
+
+def _positive_candidate(name: str, start: float, relative_std: float, factor: float) -> Unknown:
+    """Positive candidate with a relative standard deviation, bounded by a factor."""
+    return _candidate(name, start, relative_std * start, start / factor, start * factor)
+
+
+def _opening_directions(
+    name: str, hydraulics: Hydraulics, cases: Sequence[RecordingCase]
+) -> set[int]:
+    """Directions in which a spool opens, 1 and -1."""
+    spool = hydraulics.spools[name]
+    signals = [
+        case.inputs.signals[by]
+        for case in cases
+        for by in [name if name in case.inputs.signals else spool.joint]
+        if by in case.inputs.signals
+    ]
+    if not signals:
+        return set()
+    u = (np.concatenate(signals) - spool.neutral) / (spool.full - spool.neutral)
+    return {way for way, most in ((1, u.max()), (-1, -u.min())) if most > _MIN_SPOOL_STROKE}
+
+
+def _sensor_candidates(name: str, parameters: Mapping[str, float]) -> Iterator[Unknown]:
+    zero, delay = (f"{SENSOR_PREFIX}{name}.{what}" for what in ("zero", "delay"))
+    if name.startswith(INCLINATION_PREFIX):
+        yield _candidate(zero, parameters.get(zero, 0.0), _INCLINATION_ZERO_STD)
+    if name.startswith("pressure_"):  # pressure sensors have little delay
+        yield _candidate(zero, parameters.get(zero, 0.0), _PRESSURE_ZERO_STD)
+    else:
+        yield _candidate(delay, parameters.get(delay, 0.0), _DELAY_STD, 0.0, _MAX_DELAY)
+
+
+def _spool_candidates(
+    spool: Valve | Spool,
+    parameters: Mapping[str, float],
+    directions: set[int],
+    orifice_slice: slice,
+) -> Iterator[Unknown]:
+    """Candidates of a spool and of the orifices that it opened."""
+    name = f"valve.{spool.joint}" + ("" if isinstance(spool, Valve) else ".spool_b")
+    drift, dead = 0.02 * abs(spool.full - spool.neutral), spool.dead_band
+    if len(directions) == 2:  # in one direction neutral and dead band are not separable
+        least, most = spool.neutral - 3.0 * drift, spool.neutral + 3.0 * drift
+        yield _candidate(f"{name}.neutral", spool.neutral, drift, least, most)
+    yield _candidate(f"{name}.dead_band", dead, 0.05, max(dead - 0.15, 0.0), dead + 0.15)
+    for orifice in (
+        x
+        for way in sorted(directions, reverse=True)
+        for x in _ORIFICES_BY_DIRECTION[way][orifice_slice]
+    ):
+        parameter = f"valve.{spool.joint}.{orifice}"
+        if parameters[parameter]:
+            yield _positive_candidate(parameter, parameters[parameter], 0.3, 2.5)
+    if spool.bandwidth:
+        low, high = min(spool.bandwidth, _MIN_BANDWIDTH), max(spool.bandwidth, _MAX_BANDWIDTH)
+        yield _candidate(f"{name}.bandwidth", spool.bandwidth, spool.bandwidth, low, high)
+    delay = spool.delay
+    yield _candidate(f"{name}.delay", delay, _DELAY_STD, 0.0, max(delay, _MAX_DELAY))
+
+
+def _cylinder_candidates(
+    joint: str, machine: Machine, hydraulics: Hydraulics, parameters: Mapping[str, float]
+) -> Iterator[Unknown]:
+    cylinder, valve = hydraulics.cylinders[joint], hydraulics.valves[joint]
+    pressure = hydraulics.supply.pressure
+    index = machine.active.index(joint)
+    stroke = 0.0 if cylinder.motor else float(machine.upper[index] - machine.lower[index])
+    friction_force = _FRICTION_FORCE_SHARE * pressure * cylinder.area_a
+    max_speed = valve.c1 * np.sqrt(pressure) / cylinder.area_a
+    for what, size in (("coulomb", friction_force), ("viscous", friction_force / max_speed)):
+        name = f"friction.{joint}.{what}"
+        if name in parameters:
+            start = parameters[name]
+            std = max(3.0 * start, size)
+            yield _candidate(name, start, std, 0.0, start + 5.0 * std)
+    volumes = (
+        cylinder.area_a * stroke + cylinder.hose_a,
+        cylinder.area_b * stroke + cylinder.hose_b,
+    )
+    leakage_coefficient = _LEAKAGE_FLOW_SHARE * valve.c1 / np.sqrt(pressure)
+    for side, volume in zip("ab", volumes, strict=True):
+        hose = f"cylinder.{joint}.hose_{side}"
+        yield _positive_candidate(hose, parameters[hose], 0.5, 3.0)
+        for what, size in (("gas", _GAS_VOLUME_SHARE * volume), ("leakage", leakage_coefficient)):
+            name = f"cylinder.{joint}.{what}_{side}"
+            start = parameters[name]
+            yield _candidate(name, start, max(start, size), 0.0)
+    name = f"cylinder.{joint}.leakage"
+    yield _candidate(name, parameters[name], max(parameters[name], leakage_coefficient), 0.0)
+    if cylinder.motor:  # a motor has no structural compliance
+        return
+    oil = hydraulics.oil.bulk_modulus
+    oil_stiffness = sum(
+        oil * area**2 / volume
+        for area, volume in zip((cylinder.area_a, cylinder.area_b), volumes, strict=True)
+    )
+    name = f"cylinder.{joint}.stiffness"
+    start = parameters[name] or oil_stiffness
+    yield _candidate(
+        name, start, start, start / _MAX_STIFFNESS_REDUCTION, start * _MAX_STIFFNESS_INCREASE
+    )
+    name = f"cylinder.{joint}.damping"
+    yield _positive_candidate(name, parameters[name], 1.0, 20.0)

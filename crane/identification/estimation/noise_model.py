@@ -22,7 +22,6 @@ class NoiseModel:
         a: Coefficients.
         innovations: u (T,) at all instants from the first to the last, nan where unknown.
         first_instant: Number of the first instant.
-        effective_samples: See `Estimate`.
         correlation_time: Correlation time in samples, the sum of the squared autocorrelations at
             all lags (Bartlett 1946), mean S^2 / (mean S)^2 of the spectrum S: 1 for white noise,
             (1 + c^2) / (1 - c^2) for a = (1, -c).
@@ -32,7 +31,6 @@ class NoiseModel:
     a: Array
     innovations: Array
     first_instant: int
-    effective_samples: float
     correlation_time: float
     memory_length: int
 
@@ -44,59 +42,35 @@ class NoiseModel:
         is always stable. For filtered noise that is not decimated (a passband of a tenth of the
         Nyquist frequency), valid intervals need some thousand rows.
         """
-        from scipy.signal import lfilter
-
-        runs = np.split(e, np.flatnonzero(np.diff(samples) != 1) + 1)
+        breaks = np.flatnonzero(np.diff(samples) != 1) + 1
+        runs = np.split(e, breaks)
         a = _burg_coefficients(runs)
         series = np.full(int(samples[-1] - samples[0]) + 1, np.nan)
-        for run, start in zip(runs, _run_starts(samples), strict=True):
+        for run, start in zip(runs, samples[np.append(0, breaks)] - samples[0], strict=True):
             if len(run) >= len(a):
-                u = np.convolve(run, a, mode="valid")
-                series[start + len(a) - 1 : start + len(run)] = u
+                series[start + len(a) - 1 : start + len(run)] = np.convolve(run, a, mode="valid")
         largest = np.abs(np.roots(a)).max() if len(a) > 1 else 0.0
         # for predictable signals, rounding may put a root on the unit circle or beyond
         rate = -math.log(min(max(largest, 1e-3), 1.0))
         memory = len(series) if rate * len(series) <= 20 else math.ceil(20 / rate)
-        # response of e to an impulse in u
-        impulse_response = lfilter([1.0], a, np.eye(1, 4 * memory)[0])
-        # mean of the spectrum, by Parseval, over the spectrum at zero
-        effective = float(
-            len(e) * (impulse_response @ impulse_response) / impulse_response.sum() ** 2
-        )
         gain = np.abs(np.fft.fft(a, _FREQUENCY_COUNT)) ** 2
-        spectrum = gain.min() / gain if gain.min() else np.zeros(0)  # empty for a spectral line
-        correlated = (
-            float(np.mean(spectrum**2) / spectrum.mean() ** 2)
-            if len(spectrum)
-            else float(len(series))
-        )
-        return cls(a, series, int(samples[0]), effective, correlated, memory)
-
-    def zero_state(self, count: int) -> Array:
-        """Initial state of `apply_filter` for a number of signals."""
-        return np.zeros((count, len(self.a) - 1))
-
-    def apply_filter(self, x: Array, state: Array) -> tuple[Array, Array]:
-        """Filter signals (count, N) by a^-1; returns the result and the final state."""
-        from scipy.signal import lfilter
-
-        if len(self.a) == 1:
-            return x, state
-        out, state = lfilter([1.0], self.a, x, zi=state)
-        return out, state
+        correlated = float(len(series))  # of a spectral line
+        if gain.min():
+            spectrum = gain.min() / gain
+            correlated = float(np.mean(spectrum**2) / spectrum.mean() ** 2)
+        return cls(a, series, int(samples[0]), correlated, memory)
 
 
 def _burg_coefficients(runs: list[Array]) -> Array:
     """Coefficients 1, a_1, ... of the order with the smallest Bayesian information criterion."""
     count = sum(map(len, runs))
-    longest = min(_MAX_ORDER, count // 10)
     power = sum(run @ run for run in runs) / count
     a = best = np.ones(1)
     if power == 0:
         return best
     lowest = math.log(power)
     forward, backward = list(runs), list(runs)
-    for order in range(1, longest + 1):
+    for order in range(1, min(_MAX_ORDER, count // 10) + 1):
         forward, backward = (
             [f[1:] for f in forward if len(f) > 1],
             [b[:-1] for b in backward if len(b) > 1],
@@ -129,15 +103,8 @@ def innovation_covariance(noises: list[NoiseModel]) -> Array:
         row[noise.first_instant - start :][: len(noise.innovations)] = noise.innovations
     is_known = np.isfinite(u).astype(np.float64)
     u = np.nan_to_num(u)
-    S = (u @ u.T) / np.maximum(is_known @ is_known.T, 1)
-    values, vectors = np.linalg.eigh(S)
+    values, vectors = np.linalg.eigh((u @ u.T) / np.maximum(is_known @ is_known.T, 1))
     return (vectors * np.maximum(values, 0)) @ vectors.T
-
-
-def _run_starts(samples: np.ndarray) -> np.ndarray:
-    """Starts of runs without missing rows, counted from the first instant."""
-    breaks = np.flatnonzero(np.diff(samples) != 1) + 1
-    return samples[np.append(0, breaks)] - samples[0]
 
 
 class Jackknife:
@@ -158,6 +125,9 @@ class Jackknife:
         noises: Noise models of the joints, for their correlation times.
         size: Number of parameters p.
 
+    Attributes:
+        degrees_of_freedom: K - 1.
+
     Source: MacKinnon, Nielsen, Webb 2023, J. Applied Econometrics 38(5): CV3; Kuensch 1989, Annals
     of Statistics 17(3), for blocks of time.
     """
@@ -170,6 +140,7 @@ class Jackknife:
         self._segment_starts = np.unique(starts)  # an instant belongs to one segment
         self._H = np.zeros((len(self._segment_starts), size, size))
         self._c = np.zeros((len(self._segment_starts), size))
+        self.degrees_of_freedom = len(self._c) - 1
 
     def add(self, samples: np.ndarray, Q: Array, e: Array, unclipped: np.ndarray) -> None:
         """Add the rows (N,) of complete instants.
@@ -186,21 +157,10 @@ class Jackknife:
             self._H[k] += here @ here.T
             self._c[k] += Q[:, rows] @ e[rows]
 
-    @property
-    def degrees_of_freedom(self) -> int:
-        """Degrees of freedom, K - 1."""
-        return len(self._c) - 1
-
     def covariance(self) -> Array:
         """Covariance (p, p) of R theta, of rank K - 1 at most."""
         shares, U = np.linalg.eigh(self._H)
         rest = np.maximum(1 - shares, _MIN_REMAINING_SHARE)
-        rotated_changes = np.einsum("kji,kj->ki", U, self._c) / rest
-        parameter_changes = np.einsum("kij,kj->ki", U, rotated_changes)
-        parameter_changes -= parameter_changes.mean(axis=0)
-        return (
-            self.degrees_of_freedom
-            / len(parameter_changes)
-            * parameter_changes.T
-            @ parameter_changes
-        )
+        changes = np.einsum("kij,kj->ki", U, np.einsum("kji,kj->ki", U, self._c) / rest)
+        changes -= changes.mean(axis=0)
+        return self.degrees_of_freedom / len(changes) * changes.T @ changes

@@ -38,8 +38,7 @@ class StoredRegressor:
     def __init__(self, W: Array, samples: np.ndarray, rows: int = _BLOCK_ROWS):
         self.shape = W.shape
         self._W = W
-        wanted = np.arange(0, len(W), rows)
-        starts = np.unique(np.searchsorted(samples, samples[wanted])).tolist()
+        starts = np.unique(np.searchsorted(samples, samples[np.arange(0, len(W), rows)])).tolist()
         ends = [*starts[1:], len(W)]
         self._row_slices = [slice(*ends) for ends in zip(starts, ends, strict=True)]
 

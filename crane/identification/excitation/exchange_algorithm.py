@@ -1,23 +1,25 @@
-"""Exchange algorithm for valve signals: random pulse plans within limits, improved by slots."""
+"""Valve signals of pulse plans, and the exchange algorithm that improves them by slots."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from crane.codegen import Scalar
 from crane.common.errors import CraneError, InputError
 from crane.common.samples import Array
-from crane.control.valve_commands import ValveSignals, require_circuit
-from crane.description.sensors import VALVE_SIGNAL_PREFIX
-from crane.identification.calibration.unknowns import Unknown
-from crane.identification.excitation.pulse_signals import PulseSignals
-from crane.identification.excitation.signal_information import SignalInformation
+from crane.control.control_law import ControllerInputs
+from crane.control.valve_commands import ValveCommand, require_circuit
+from crane.hydraulics.circuit_elements import Supply
+from crane.hydraulics.components import Cylinder, Valve
+from crane.identification.excitation.signal_information import (
+    SignalInformation,
+    SignalLimits,
+    replay_signals,
+)
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 from crane.simulation.simulation_run import simulate
 
-_DEFAULT_DEVIATION = 0.3  # relative deviation of a parameter without bounds
-# [s] before the end, and share of the largest speed that counts as rest
-_FINAL_DURATION, _REST_SPEED_SHARE = 0.5, 0.1
 # approximate duration of a slot [s], and least number of slots
 _SLOT_DURATION, _MIN_SLOTS = 1.5, 4
 _RANDOM_TRIAL_SHARE = 0.25  # of all trials that are completely random
@@ -28,131 +30,177 @@ _REFERENCE_OPENING = 0.5  # opening of the reference signals
 Progress = Callable[[float], None]
 
 
-class SignalLimits:
-    """Limits of a run that starts at home and is driven by valve signals.
+class PulseSignals(ValveCommand):
+    """Pulses of valve signals, one per valve and time slot, that keep cylinders within strokes.
 
-    Strokes keep a margin to both ends, or half of the margin of home if that is less; the demand
-    of flow is within the pump's flow, pressures are below those of the relief valves by the
-    margin, and in the last half second all speeds are below a tenth of their maxima. With each
-    unknown at its bounds, or 30 % off if it has one sign, strokes do not reach their ends.
+    A plan contains the largest opening y of each pulse, -1 to 1, and the share of its slot that
+    the pulse takes. The spool position u = (U - neutral) / (full - neutral) goes from 0 to sign(y)
+    (d + (1 - d) |y|) with the dead band d, and back to 0, at the rate r, so that over a pulse of
+    duration T
+
+        integral of |y| dt = |y| (T - (|u| + d) / r),
+
+    and the stroke changes by this times its steady velocity at full opening
+    (`full_opening_speed`). At the start of a slot the plan is adapted to the state of the machine:
+    a pulse that would exceed its range is reversed or reduced, and all openings are reduced if
+    together they would exceed the pump's flow.
 
     Args:
-        information: Information of the machine and the unknowns.
-        margin: Margin relative to strokes, relief pressures and the pump's flow.
-
-    Attributes:
-        machine: The machine of the information.
-        low: (m,) lower limits [m], [rad].
+        machine: The machine.
+        plan: (slots, m, 2) openings, and shares of the slot from 0 to 1; valves are closed in the
+            slot before and after them.
+        slot: Duration of a slot [s].
+        rate: Rate of u [1/s].
+        low: (m,) lower limits of the coordinates [m], [rad].
         high: (m,) upper limits [m], [rad].
-        flow: Largest demand of pump flow [m3/s].
+        flow: Largest demand of pump flow [m3/s]; infinite without limit.
     """
 
-    def __init__(self, information: SignalInformation, margin: float):
-        machine = self.machine = information.machine
-        self._circuit, self._margin = require_circuit(machine), margin
-        which = [machine.active.index(joint) for joint in self._circuit.joints]
-        self._lower, self._upper = machine.lower[which], machine.upper[which]
-        self._stroke_lengths = self._upper - self._lower
-        home = np.array([machine.home[machine.column(joint)] for joint in self._circuit.joints])
-        below, above = np.minimum(
-            margin * self._stroke_lengths, [(home - self._lower) / 2, (self._upper - home) / 2]
-        )
-        self.low, self.high = self._lower + below, self._upper - above
-        supply = self._circuit.supply
-        if supply.control != "pressure":
-            raise InputError(
-                f"signals are designed for a pump that keeps its pressure, that of "
-                f"'{machine.name}' has {supply.control} control: record a task instead"
-            )
-        for joint, cylinder in self._circuit.cylinders.items():
-            if cylinder.motor:
-                raise InputError(
-                    f"signals are designed for cylinders, '{joint}' has a motor: lock it"
-                )
-        max_flow = supply.flow
-        self.flow = (1 - margin) * max_flow if max_flow else np.inf
-        self._perturbed_machines = [
-            information.perturbed_machine(values)
-            for values in _perturbed_values(information.unknowns)
+    is_open_loop = True
+
+    def __init__(
+        self,
+        machine: Machine,
+        plan: Array,
+        slot: float,
+        rate: float,
+        low: Array,
+        high: Array,
+        flow: float,
+    ):
+        circuit = self._circuit = require_circuit(machine)
+        self._plan, self.period, self._rate, self._max_flow = plan, slot, rate, flow
+        self._low, self._high = low, high
+        self._joint_columns = [machine.column(joint) for joint in circuit.joints]
+        valves = list(circuit.valves.values())
+        self._neutral = np.array([valve.neutral for valve in valves])
+        self._signal_ranges = np.array([valve.full - valve.neutral for valve in valves])
+        self._dead_bands = np.array([valve.dead_band for valve in valves])
+        self._valve_indices = [
+            circuit.joints.index(spool.joint) for spool in circuit.spools.values()
         ]
+        # start times of slots, peak spool positions, and durations of pulses
+        self._slot_starts = [0.0]
+        self._peak_positions, self._duration_history = (
+            [np.zeros(len(valves))],
+            [np.zeros(len(valves))],
+        )
 
-    def exceeded_limit(self, run: Recording) -> str:
-        """Name of a limit that a run exceeds, "" if it exceeds none."""
-        q = self._strokes(run)
-        for i, joint in enumerate(self._circuit.joints):
-            if q[:, i].min() < self.low[i] - 1e-9 or q[:, i].max() > self.high[i] + 1e-9:
-                return f"the stroke of '{joint}'"
-        if self.pump_flow_share(run) > 1:
-            return "the pump's flow"
-        for joint, pressure in zip(self._circuit.joints, self.peak_pressures(run), strict=True):
-            relief = self._circuit.cylinders[joint].relief
-            if relief and pressure > (1 - self._margin) * relief:
-                return f"the relief pressure of '{joint}'"
-        speeds = np.abs(run.v)
-        last = speeds[run.time > run.time[-1] - _FINAL_DURATION].max(axis=0)
-        free = np.isin(run.joints, run.free)  # free joints sway
-        moving = (last > _REST_SPEED_SHARE * speeds.max(axis=0)) & ~free
-        if moving.any():
-            return f"the rest of '{run.joints[int(np.argmax(moving))]}' at the end"
-        return ""
+    def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
+        """See `ValveCommand`."""
+        slot = round(time / self.period) - 1
+        peak_positions = self._pulse_durations = np.zeros(len(self._signal_ranges))
+        if 0 <= slot < len(self._plan):
+            peak_positions = self._pulse_positions(slot, q, pressures)
+        slot_index = max(0, slot + 1)
+        (
+            self._slot_starts[slot_index:],
+            self._peak_positions[slot_index:],
+            self._duration_history[slot_index:],
+        ) = [time], [peak_positions], [self._pulse_durations]
 
-    def stroke_margins(self, run: Recording) -> Array:
-        """Smallest distances (m,) to the ends of the strokes, per stroke."""
-        q = self._strokes(run)
-        ends = np.minimum(q.min(axis=0) - self._lower, self._upper - q.max(axis=0))
-        return np.asarray(ends / self._stroke_lengths)
+    def _pulse_positions(self, slot: int, q: Array, pressures: Array) -> Array:
+        """Peak spool positions (m,) in a slot."""
+        opening, share = self._plan[slot].T
+        x = q[self._joint_columns]
+        circuit = self._circuit
+        speeds = np.empty((len(x), 2))  # at full opening, forwards and backwards
+        for i, joint in enumerate(circuit.joints):
+            cylinder, valve = circuit.cylinders[joint], circuit.valves[joint]
+            force = cylinder.area_a * pressures[i][0] - cylinder.area_b * pressures[i][1]
+            speeds[i] = [
+                full_opening_speed(cylinder, valve, circuit.supply, force, side)
+                for side in (False, True)
+            ]
+        self._pulse_durations = share * self.period
+        openings = np.array(
+            [
+                self._opening_within_stroke(i, float(y), float(x[i]), speeds[i])
+                for i, y in enumerate(opening)
+            ]
+        )
+        openings *= min(1.0, self._max_flow / max(self._pump_flow(openings, speeds), 1e-30))
+        u = self._dead_bands + (1.0 - self._dead_bands) * np.abs(openings)
+        return np.where(openings, np.copysign(u, openings), 0.0)
 
-    def worst_case_stroke_margins(self, run: Recording) -> Array:
-        """Stroke margins (m,) of the worst machine with deviating parameters and the same signals.
+    def references(self, times: Array) -> Array:
+        """See `ValveCommand`."""
+        at = np.maximum(np.searchsorted(self._slot_starts, times, "right") - 1, 0)
+        top, last = np.array(self._peak_positions)[at], np.array(self._duration_history)[at]
+        since = np.asarray(times)[:, None] - np.array(self._slot_starts)[at, None]
+        ramps = self._rate * np.clip(np.minimum(since, last - since), 0.0, None)
+        u = np.copysign(np.minimum(np.abs(top), ramps), top)
+        # a second spool gets the signal of the first one, as in `ValveSignals`
+        return np.asarray(self._neutral + self._signal_ranges * u)[:, self._valve_indices]
 
-        Raises:
-            CraneError: A simulation fails.
-        """
-        runs = [replay_signals(machine, run) for machine in self._perturbed_machines]
-        return np.min([self.stroke_margins(other) for other in (run, *runs)], axis=0)
+    def signals(self, inputs: ControllerInputs) -> Sequence[Scalar]:
+        """See `ValveCommand`."""
+        return inputs.reference
 
-    def pump_flow_share(self, run: Recording) -> float:
-        """Largest share of the pump's flow, 0 if it has no limit."""
-        supply = self._circuit.supply
-        if not supply.flow:
-            return 0.0
-        flow_shares = (supply.pressure - run.channels["pressure_supply"]) / supply.droop
-        return float(flow_shares.max())
+    def _opening_within_stroke(self, i: int, opening: float, x: float, speeds: Array) -> float:
+        """Opening of a pulse that keeps cylinder i within its range."""
+        dead, rate, duration = self._dead_bands[i], self._rate, self._pulse_durations[i]
+        clearances = max(self._high[i] - x, 0.0), max(x - self._low[i], 0.0)
+        side = int(opening < 0)
+        # what the rate allows within the pulse
+        size = min(abs(opening), max((rate * duration / 2 - dead) / (1.0 - dead), 0.0))
+        if size and self._opening_integral(i, size) * speeds[side] > clearances[side]:
+            side = int(clearances[1] > clearances[0])
+            if self._opening_integral(i, size) * speeds[side] > clearances[side]:
+                # the smaller root of the integral, which is quadratic in the opening
+                integral, slope = clearances[side] / speeds[side], duration - 2 * dead / rate
+                root = np.sqrt(max(slope**2 - 4 * (1.0 - dead) / rate * integral, 0.0))
+                size = float(2 * integral / (slope + root)) if slope > 0 else 0.0
+        return -size if side else size
 
-    def peak_pressures(self, run: Recording) -> Array:
-        """Largest pressures (m,) in the cylinders [Pa]."""
-        return np.array([
-            max(run.channels[f"pressure_{joint}_{side}"].max() for side in "ab")
-            for joint in self._circuit.joints
-        ])  # fmt: skip
+    def _opening_integral(self, i: int, opening: float) -> float:
+        """Integral of the opening over the pulse [s]."""
+        dead = self._dead_bands[i]
+        u = dead + (1.0 - dead) * opening
+        return float(opening * (self._pulse_durations[i] - (u + dead) / self._rate))
 
-    def _strokes(self, run: Recording) -> Array:
-        return run.q[:, [run.joints.index(joint) for joint in self._circuit.joints]]
-
-
-def _perturbed_values(unknowns: list[Unknown]) -> list[dict[str, float]]:
-    """Extreme values of the unknowns, one at a time."""
-    found = []
-    for one in unknowns:
-        ends = one.low, one.high
-        if not np.isfinite(ends).all():
-            deviation = _DEFAULT_DEVIATION * one.start if np.isfinite(ends).any() else 0.0
-            ends = one.start - deviation, one.start + deviation
-        found += [{one.name: end} for end in ends if end != one.start and not one.sensor]
-    return found
+    def _pump_flow(self, openings: Array, speeds: Array) -> float:
+        """Demand of pump flow [m3/s]."""
+        total = 0.0
+        for y, speed, cylinder in zip(
+            openings, speeds, self._circuit.cylinders.values(), strict=True
+        ):
+            area = cylinder.area_b if y < 0 else cylinder.area_a
+            total += abs(y) * speed[int(y < 0)] * area
+        return total
 
 
-def replay_signals(machine: Machine, run: Recording) -> Recording:
-    """Simulate a machine from home with the valve signals of another run.
+def full_opening_speed(
+    cylinder: Cylinder, valve: Valve, supply: Supply, force: float, backwards: bool
+) -> float:
+    """Steady speed of a cylinder at full opening [m/s], [rad/s].
 
-    Raises:
-        CraneError: The simulation fails.
+    With the pressure drops of both orifices, (A_in w / c_in)^2 and (A_out w / c_out)^2, and the
+    force F against the motion, the speed w is given by
+
+        w^2 (A_in^3 / c_in^2 + A_out^3 / c_out^2) = A_in p_S - A_out p_R - F,
+
+    A compensator limits the inflow to c_in sqrt(margin), unless a pulling load causes a larger
+    outflow, c_out sqrt(-F / A_out - p_R). The speed is 0 if the load is too large.
+
+    Args:
+        cylinder: The cylinder.
+        valve: Valve of the cylinder.
+        supply: Supply of the circuit.
+        force: Cylinder force A_A p_A - A_B p_B [N], [N m].
+        backwards: Whether oil flows into chamber B.
     """
-    joints, step = require_circuit(machine).joints, float(run.time[1] - run.time[0])
-    signals = {joint: run.channels[VALVE_SIGNAL_PREFIX + joint] for joint in joints}
-    return simulate(
-        machine, ValveSignals(machine, run.time, signals), None, step * (len(run.time) - 1), step
-    )
+    inward, outward = cylinder.area_a, cylinder.area_b
+    inlet, outlet = valve.c1, valve.c2
+    if backwards:
+        inward, outward, inlet, outlet = outward, inward, valve.c4, valve.c3
+        force = -force
+    driving_force = inward * supply.pressure - outward * supply.tank - force
+    speed = np.sqrt(max(driving_force, 0.0) / (inward**3 / inlet**2 + outward**3 / outlet**2))
+    if valve.margin:
+        load_driven_speed = outlet * np.sqrt(max(-force / outward - supply.tank, 0.0)) / outward
+        speed = min(speed, max(inlet * np.sqrt(valve.margin) / inward, load_driven_speed))
+    return float(speed)
 
 
 class ExchangeAlgorithm:

@@ -10,7 +10,7 @@ from crane.common.errors import InputError
 from crane.common.samples import Array, as_sample
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.model_term import MotionSamples
+from crane.identification.mechanics.model_terms import MotionSamples
 
 
 @dataclass(frozen=True, eq=False)

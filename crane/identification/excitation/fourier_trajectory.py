@@ -85,8 +85,7 @@ class FourierTrajectory(Trajectory):
         """See `Trajectory`: q = f(s), v = f' s', a = f'' s'^2 + f' s''."""
         time = np.asarray(time, dtype=np.float64)
         lead = self.lead
-        side = np.clip(np.minimum(time, self.duration - time), 0.0, lead)
-        u = side / lead
+        u = np.clip(np.minimum(time, self.duration - time), 0.0, lead) / lead
         phase_offset = lead * (u**3 - u**4 / 2 - 0.5)  # from -lead / 2 at rest to 0 when steady
         is_second_half = time > self.duration / 2
         steady_time = np.clip(time - lead, 0.0, self.duration - 2 * lead)

@@ -9,7 +9,7 @@ import yaml
 from numpy.typing import ArrayLike
 
 from crane.common.atomic_output import replace_file
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.common.progress import progress_reporter
 from crane.common.result import Result
 from crane.common.samples import Array, as_count, as_number, as_seed
@@ -22,16 +22,14 @@ from crane.identification.excitation.fisher_information import (
     InformationMeasures,
 )
 from crane.identification.excitation.fourier_trajectory import FourierTrajectory
-from crane.identification.excitation.trajectory_limits import (
+from crane.identification.excitation.trajectory_optimizer import (
+    COARSE_SAMPLES,
     QUANTITIES,
     TrajectoryLimits,
+    TrajectoryOptimizer,
     joint_values,
     singularity_proximity,
     trajectory_limits,
-)
-from crane.identification.excitation.trajectory_optimizer import (
-    COARSE_SAMPLES,
-    TrajectoryOptimizer,
 )
 from crane.identification.mechanics.base_parameters import (
     BaseParameters,
@@ -39,7 +37,7 @@ from crane.identification.mechanics.base_parameters import (
     random_samples,
 )
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.model_term import MotionSamples
+from crane.identification.mechanics.model_terms import MotionSamples
 from crane.machine.machine import Machine
 from crane.recordings import timeseries
 from crane.recordings.recording import FORCE_UNITS, VELOCITY_UNITS
@@ -237,10 +235,7 @@ def excite(
         InputError: Arguments are out of range, or no trajectory is within the limits.
     """
     progress = progress_reporter(progress)
-    if criterion not in CRITERIA:
-        raise InputError(
-            f"criterion '{criterion}' is unknown, {suggest_names(CRITERIA, criterion)}"
-        )
+    check_name(criterion, CRITERIA, f"criterion '{criterion}' is unknown")
     for what, value in (("starts", starts), ("harmonics", harmonics), ("periods", periods)):
         as_count(value, f"the number of {what}")
     period = as_number(period, "the period", "s", greater_than=0)
@@ -374,8 +369,7 @@ def _random_motions(
     """Random motions within the limits, with harmonics up to an angular frequency [rad/s]."""
     machine, rng = model.machine, np.random.default_rng(0)
     at = random_samples(model, 300)
-    is_regular = singularity_proximity(machine, at) <= 1
-    q_a = at.q_a[is_regular]
+    q_a = at.q_a[singularity_proximity(machine, at) <= 1]
     v_max = np.minimum(bounds.velocity, max_frequency * bounds.half_stroke)
     a_max = np.minimum(bounds.acceleration, max_frequency * v_max)
     v_a, a_a = (limit * rng.uniform(-1, 1, q_a.shape) for limit in (v_max, a_max))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.common.one_line_repr import format_count
 from crane.common.progress import progress_reporter
 from crane.common.result import Result
@@ -17,9 +17,9 @@ from crane.common.units import format_quantity, format_table
 from crane.control.valve_commands import require_circuit
 from crane.description.sensors import VALVE_SIGNAL_PREFIX
 from crane.identification.calibration.unknowns import Unknown
-from crane.identification.excitation.exchange_algorithm import ExchangeAlgorithm, SignalLimits
+from crane.identification.excitation.exchange_algorithm import ExchangeAlgorithm
 from crane.identification.excitation.fisher_information import CRITERIA, InformationMeasures
-from crane.identification.excitation.signal_information import SignalInformation
+from crane.identification.excitation.signal_information import SignalInformation, SignalLimits
 from crane.machine.machine import Machine
 from crane.recordings import timeseries
 from crane.recordings.recording import IDEAL_SENSORS, SENSORS_NOTE, Recording
@@ -198,10 +198,7 @@ def excite_valves(
     """
     progress = progress_reporter(progress)
     require_circuit(machine)
-    if criterion not in CRITERIA:
-        raise InputError(
-            f"criterion '{criterion}' is unknown, {suggest_names(CRITERIA, criterion)}"
-        )
+    check_name(criterion, CRITERIA, f"criterion '{criterion}' is unknown")
     step = as_number(step, "the step", "s", greater_than=0, max_magnitude=_MAX_STEP)
     duration = as_number(duration, "the duration", "s", greater_than=0)
     if step < _MIN_STEP or duration < _MIN_DURATION:
@@ -216,53 +213,29 @@ def excite_valves(
     information = SignalInformation(machine, fit, sensors, noise, as_seed(seed))
     limits = SignalLimits(information, margin)
     search = ExchangeAlgorithm(information, limits, CRITERIA[criterion], duration, step, rate)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         reference_run, best = search.run(trials, np.random.default_rng(seed), progress)
-        initial_information, optimized_information = (
-            information.measures(reference_run),
-            information.measures(best),
+        initial_information, optimized_information = map(
+            information.measures, (reference_run, best)
         )
         worst_case_margins = limits.worst_case_stroke_margins(best)
-    return _excitation_result(
-        information,
-        limits,
-        best,
-        initial_information,
-        optimized_information,
-        worst_case_margins,
-        criterion,
-        seed,
-    )
-
-
-def _excitation_result(
-    information: SignalInformation,
-    limits: SignalLimits,
-    run: Recording,
-    initial_information: InformationMeasures,
-    optimized_information: InformationMeasures,
-    worst_case_margins: Array,
-    criterion: str,
-    seed: int,
-) -> SignalExcitation:
-    table, joints = information.expected_readings(run), require_circuit(information.machine).joints
+    joints = require_circuit(machine).joints
     largest_changes = np.abs(
-        np.diff([run.channels[VALVE_SIGNAL_PREFIX + joint] for joint in joints])
+        np.diff([best.channels[VALVE_SIGNAL_PREFIX + joint] for joint in joints])
     ).max(axis=1)
     return SignalExcitation(
         machine=information.machine,
         unknowns=tuple(information.unknowns),
-        run=run,
-        expected_readings=table,
+        run=best,
+        expected_readings=information.expected_readings(best),
         noise=dict(zip(information.units, information.noise.tolist(), strict=True)),
         initial_information=initial_information,
         optimized_information=optimized_information,
-        stroke_margins=limits.stroke_margins(run),
+        stroke_margins=limits.stroke_margins(best),
         worst_case_stroke_margins=worst_case_margins,
-        pump_flow_share=limits.pump_flow_share(run),
-        peak_pressures=limits.peak_pressures(run),
-        signal_rates=largest_changes / (run.time[1] - run.time[0]),
+        pump_flow_share=limits.pump_flow_share(best),
+        peak_pressures=limits.peak_pressures(best),
+        signal_rates=largest_changes / (best.time[1] - best.time[0]),
         criterion=criterion,
         seed=seed,
     )

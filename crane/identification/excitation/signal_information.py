@@ -1,4 +1,4 @@
-"""Fisher information of a recording with valve signals about calibrated parameters."""
+"""Recordings with valve signals: Fisher information about parameters, and limits."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.common.samples import Array, as_number
-from crane.control.valve_commands import require_circuit
+from crane.control.valve_commands import ValveSignals, require_circuit
 from crane.description.sensors import INCLINATION_PREFIX, VALVE_SIGNAL_PREFIX, VELOCITY_SUFFIX
 from crane.dynamics.joint_forces import find_stick_slip_columns
 from crane.formats.machine_loading import MachineVariants
@@ -23,9 +23,13 @@ from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 from crane.recordings.timeseries import TIME, Table
 from crane.simulation.recorded_run import read_simulation, simulated_columns, simulated_units
+from crane.simulation.simulation_run import simulate
 
 # standard deviations of usual sensors, by unit
 _DEFAULT_NOISE = {"rad": 1e-3, "m": 5e-4, "rad/s": 5e-3, "m/s": 2e-3, "Pa": 3e4}
+_DEFAULT_DEVIATION = 0.3  # relative deviation of a parameter without bounds
+# [s] before the end, and share of the largest speed that counts as rest
+_FINAL_DURATION, _REST_SPEED_SHARE = 0.5, 0.1
 _MIN_SENSITIVITY = 1e-6  # change of all readings per scale of a parameter, in standard deviations
 
 
@@ -75,20 +79,28 @@ class SignalInformation:
             *(f"pressure_{joint}_{side}" for joint in joints for side in "ab"),
         ]
         available_units = simulated_units(machine)
-        self.units = {
-            name: _sensor_unit(available_units, name)
-            for name in dict.fromkeys(default_sensors if sensors is None else sensors)
-        }
+        self.units: dict[str, str] = {}
+        for name in default_sensors if sensors is None else sensors:
+            unit = "rad/s" if name.endswith(VELOCITY_SUFFIX) else "rad"
+            if not name.startswith(INCLINATION_PREFIX):
+                check_name(name, available_units, f"'{name}' cannot be compared")
+                unit = available_units[name]
+            self.units[name] = unit
         if not self.units:
             raise InputError(f"no sensor is named, choose among {', '.join(available_units)}")
         given = {x: y.noise for x, y in machine.sensors.items() if y.noise and x in self.units}
         given |= noise or {}
         for name in given:
-            if name not in self.units:
+            check_name(name, self.units, f"noise of '{name}', which is not measured")
+        noise_std = []
+        for name, unit in self.units.items():
+            if name not in given and unit not in _DEFAULT_NOISE:
                 raise InputError(
-                    f"noise of '{name}', which is not measured, {suggest_names(self.units, name)}"
+                    f"noise of '{name}' is not known, give its deviation in {unit or '1'}"
                 )
-        self.noise = np.array([_noise_std(name, given, unit) for name, unit in self.units.items()])
+            std = given.get(name, _DEFAULT_NOISE.get(unit))
+            noise_std.append(as_number(std, f"noise of '{name}'", unit, greater_than=0))
+        self.noise = np.array(noise_std)
         signals = {VALVE_SIGNAL_PREFIX + joint: "V" for joint in joints}
         simulated_columns(machine, Table(self.units, np.zeros((0, len(self.units))), {}))
         variants = MachineVariants(machine)
@@ -107,8 +119,7 @@ class SignalInformation:
 
     def expected_readings(self, run: Recording, noisy: bool = False) -> Table:
         """Recording of a run: signals and readings, with noise or without."""
-        names = list(self.units)
-        values = read_simulation(self.machine, run, names)
+        values = read_simulation(self.machine, run, list(self.units))
         if noisy:
             random = np.random.default_rng(self._seed)
             values = values + self.noise * random.normal(size=values.shape)
@@ -132,8 +143,7 @@ class SignalInformation:
             CraneError: The simulation of a perturbed machine fails.
         """
         names, table = list(self.units), self.expected_readings(run, noisy=True)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             case = recording_case(self.machine, "the design", table, {}, names, (0.0, np.inf))
         if not self._problem.cases:
             self._problem = self._smoothed_problem([case])
@@ -151,20 +161,13 @@ class SignalInformation:
     def measures(self, run: Recording) -> InformationMeasures:
         """Information measures of a recording of a run; standard deviations in SI units."""
         rows = self.information_root(run)
-        result = information_measures(rows, np.eye(len(self.unknowns)), 0.0)
-        scale = np.array([unknown.scale for unknown in self.unknowns])
-        return replace(result, std=self.standard_deviations(rows) * scale)
-
-    def standard_deviations(self, information_root: Array) -> Array:
-        """Standard deviations (p,) of the scaled parameters, infinite if not identifiable."""
-        is_identifiable = np.linalg.norm(information_root, axis=0) > _MIN_SENSITIVITY
-        out = np.full(len(information_root), np.inf)
+        result = information_measures(rows, np.eye(len(rows)), 0.0)
+        is_identifiable = np.linalg.norm(rows, axis=0) > _MIN_SENSITIVITY
+        std = np.full(len(rows), np.inf)
         if is_identifiable.any():
-            identifiable_root = _triangular_factor(information_root[:, is_identifiable])
-            out[is_identifiable] = information_measures(
-                identifiable_root, np.eye(len(identifiable_root)), 0.0
-            ).std
-        return out
+            root = _triangular_factor(rows[:, is_identifiable])
+            std[is_identifiable] = information_measures(root, np.eye(len(root)), 0.0).std
+        return replace(result, std=std * [unknown.scale for unknown in self.unknowns])
 
     def _smoothed_problem(self, cases: list[RecordingCase]) -> CalibrationProblem:
         problem = CalibrationProblem(self.machine, self.unknowns, cases)
@@ -177,17 +180,122 @@ def _triangular_factor(matrix: Array) -> Array:
     return np.asarray(np.linalg.qr(matrix, mode="r"), dtype=np.float64)
 
 
-def _sensor_unit(available_units: Mapping[str, str], name: str) -> str:
-    if name.startswith(INCLINATION_PREFIX):
-        return "rad/s" if name.endswith(VELOCITY_SUFFIX) else "rad"
-    if name not in available_units:
-        raise InputError(f"'{name}' cannot be compared, {suggest_names(available_units, name)}")
-    return available_units[name]
+class SignalLimits:
+    """Limits of a run that starts at home and is driven by valve signals.
+
+    Strokes keep a margin to both ends, or half of the margin of home if that is less; the demand
+    of flow is within the pump's flow, pressures are below those of the relief valves by the
+    margin, and in the last half second all speeds are below a tenth of their maxima. With each
+    unknown at its bounds, or 30 % off if it has one sign, strokes do not reach their ends.
+
+    Args:
+        information: Information of the machine and the unknowns.
+        margin: Margin relative to strokes, relief pressures and the pump's flow.
+
+    Attributes:
+        machine: The machine of the information.
+        low: (m,) lower limits [m], [rad].
+        high: (m,) upper limits [m], [rad].
+        flow: Largest demand of pump flow [m3/s].
+    """
+
+    def __init__(self, information: SignalInformation, margin: float):
+        machine = self.machine = information.machine
+        self._circuit, self._margin = require_circuit(machine), margin
+        which = [machine.active.index(joint) for joint in self._circuit.joints]
+        self._lower, self._upper = machine.lower[which], machine.upper[which]
+        self._stroke_lengths = self._upper - self._lower
+        home = np.array([machine.home[machine.column(joint)] for joint in self._circuit.joints])
+        below, above = np.minimum(
+            margin * self._stroke_lengths, [(home - self._lower) / 2, (self._upper - home) / 2]
+        )
+        self.low, self.high = self._lower + below, self._upper - above
+        supply = self._circuit.supply
+        if supply.control != "pressure":
+            raise InputError(
+                f"signals are designed for a pump that keeps its pressure, that of "
+                f"'{machine.name}' has {supply.control} control: record a task instead"
+            )
+        for joint, cylinder in self._circuit.cylinders.items():
+            if cylinder.motor:
+                raise InputError(
+                    f"signals are designed for cylinders, '{joint}' has a motor: lock it"
+                )
+        max_flow = supply.flow
+        self.flow = (1 - margin) * max_flow if max_flow else np.inf
+        self._perturbed_machines: list[Machine] = []  # with one unknown at an end
+        for one in information.unknowns:
+            ends = one.low, one.high
+            if not np.isfinite(ends).all():
+                deviation = _DEFAULT_DEVIATION * one.start if np.isfinite(ends).any() else 0.0
+                ends = one.start - deviation, one.start + deviation
+            self._perturbed_machines += [
+                information.perturbed_machine({one.name: end})
+                for end in ends
+                if end != one.start and not one.sensor
+            ]
+
+    def exceeded_limit(self, run: Recording) -> str:
+        """Name of a limit that a run exceeds, "" if it exceeds none."""
+        q = self._strokes(run)
+        for i, joint in enumerate(self._circuit.joints):
+            if q[:, i].min() < self.low[i] - 1e-9 or q[:, i].max() > self.high[i] + 1e-9:
+                return f"the stroke of '{joint}'"
+        if self.pump_flow_share(run) > 1:
+            return "the pump's flow"
+        for joint, pressure in zip(self._circuit.joints, self.peak_pressures(run), strict=True):
+            relief = self._circuit.cylinders[joint].relief
+            if relief and pressure > (1 - self._margin) * relief:
+                return f"the relief pressure of '{joint}'"
+        speeds = np.abs(run.v)
+        last = speeds[run.time > run.time[-1] - _FINAL_DURATION].max(axis=0)
+        # free joints sway
+        moving = (last > _REST_SPEED_SHARE * speeds.max(axis=0)) & ~np.isin(run.joints, run.free)
+        if moving.any():
+            return f"the rest of '{run.joints[int(np.argmax(moving))]}' at the end"
+        return ""
+
+    def stroke_margins(self, run: Recording) -> Array:
+        """Smallest distances (m,) to the ends of the strokes, per stroke."""
+        q = self._strokes(run)
+        ends = np.minimum(q.min(axis=0) - self._lower, self._upper - q.max(axis=0))
+        return np.asarray(ends / self._stroke_lengths)
+
+    def worst_case_stroke_margins(self, run: Recording) -> Array:
+        """Stroke margins (m,) of the worst machine with deviating parameters and the same signals.
+
+        Raises:
+            CraneError: A simulation fails.
+        """
+        runs = [replay_signals(machine, run) for machine in self._perturbed_machines]
+        return np.min([self.stroke_margins(other) for other in (run, *runs)], axis=0)
+
+    def pump_flow_share(self, run: Recording) -> float:
+        """Largest share of the pump's flow, 0 if it has no limit."""
+        supply = self._circuit.supply
+        if not supply.flow:
+            return 0.0
+        return float(((supply.pressure - run.channels["pressure_supply"]) / supply.droop).max())
+
+    def peak_pressures(self, run: Recording) -> Array:
+        """Largest pressures (m,) in the cylinders [Pa]."""
+        return np.array([
+            max(run.channels[f"pressure_{joint}_{side}"].max() for side in "ab")
+            for joint in self._circuit.joints
+        ])  # fmt: skip
+
+    def _strokes(self, run: Recording) -> Array:
+        return run.q[:, [run.joints.index(joint) for joint in self._circuit.joints]]
 
 
-def _noise_std(name: str, given: Mapping[str, float], unit: str) -> float:
-    if name in given:
-        return as_number(given[name], f"noise of '{name}'", unit, greater_than=0)
-    if unit not in _DEFAULT_NOISE:
-        raise InputError(f"noise of '{name}' is not known, give its deviation in {unit or '1'}")
-    return _DEFAULT_NOISE[unit]
+def replay_signals(machine: Machine, run: Recording) -> Recording:
+    """Simulate a machine from home with the valve signals of another run.
+
+    Raises:
+        CraneError: The simulation fails.
+    """
+    joints, step = require_circuit(machine).joints, float(run.time[1] - run.time[0])
+    signals = {joint: run.channels[VALVE_SIGNAL_PREFIX + joint] for joint in joints}
+    return simulate(
+        machine, ValveSignals(machine, run.time, signals), None, step * (len(run.time) - 1), step
+    )

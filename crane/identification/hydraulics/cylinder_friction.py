@@ -13,16 +13,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.common.errors import InputError, RecordingError, suggest_names
+from crane.common.errors import RecordingError, check_name
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
 from crane.description.force_elements import Friction
 from crane.dynamics.dynamics import Dynamics
-from crane.identification.estimation import estimators
-from crane.identification.estimation.regression_problem import Estimate, confidence_intervals
+from crane.identification.estimation.estimators import Estimate, EstimatedValues, least_squares
 from crane.identification.mechanics.smoothed_motion import smoothed_motion
-from crane.identification.signals.steady_samples import steady_samples
+from crane.identification.signals.signal_quality import steady_samples
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 
@@ -37,7 +36,7 @@ _STRIBECK_GRID_SIZE = 40  # stribeck velocities tried before the fit
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class CylinderFriction(Result):
+class CylinderFriction(EstimatedValues, Result):
     """Identified friction of one joint.
 
     Attributes:
@@ -66,15 +65,6 @@ class CylinderFriction(Result):
     def names(self) -> tuple[str, ...]:
         """Names of the values."""
         return PARAMETER_NAMES[: len(self.values)]
-
-    @property
-    def std(self) -> Array:
-        """Standard errors."""
-        return np.sqrt(np.diag(self.covariance))
-
-    def interval(self, level: float = 0.95) -> Array:
-        """Confidence intervals (p, 2) of a level."""
-        return confidence_intervals(self.values, self.std, self.degrees_of_freedom, level)
 
     @property
     def friction(self) -> Friction:
@@ -130,10 +120,7 @@ def identify_cylinder_friction(
         InputError: The joint is not active.
         RecordingError: The recording is not suitable, or does not determine the parameters.
     """
-    if joint not in machine.active:
-        raise InputError(
-            f"'{joint}' is not an active joint, {suggest_names(machine.active, joint)}"
-        )
+    check_name(joint, machine.active, f"'{joint}' is not an active joint")
     index = machine.active.index(joint)
     motion = smoothed_motion(machine, recording)
     load = Dynamics(machine).inverse(motion.q, motion.v, motion.a)[:, index]
@@ -156,17 +143,17 @@ def identify_cylinder_friction(
             )
     every = max(1, len(at) // _MAX_SAMPLES)
     at, speed, force = at[::every], speed[::every], force[::every]
-    result, note = _fit_without_stiction(at, speed, force, described_friction.smoothing), ""
+    note, estimate = "", None
     if stribeck is not False:
-        stiction_fit, note = _fit_with_stiction(at, speed, force, described_friction.smoothing)
+        estimate, note = _fit_with_stiction(at, speed, force, described_friction.smoothing)
         if note and stribeck:
             raise RecordingError(f"stiction of '{joint}' cannot be determined: {note}")
-        if not note:
-            result = stiction_fit
-    values, estimate = result
+    if estimate is None:
+        W = _friction_columns(speed, described_friction.smoothing)
+        estimate = least_squares(W, force, samples=at)
     return CylinderFriction(
         joint=joint,
-        values=values,
+        values=estimate.values,
         covariance=estimate.covariance,
         degrees_of_freedom=estimate.degrees_of_freedom,
         smoothing=described_friction.smoothing,
@@ -175,9 +162,6 @@ def identify_cylinder_friction(
         noise=float(estimate.noise[0]),
         note=note and f"Coulomb and viscous friction only: {note}",
     )
-
-
-FitResult = tuple[Array, Estimate]
 
 
 def _friction_law(values: Array, v: Array, smoothing: float) -> Array:
@@ -197,15 +181,10 @@ def _friction_columns(v: Array, smoothing: float, stribeck: float | None = None)
     return np.column_stack(columns)
 
 
-def _fit_without_stiction(at: np.ndarray, v: Array, force: Array, smoothing: float) -> FitResult:
-    estimate = estimators.least_squares(_friction_columns(v, smoothing), force, samples=at)
-    return estimate.values, estimate
-
-
 def _fit_with_stiction(
     at: np.ndarray, v: Array, force: Array, smoothing: float
-) -> tuple[FitResult, str]:
-    """Fit with stiction, and the reason why it is not identifiable, else ""."""
+) -> tuple[Estimate | None, str]:
+    """Fit with stiction, None if it is not identifiable, and the reason for that, else ""."""
     from scipy.optimize import minimize_scalar
 
     sizes = np.abs(v)
@@ -226,21 +205,20 @@ def _fit_with_stiction(
     linear = np.linalg.lstsq(W, force, rcond=None)[0]
     values = np.append(linear, width)
     stribeck_derivative = linear[3] * W[:, 3] * 2 * v**2 / width**3
-    fit_without = _fit_without_stiction(at, v, force, smoothing)
     low = f"speeds from {slowest:.2g} to {fastest:.2g}"
     if best == 0 or width < slowest:
-        return fit_without, f"{low} hold none below the Stribeck velocity, record slower ones"
+        return None, f"{low} hold none below the Stribeck velocity, record slower ones"
     if best == _STRIBECK_GRID_SIZE - 1 or width > 0.5 * fastest:
         return (
-            fit_without,
+            None,
             f"{low} do not exceed the Stribeck velocity twofold, record faster ones",
         )
     J = np.column_stack([W, stribeck_derivative])
     if np.linalg.cond(J / np.maximum(np.linalg.norm(J, axis=0), 1e-300)) > 1e8:
-        return fit_without, f"{low} show no stiction"
-    estimate = estimators.least_squares(
+        return None, f"{low} show no stiction"
+    estimate = least_squares(
         J, force - _friction_law(values, v, smoothing) + J @ values, samples=at
     )
     if not linear[3] > 3 * estimate.std[3]:
-        return fit_without, f"{low} show no stiction"
-    return (values, dataclasses.replace(estimate, values=values)), ""
+        return None, f"{low} show no stiction"
+    return dataclasses.replace(estimate, values=values), ""

@@ -1,10 +1,10 @@
 """Signals of one hydraulic cylinder in a recording: stroke, valve opening, pressures."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
-from crane.common.errors import InputError, RecordingError, suggest_names
+from crane.common.errors import InputError, RecordingError, check_name
 from crane.common.samples import Array
 from crane.hydraulics.components import Cylinder, Valve
 from crane.identification.signals.signal_processing import (
@@ -14,8 +14,8 @@ from crane.identification.signals.signal_processing import (
 )
 from crane.machine.machine import Machine
 from crane.recordings.measured_recordings import locked_joint_conflicts
-from crane.recordings.missing_measurements import check_columns_present
 from crane.recordings.recording import Recording
+from crane.recordings.timeseries import check_columns_present
 
 _STROKE_TOLERANCE = 1e-3  # of the stroke, for noise beyond its ends
 _NOISE_SHARE = 0.03  # of the fastest speed; noise above it is smoothed
@@ -63,8 +63,7 @@ def cylinder_and_valve(machine: Machine, joint: str) -> tuple[Cylinder, Valve]:
     circuit = machine.hydraulics
     if circuit is None:
         raise InputError(f"'{machine.name}' has no hydraulics, add the section to its file")
-    if joint not in circuit.cylinders:
-        raise InputError(f"'{joint}' has no cylinder, {suggest_names(circuit.cylinders, joint)}")
+    check_name(joint, circuit.cylinders, f"'{joint}' has no cylinder")
     if circuit.valves[joint].spool_b:
         raise InputError(
             f"the valve of '{joint}' has two spools, which this method does not separate: fit "
@@ -85,10 +84,7 @@ def joint_index(recording: Recording, joint: str) -> int:
     Raises:
         RecordingError: It is not recorded.
     """
-    if joint not in recording.joints:
-        raise RecordingError(
-            f"'{joint}' is not recorded, {suggest_names(recording.joints, joint)}"
-        )
+    check_name(joint, recording.joints, f"'{joint}' is not recorded", RecordingError)
     return recording.joints.index(joint)
 
 
@@ -110,10 +106,7 @@ def channel_values(recording: Recording, name: str, unit: str) -> Array:
     Raises:
         RecordingError: The channel is missing, or has another unit.
     """
-    if name not in recording.channels:
-        raise RecordingError(
-            f"channel '{name}' [{unit}] is missing, {suggest_names(recording.channels, name)}"
-        )
+    check_name(name, recording.channels, f"channel '{name}' [{unit}] is missing", RecordingError)
     given = recording.channel_units.get(name, "")
     if given not in ("", unit):
         raise RecordingError(f"channel '{name}' is in {given}, give {unit}")
@@ -172,8 +165,7 @@ def cylinder_signals(
 
 def valve_opening(valve: Valve, u: Array) -> Array:
     """Opening (N,) for spool positions u (N,), see `Valve`."""
-    size = np.clip((np.abs(u) - valve.dead_band) / (1 - valve.dead_band), 0.0, 1.0)
-    return np.copysign(size, u)
+    return np.copysign(np.clip((np.abs(u) - valve.dead_band) / (1 - valve.dead_band), 0.0, 1.0), u)
 
 
 def spool_position(valve: Valve, voltage: Array, step: float) -> Array:
@@ -223,29 +215,3 @@ def noise_std(x: Array) -> float:
         size = np.median(np.abs(np.diff(x, order)))
         found.append(1.4826 * float(size) / np.sqrt(comb(2 * order, order)))
     return min(found)
-
-
-def signal_noise(
-    signals: CylinderSignals, given: dict[str, float] | None = None
-) -> dict[str, float]:
-    """Standard deviation of the noise of each sensor, estimated if not given.
-
-    Raises:
-        InputError: A sensor is unknown.
-    """
-    for name in given or {}:
-        if name not in SIGNAL_NAMES:
-            raise InputError(f"sensor '{name}' is unknown, {suggest_names(SIGNAL_NAMES, name)}")
-    return {name: noise_std(getattr(signals, name)) for name in SIGNAL_NAMES} | (given or {})
-
-
-def shift_signal(signals: CylinderSignals, name: str, offset: float) -> CylinderSignals:
-    """Signals with an offset added to one of them; an opening of zero stays zero."""
-    values = {entry.name: getattr(signals, entry.name) for entry in fields(signals)}
-    where = values["opening"] != 0 if name == "opening" else 1.0
-    return CylinderSignals(**values | {name: values[name] + offset * where})
-
-
-def opening_regions(y: Array) -> np.ndarray:
-    """Label (N,) of the smooth piece of the opening: closed, open, or fully open, with sign."""
-    return np.sign(y) * (1.0 + (np.abs(y) >= 1))

@@ -9,18 +9,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
-from crane.identification.estimation import estimators
-from crane.identification.estimation.regression_problem import confidence_intervals
+from crane.identification.estimation.estimators import (
+    EstimatedValues,
+    instrumental_variables,
+    least_squares,
+)
 from crane.identification.hydraulics.cylinder_signals import (
+    SIGNAL_NAMES,
     CylinderSignals,
     cylinder_and_valve,
     cylinder_signals,
     noise_std,
-    signal_noise,
 )
 from crane.identification.hydraulics.orifice_equations import (
     EquationSides,
@@ -56,7 +59,7 @@ _UNIDENTIFIABLE_REASONS = {
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class OrificeCoefficients(Result):
+class OrificeCoefficients(EstimatedValues, Result):
     """Identified bulk modulus and orifice coefficients of one cylinder.
 
     Attributes:
@@ -85,18 +88,9 @@ class OrificeCoefficients(Result):
     training_sides: tuple[EquationSides, ...] = ()
 
     @property
-    def std(self) -> Array:
-        """Standard errors (5,)."""
-        return np.sqrt(np.diag(self.covariance))
-
-    @property
     def bulk_modulus(self) -> float:
         """Bulk modulus beta [Pa]; infinite if the estimate of 1/beta is negative."""
         return 1 / float(self.values[0]) if self.values[0] > 0 else np.inf
-
-    def interval(self, level: float = 0.95) -> Array:
-        """Confidence intervals (5, 2) of a level."""
-        return confidence_intervals(self.values, self.std, self.degrees_of_freedom, level)
 
     def predict(self, recording: Recording, period: float | None = None) -> EquationSides:
         """Both sides of (29) on another recording, as means over windows.
@@ -105,10 +99,13 @@ class OrificeCoefficients(Result):
             recording: As for `identify_orifices`.
             period: As for `identify_orifices`.
         """
-        signals = cylinder_signals(self.machine, recording, self.joint, period)
-        return OrificeEquations(self.machine, self.joint, signals, self.window, False).sides(
-            self.values
-        )
+        return OrificeEquations(
+            self.machine,
+            self.joint,
+            cylinder_signals(self.machine, recording, self.joint, period),
+            self.window,
+            False,
+        ).sides(self.values)
 
     def to_text(self) -> str:
         """A table of the parameters."""
@@ -151,7 +148,7 @@ def identify_orifices(
     opening crosses zero or its end are omitted, as the integrands have kinks there. Rows use every
     other sample, with the samples between them as instruments, so that white noise does not bias
     X. Standard errors propagate the white noise of the sensors to X; residuals beyond that noise
-    add the covariance of `estimators.instrumental_variables`, with its correlation in time.
+    add the covariance of `instrumental_variables`, with its correlation in time.
 
     "chambers": the same with the two equations of (23) instead of their difference (29). In (29)
     c1 and c2 (and c3, c4) differ only by the change of V_A / V_B along the stroke; here each has
@@ -179,9 +176,10 @@ def identify_orifices(
         InputError: The method, joint or sensor is unknown, or parameters are not identifiable.
         RecordingError: Columns are missing, or samples are not suitable.
     """
-    if method not in METHODS:
-        raise InputError(f"method '{method}' is unknown, {suggest_names(METHODS, method)}")
-    cylinder, _ = cylinder_and_valve(machine, joint)
+    check_name(method, METHODS, f"method '{method}' is unknown")
+    for name in noise or ():
+        check_name(name, SIGNAL_NAMES, f"sensor '{name}' is unknown")
+    cylinder, valve = cylinder_and_valve(machine, joint)
     if cylinder.counterbalance_a or cylinder.counterbalance_b:
         raise InputError(
             f"the cylinder of '{joint}' has a counterbalance valve, for which (21), (22) do not "
@@ -194,35 +192,26 @@ def identify_orifices(
     runs = [cylinder_signals(machine, one, joint, period) for one in recordings]
     sets = [OrificeEquations(machine, joint, run, window, method == "chambers") for run in runs]
     _check_identifiable(sets, joint)
+    levels = []
+    for one, run in zip(recordings, runs, strict=True):
+        level = {name: noise_std(getattr(run, name)) for name in SIGNAL_NAMES}
+        if f"spool_{joint}" not in one.channels and valve.bandwidth:
+            # the spool dynamics keep the noise of the signal at the low frequencies of the
+            # windows, and remove it from differences between samples
+            volts = noise_std(one.channels[f"voltage_{joint}"])
+            scale = abs(valve.full - valve.neutral) * (1 - valve.dead_band)
+            periods = max(len(one.time) // len(run.time), 1)
+            level["opening"] = volts / scale / np.sqrt(periods)
+        levels.append(level | dict(noise or {}))
     if method == "ls":
         values, covariance, freedom, condition, misfit = _pointwise_estimate(machine, joint, runs)
     else:
-        levels = [
-            _opening_noise(machine, one, joint, len(run.time)) | dict(noise or {})
-            for one, run in zip(recordings, runs, strict=True)
-        ]
         values, covariance, freedom, condition, misfit = _weak_form_estimate(sets, levels, joint)
     _check_values(values, covariance, joint, method, runs)
     training = tuple(rows.sides(values) for rows in sets)
     return OrificeCoefficients(
         machine, joint, method, values, covariance, freedom, condition, misfit, window, training
     )
-
-
-def _opening_noise(
-    machine: Machine, recording: Recording, joint: str, count: int
-) -> dict[str, float]:
-    """Noise of an opening that is computed from the valve signal, over `count` samples.
-
-    The spool dynamics keep the noise at the low frequencies of the windows, and remove it from
-    differences between samples.
-    """
-    _, valve = cylinder_and_valve(machine, joint)
-    if f"spool_{joint}" in recording.channels or not valve.bandwidth:
-        return {}
-    level = noise_std(recording.channels[f"voltage_{joint}"])
-    level /= abs(valve.full - valve.neutral) * (1 - valve.dead_band)
-    return {"opening": level / np.sqrt(max(len(recording.time) // count, 1))}
 
 
 def _weak_form_estimate(
@@ -245,7 +234,7 @@ def _weak_form_estimate(
     group = np.concatenate(groups)[order]
     W_all, Z_all, y_all = (np.concatenate(part)[order] for part in (W, Z, y))
     try:
-        estimate = estimators.instrumental_variables(
+        estimate = instrumental_variables(
             W_all, y_all, Z_all, group, np.concatenate(samples)[order]
         )
     except InputError as error:
@@ -253,10 +242,10 @@ def _weak_form_estimate(
     X, scale = estimate.values, estimate.noise**2
     A = sum(Z_all[group == g].T @ W_all[group == g] / scale[g] for g in range(len(scale)))
     middle, explained = np.zeros((5, 5)), 0.0
-    for rows, given in zip(sets, noise, strict=True):
+    for rows, levels in zip(sets, noise, strict=True):
         w, N = rows.windows, len(rows.signals.time)
         Z_rows = rows.W[:, ::-1] * rows.is_smooth[:, None]
-        for sensor, level in signal_noise(rows.signals, given).items():
+        for sensor, level in levels.items():
             df, dg = rows.noise_sensitivity(X, sensor, level)
             total = np.zeros((N, 5))
             for e in range(count):
@@ -273,8 +262,7 @@ def _weak_form_estimate(
             middle += total.T @ total
     inverse = np.linalg.inv(A)
     propagated = inverse @ middle @ inverse.T
-    found = float(np.sum(estimate.residuals**2 / scale[group]))
-    misfit = found / max(explained, 1e-300)
+    misfit = float(np.sum(estimate.residuals**2 / scale[group])) / max(explained, 1e-300)
     other = max(0.0, 1 - 1 / misfit) * estimate.covariance
     both = np.diag(propagated + other)
     # Welch-Satterthwaite: the propagated part is taken as exactly known
@@ -303,9 +291,7 @@ def _pointwise_estimate(
         y.append((-found.v[:, 1] * stiff)[::every])
         samples.append(start + np.arange(len(y[-1])))
         start += len(y[-1]) + 100
-    estimate = estimators.least_squares(
-        np.concatenate(W), np.concatenate(y), samples=np.concatenate(samples)
-    )
+    estimate = least_squares(np.concatenate(W), np.concatenate(y), samples=np.concatenate(samples))
     freedom = np.full(5, estimate.degrees_of_freedom)
     return estimate.values, estimate.covariance, freedom, estimate.scaled_condition, np.nan
 

@@ -15,7 +15,7 @@ flow. Area A times the first equation minus area B times the second is equation 
 Equations are those of the electro-hydraulic forwarder paper (IROS 2012).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -25,8 +25,6 @@ from crane.common.samples import Array
 from crane.identification.hydraulics.cylinder_signals import (
     CylinderSignals,
     cylinder_and_valve,
-    opening_regions,
-    shift_signal,
 )
 from crane.machine.machine import Machine
 
@@ -90,7 +88,9 @@ class OrificeEquations:
         # weights of the equations in (29)
         self._difference_weights = areas if per_chamber else np.ones(1)
         self.windows = w = WeakFormWindows.create(len(signals.time), signals.step, window_length)
-        self.is_smooth = w.are_uniform(opening_regions(signals.opening))
+        # closed, open, or fully open, with sign
+        regions = np.sign(signals.opening) * (1.0 + (np.abs(signals.opening) >= 1))
+        self.is_smooth = w.are_uniform(regions)
         states, columns = self._combined_terms(signals)
         self.W = np.empty((len(self.combination), 2, len(w.centres), 5))
         self.y = np.empty(self.W.shape[:3])
@@ -102,28 +102,23 @@ class OrificeEquations:
 
     def _combined_terms(self, signals: CylinderSignals) -> tuple[Array, Array]:
         states, columns = chamber_terms(self.machine, self.joint, signals)
-        return np.tensordot(self.combination, states, 1), np.tensordot(
-            self.combination, columns, 1
-        )
+        combination = self.combination
+        return np.tensordot(combination, states, 1), np.tensordot(combination, columns, 1)
 
     def sides(self, X: Array) -> EquationSides:
         """Both sides of (29) for X (5,) in all windows."""
-        W, y = (
-            np.tensordot(self._difference_weights, self.W, 1),
-            np.tensordot(self._difference_weights, self.y, 1),
-        )
+        W, y = (np.tensordot(self._difference_weights, x, 1) for x in (self.W, self.y))
         time = self.signals.time[self.windows.centres]
         return EquationSides(time, (W @ X).mean(axis=0), y.mean(axis=0))
 
     def noise_sensitivity(self, X: Array, sensor: str, offset: float) -> tuple[Array, Array]:
         """Changes (E, N) of the differentiated part and of the other part by noise of a sensor."""
-        ends = []
+        ends, values = [], getattr(self.signals, sensor)
+        where = values != 0 if sensor == "opening" else 1.0  # an opening of zero stays zero
         for sign in (1, -1):
-            states, columns = self._combined_terms(
-                shift_signal(self.signals, sensor, sign * offset)
-            )
-            f = states[:, 0] * X[0] + states[:, 1]
-            ends.append((f, np.tensordot(columns, X[1:], (1, 0))))
+            shifted = replace(self.signals, **{sensor: values + sign * offset * where})
+            states, columns = self._combined_terms(shifted)
+            ends.append((states[:, 0] * X[0] + states[:, 1], np.tensordot(columns, X[1:], (1, 0))))
         return 0.5 * (ends[0][0] - ends[1][0]), 0.5 * (ends[0][1] - ends[1][1])
 
 
@@ -159,8 +154,7 @@ def chamber_terms(machine: Machine, joint: str, signals: CylinderSignals) -> tup
             ],
         ]
     )
-    states = np.array([[signals.p_a, np.log(volume_a)], [signals.p_b, np.log(volume_b)]])
-    return states, columns
+    return np.array([[signals.p_a, np.log(volume_a)], [signals.p_b, np.log(volume_b)]]), columns
 
 
 def _signed_sqrt(drop: Array) -> Array:

@@ -25,7 +25,7 @@ from crane.identification.hydraulics.cylinder_signals import (
     cylinder_and_valve,
     joint_velocity,
 )
-from crane.identification.signals.steady_samples import steady_means
+from crane.identification.signals.signal_quality import steady_means
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 
@@ -122,7 +122,7 @@ class ValveCurve(Result):
 
     def predict(self, signal: Array) -> Array:
         """Steady speeds of signals (N,) [V]."""
-        return _steady_speed(self.values, signal, np.sign(self.signal_range))
+        return _steady_speed(self.values, signal, np.sign(self.signal_range))[0]
 
     def to_text(self, unit: str = "m") -> str:
         """Table of all parameters."""
@@ -201,10 +201,8 @@ def identify_valve(
     at = at[:: max(1, len(at) // 4000)]
     U, speeds = signal[at], v[at]
     values = _fit_curve(U, speeds, sign, fastest)
-    J = _steady_speed_jacobian(values, U, sign)
-    estimate = estimators.least_squares(
-        J, speeds - _steady_speed(values, U, sign) + J @ values, samples=at
-    )
+    fitted, J = _steady_speed(values, U, sign)
+    estimate = estimators.least_squares(J, speeds - fitted + J @ values, samples=at)
     return ValveCurve(
         joint=joint,
         values=values,
@@ -219,19 +217,12 @@ def identify_valve(
     )
 
 
-def _steady_speed(values: Array, U: Array, sign: float) -> Array:
+def _steady_speed(values: Array, U: Array, sign: float) -> tuple[Array, Array]:
+    """Steady speeds (M,) of signals (M,), and their Jacobian (M, 4)."""
     up, down, s_up, s_down = values
     rising, falling = np.maximum(sign * (U - up), 0), np.maximum(sign * (down - U), 0)
-    return np.asarray(s_up * rising - s_down * falling)
-
-
-def _steady_speed_jacobian(values: Array, U: Array, sign: float) -> Array:
-    """Jacobian (M, 4) of `_steady_speed`."""
-    up, down, s_up, s_down = values
-    rising, falling = np.maximum(sign * (U - up), 0), np.maximum(sign * (down - U), 0)
-    return np.column_stack(
-        [-sign * s_up * (rising > 0), -sign * s_down * (falling > 0), rising, -falling]
-    )
+    columns = [-sign * s_up * (rising > 0), -sign * s_down * (falling > 0), rising, -falling]
+    return s_up * rising - s_down * falling, np.column_stack(columns)
 
 
 def _fit_curve(U: Array, v: Array, sign: float, fastest: float) -> Array:
@@ -248,10 +239,10 @@ def _fit_curve(U: Array, v: Array, sign: float, fastest: float) -> Array:
     volts, rate = float(np.ptp(U)), float(np.abs(start[2:]).max())
 
     def residuals(x: Array) -> Array:
-        return _steady_speed(x, U, sign) - v
+        return _steady_speed(x, U, sign)[0] - v
 
     def jacobian(x: Array) -> Array:
-        return _steady_speed_jacobian(x, U, sign)
+        return _steady_speed(x, U, sign)[1]
 
     scale = [volts, volts, rate, rate]
     fine = 1e-14

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from crane.closure.constraint_structure import Indices
+from crane.closure.coordinates import Indices
 from crane.common.errors import ClosureError, InputError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.model_term import MotionSamples
+from crane.identification.mechanics.model_terms import MotionSamples
 from crane.machine.machine import Machine
 
 _RANK_TOLERANCE = 1e-8  # independent part of a column, relative to its norm
@@ -63,8 +63,7 @@ class BaseParameters(OneLineRepr):
         small independent part may together be dependent.
         """
         names, units = [self.names[i] for i in self.independent], self.units[self.independent]
-        order = _pivot_order(rows)
-        identifiable = group_parameters(names, rows, units, order.index)
+        identifiable = group_parameters(names, rows, units, _pivot_order(rows).index)
         if identifiable.rank == self.rank:
             return self
         independent = self.independent[identifiable.independent]
@@ -163,9 +162,13 @@ def base_parameters(
     norms = np.linalg.norm(rows, axis=0) * units
     if norms[bodies:].any():  # other parameters are compared among themselves
         units[bodies:] = norms[:bodies].max(initial=0.0) / norms[bodies:].max() or 1.0
-    return group_parameters(
-        model.names, rows, units, lambda column: _column_preference(model, column)
-    )
+
+    def preference(column: int) -> tuple[int, int, int]:
+        if column >= bodies:  # after those of bodies, distal ones first
+            return (1, 0, column)
+        return (0, _PREFERENCE_ORDER[model.names[column].rpartition(".")[2]], -column)
+
+    return group_parameters(model.names, rows, units, preference)
 
 
 def group_parameters(
@@ -217,12 +220,3 @@ def _pivot_order(columns: Array) -> list[int]:
             direction = rest[:, order[-1]] / length
             rest -= np.outer(direction, direction @ rest)
     return order
-
-
-def _column_preference(model: IdentificationModel, column: int) -> tuple[int, int, int]:
-    """Preference of a column: bodies before other parameters, distal bodies first."""
-    bodies = 10 * len(model.bodies)
-    if column >= bodies:
-        return (1, 0, column)
-    kind = model.names[column].rpartition(".")[2]
-    return (0, _PREFERENCE_ORDER[kind], -column)

@@ -12,13 +12,12 @@ from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_number
 from crane.common.units import format_table
-from crane.identification.mechanics.equation_setup import RecordingOrMotion, prepare_motions
 from crane.identification.mechanics.feasible_parameters import load_convex_solver
+from crane.identification.mechanics.identifiability import prior_from_names, read_priors
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.priors import prior_from_names, read_priors
-from crane.identification.mechanics.regression_equations import Progress, RegressionEquations
-from crane.identification.signals.signal_processing import Motion
+from crane.identification.mechanics.identify import RecordingOrMotion, identify, prepare_motions
+from crane.identification.mechanics.regression_equations import RegressionEquations
+from crane.identification.signals.signal_processing import Motion, Progress
 from crane.machine.machine import Machine
 
 FOLD_COUNT = 5
@@ -85,7 +84,10 @@ def cross_validate(
         for values in itertools.product(*candidates.values())
     ]
     _check_settings(machine, grid, options)
-    lowest = _comparison_bandwidth(machine, candidates, options)
+    # all are compared at the lowest one, None for that of the first identification
+    lowest = options.get("bandwidth") or machine.estimation.bandwidth
+    if _BANDWIDTH in candidates:
+        lowest = min(map(_read_frequency, candidates[_BANDWIDTH]))
     trials, reason = list[CrossValidationTrial](), ""
     for done, settings in enumerate(grid):
         errors = np.full(FOLD_COUNT, np.inf)
@@ -105,12 +107,11 @@ def cross_validate(
     return sorted(trials, key=lambda trial: trial.mean_error)
 
 
-def identify_options(trial: CrossValidationTrial, options: Mapping[str, Any]) -> dict[str, Any]:
+def identify_options(settings: Mapping[str, object], options: Mapping[str, Any]) -> dict[str, Any]:
     """Options of `identify` for the settings of a trial and other options."""
-    prior_settings = {name: what for name, what in trial.settings.items() if name != _BANDWIDTH}
-    out = dict(options)
-    if _BANDWIDTH in trial.settings:
-        out["bandwidth"] = _read_frequency(trial.settings[_BANDWIDTH])
+    out, prior_settings = dict(options), dict(settings)
+    if _BANDWIDTH in prior_settings:
+        out["bandwidth"] = _read_frequency(prior_settings.pop(_BANDWIDTH))
     if prior_settings:
         given_prior = {} if (given := out.get("prior")) is None else given
         if not isinstance(given_prior, Mapping | int | float):
@@ -148,7 +149,7 @@ def _check_settings(
                 as_number(_read_frequency(value), "the bandwidth", "Hz", greater_than=0)
             else:
                 prior_from_names(model, read_priors({name: value}), np.ones(len(model.names)))
-        identify_options(CrossValidationTrial(settings, np.empty(0)), options)
+        identify_options(settings, options)
 
 
 def _read_frequency(value: object) -> float:
@@ -156,15 +157,6 @@ def _read_frequency(value: object) -> float:
         return float(str(value))
     except ValueError:
         raise InputError(f"bandwidth is '{value}', give numbers in Hz") from None
-
-
-def _comparison_bandwidth(
-    machine: Machine, candidates: Mapping[str, Sequence[object]], options: Mapping[str, Any]
-) -> float | None:
-    """Bandwidth of the comparison; None for that of the first identification."""
-    if _BANDWIDTH in candidates:
-        return min(map(_read_frequency, candidates[_BANDWIDTH]))
-    return options.get("bandwidth") or machine.estimation.bandwidth
 
 
 def _held_out_error(
@@ -184,15 +176,14 @@ def _held_out_error(
     for motion in motions:
         edges = np.linspace(0, len(motion.time), FOLD_COUNT + 1).astype(int)
         start, stop = edges[fold], edges[fold + 1]
-        held_out.append(_slice_motion(motion, slice(start, stop)))
+        held_out.append(motion[start:stop])
         training += [
-            _slice_motion(motion, part)
+            motion[part]
             for part in (slice(0, start), slice(stop, None))
             if len(motion.time[part]) >= _MIN_FOLD_SAMPLES
         ]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        trial = identify_options(CrossValidationTrial(settings, np.empty(0)), options)
+    with warnings.catch_warnings(action="ignore", category=CraneWarning):
+        trial = identify_options(settings, options)
         # checks are not reliable on folds; the complete recordings were checked
         identification = identify(machine, training, **trial | {"trust": True})
         held_out_equations = RegressionEquations(
@@ -207,10 +198,3 @@ def _held_out_error(
             if held_out_equations.is_moving.any()
             else np.nan
         )
-
-
-def _slice_motion(motion: Motion, part: slice) -> Motion:
-    return Motion(
-        motion.time[part], motion.q[part], motion.v[part], motion.a[part], motion.tau[part],
-        motion.passband,
-    )  # fmt: skip

@@ -8,9 +8,9 @@ with positive mass density, if and only if the pseudo-inertia
 is positive definite (Wensing, Kim, Slotine 2018, IEEE Robotics and Automation Letters 3(1)).
 """
 
+import math
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,13 @@ import numpy as np
 from crane.common.errors import CraneError, InputError
 from crane.common.optional_libraries import import_optional_library
 from crane.common.samples import Array
-from crane.description.inertia_feasibility import inertia_problem
+from crane.identification.estimation.estimators import Estimate, Prior, RegressionProblem
+from crane.identification.mechanics.base_parameters import BaseParameters
+from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.regression_equations import (
+    ProjectedRegressor,
+    RegressionEquations,
+)
 
 _MIN_EIGENVALUE = 1e-4  # smallest eigenvalue of X
 _SOLVER_TOLERANCES = {
@@ -28,25 +34,11 @@ _SOLVER_TOLERANCES = {
 }
 _CAUTIOUS_OPTIONS = {"max_step_fraction": 0.9, "static_regularization_constant": 1e-7}
 _SCS_OPTIONS = {"eps": 1e-7, "max_iters": 20000}
-_SINGULARITY_TOLERANCE = 1e-10  # smallest over largest eigenvalue of the second moments of a prior
-
-
-@dataclass(frozen=True, eq=False)
-class FeasibleSolution:
-    """Physically feasible estimate.
-
-    Attributes:
-        values: (p,) m, mcx, mcy, mcz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz of each body, then the others.
-        misfit: |weights (W values - y)|^2.
-        divergence: (nb,) divergence of each body from its prior [1].
-        smallest_eigenvalues: (nb,) smallest eigenvalue of the pseudo-inertia of each body [kg], in
-            a length unit in which the second moments of the prior have the trace of its mass.
-    """
-
-    values: Array
-    misfit: float
-    divergence: Array
-    smallest_eigenvalues: Array
+_MIN_NOISE_SHARE = 1e-4  # least noise of a feasible estimate, relative to the forces
+_DEFAULT_RELATIVE_STD = 0.3  # default relative standard deviation of the prior of a body
+_UNINFORMATIVE_STD = 1e3  # that of a body without a prior
+_ROUNDING = 1e-9
+_MIN_THICKNESS = 0.05  # least thickness of a body in a prior, relative to its size
 
 
 def pseudo_inertia(parameters: Array) -> Array:
@@ -66,6 +58,11 @@ def body_size(body: Array) -> tuple[float, float]:
     """Mass [kg] and root mean square distance of the mass from the origin [m]."""
     P = pseudo_inertia(body)
     return float(body[0]), float(np.sqrt(max(np.trace(P[:3, :3]), 0.0) / body[0]))
+
+
+def body_units(mass: float, length: float) -> Array:
+    """Units m, m l and m l^2 (10,) of the parameters of a body."""
+    return mass * np.array([1.0, *[length] * 3, *[length**2] * 6])
 
 
 def body_parameters(P: Array) -> Array:
@@ -92,10 +89,10 @@ def solve_feasible(
     weights: Array,
     bodies: Sequence[str],
     prior: Array,
-    prior_weight: float | Array,
-    parameter_std: Array | None = None,
+    prior_weight: Array,
+    parameter_std: Array,
     nonnegative: Sequence[int] = (),
-) -> FeasibleSolution:
+) -> Array:
     """Minimize misfit and divergence from a prior over physically feasible bodies.
 
         |weights (W theta - y)|^2 + sum_b prior_weight_b 2 d(P_b, P0_b)
@@ -115,33 +112,34 @@ def solve_feasible(
         weights: One over the noise of each row (m,).
         bodies: Names of the bodies (nb,).
         prior: Prior means (p,), with feasible bodies.
-        prior_weight: Positive weight of each body (nb,) or of all.
-        parameter_std: Prior standard deviations (p - 10 nb,) of the other parameters; default
-            infinite, without a prior.
+        prior_weight: Positive weight of each body (nb,).
+        parameter_std: Prior standard deviations (p - 10 nb,) of the other parameters; infinite
+            without a prior.
         nonnegative: Columns of other parameters that must not be negative, such as friction.
 
+    Returns:
+        (p,) m, mcx, mcy, mcz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz of each body, then the others.
+
     Raises:
-        InputError: Shapes differ, a body of the prior is not feasible, or CVXPY is missing.
+        InputError: A body of the prior is not feasible, or CVXPY is missing.
         CraneError: The solver fails.
 
     Source: Lee, Wensing, Park 2020, IEEE Transactions on Robotics 36(1).
     """
     cp = load_convex_solver()
     size, split = np.shape(W)[1], 10 * len(bodies)
-    parameter_std = (
-        np.full(size - split, np.inf) if parameter_std is None else np.asarray(parameter_std)
-    )
-    prior_weight = np.broadcast_to(np.asarray(prior_weight, np.float64), len(bodies))
-    _check_arguments(W, y, weights, prior, prior_weight, parameter_std, nonnegative, split)
     factors = [
         _prior_factor(body, p)
         for body, p in zip(bodies, prior[:split].reshape(-1, 10), strict=True)
     ]
 
     # triangular factor of the weighted [W y]
-    weighted_factor = np.linalg.qr(np.column_stack([W, y]) * np.asarray(weights)[:, None]).R
+    weighted_factor = np.linalg.qr(np.column_stack([W, y]) * weights[:, None]).R
     R, d = weighted_factor[:size, :size], weighted_factor[:size, size]
-    maps = [_scaled_parameter_map(L) for L in factors]
+    # from vec(X) to the ten parameters of L X L^T
+    basis = np.eye(16).reshape(16, 4, 4)
+    symmetric = 0.5 * (basis + np.swapaxes(basis, 1, 2))
+    maps = [body_parameters(L @ symmetric @ L.T).T for L in factors]
     # The unknowns are near zero: X - 1, and the other parameters relative to their estimate for
     # the bodies of the prior, in units of the forces or of their prior.
     d = d - R[:, :split] @ prior[:split]
@@ -162,28 +160,15 @@ def solve_feasible(
     cost = cp.sum_squares(scale * (prior_root * unit @ z - prior_root @ prior_offset))
     constraints = [z[bounded] >= -start[bounded] / unit[bounded]]
     for b, x in enumerate(X):
-        block = R[:, 10 * b : 10 * b + 10] @ maps[b]
-        model = model + block @ cp.vec(x - np.eye(4), order="F")
+        model = model + R[:, 10 * b : 10 * b + 10] @ maps[b] @ cp.vec(x - np.eye(4), order="F")
         cost += 2 * prior_weight[b] * scale**2 * (cp.trace(x) - cp.log_det(x) - 4)
         constraints.append(x >> _MIN_EIGENVALUE * np.eye(4))
     problem = cp.Problem(cp.Minimize(cp.sum_squares(scale * model) + cost), constraints)
     _solve_convex_problem(problem)
-    solved = [0.5 * (x.value + x.value.T) for x in X]
     others = start + unit * z.value
     others[bounded] = np.maximum(others[bounded], 0)  # rounding errors
-    inertias = [L @ x @ L.T for L, x in zip(factors, solved, strict=True)]
-    values = np.concatenate([*(body_parameters(P) for P in inertias), others])
-    return FeasibleSolution(
-        values,
-        float(np.sum((weights * (W @ values - y)) ** 2)),
-        np.array([np.trace(x) - np.linalg.slogdet(x)[1] - 4 for x in solved]),
-        np.array(
-            [
-                np.linalg.eigvalsh(_normalized_inertia(P, L @ L.T))[0]
-                for P, L in zip(inertias, factors, strict=True)
-            ]
-        ),
-    )
+    inertias = [L @ (0.5 * (x.value + x.value.T)) @ L.T for L, x in zip(factors, X, strict=True)]
+    return np.concatenate([*map(body_parameters, inertias), others])
 
 
 def _solve_convex_problem(problem: Any) -> None:
@@ -218,38 +203,7 @@ def divergence_hessian_root(body: Array) -> Array:
     """
     cholesky_factor = np.linalg.cholesky(pseudo_inertia(body))
     first = np.linalg.solve(cholesky_factor, pseudo_inertia(np.eye(10)))
-    transformed = np.linalg.solve(cholesky_factor, np.swapaxes(first, 1, 2))
-    return transformed.reshape(10, 16).T
-
-
-def _check_arguments(
-    W: Array,
-    y: Array,
-    weights: Array,
-    prior: Array,
-    prior_weight: Array,
-    parameter_std: Array,
-    nonnegative: Sequence[int],
-    split: int,
-) -> None:
-    count, size = np.shape(W)
-    shapes = {"y": (y, (count,)), "weights": (weights, (count,)), "prior": (prior, (size,))}
-    shapes["spread"] = (parameter_std, (size - split,))
-    for name, (array, shape) in shapes.items():
-        if size < split or np.shape(array) != shape:
-            raise InputError(
-                f"{name} has the shape {np.shape(array)}, give {shape} for the regressor "
-                f"{(count, size)} with {split} columns of bodies"
-            )
-    for name, array in (("regressor", W), ("y", y), ("weights", weights), ("prior", prior)):
-        if not np.isfinite(array).all():
-            raise InputError(f"{name} is not finite, leave such rows out")
-    if not (prior_weight > 0).all() or not (parameter_std > 0).all():
-        raise InputError("weight and spread of the prior are not above 0, give larger ones")
-    if not all(split <= i < size for i in nonnegative):
-        raise InputError(
-            f"nonnegative columns {list(nonnegative)}, choose of {split} to {size - 1}"
-        )
+    return np.linalg.solve(cholesky_factor, np.swapaxes(first, 1, 2)).reshape(10, 16).T
 
 
 def _prior_factor(body: str, parameters: Array) -> Array:
@@ -258,32 +212,123 @@ def _prior_factor(body: str, parameters: Array) -> Array:
     Raises:
         InputError: The body is not feasible, or flat.
     """
-    P = pseudo_inertia(parameters)
-    mass, first = parameters[0], parameters[1:4]
-    if mass <= 0:
-        raise InputError(f"prior of '{body}' has the mass {mass:.4g} kg, give it a positive one")
-    second = P[:3, :3] - np.outer(first, first) / mass
-    problem = inertia_problem(mass, np.trace(second) * np.eye(3) - second)
-    if problem:
-        raise InputError(f"prior of '{body}' has {problem}")
-    values = np.linalg.eigvalsh(second)
-    if values[0] <= _SINGULARITY_TOLERANCE * values[-1]:
+    try:
+        return np.asarray(np.linalg.cholesky(pseudo_inertia(parameters)), dtype=np.float64)
+    except np.linalg.LinAlgError:
         raise InputError(
-            f"prior of '{body}' is flat: second moments of mass {values[0]:.3g}, {values[1]:.3g}, "
-            f"{values[2]:.3g} kg m2 about its centre, give it some thickness"
+            f"prior of '{body}' is flat or no possible body: give it a positive mass, possible "
+            "moments of inertia, and some thickness"
+        ) from None
+
+
+def feasible_estimate(
+    model: IdentificationModel,
+    base: BaseParameters,
+    equations: RegressionEquations,
+    selection: Array,
+    unconstrained: Estimate,
+    prior: Prior | None,
+) -> Estimate:
+    """Estimate all parameters with feasible bodies and nonnegative friction.
+
+    The covariance is that of the minimum of the cost of `solve_feasible`,
+
+        H^-1 (W^T D C D W + P) H^-1,    H = W^T D W + P,    D = 1 / noise^2,
+
+    with the covariance C of the residuals, and P half of the second derivative of the prior terms
+    at the estimate. Active bounds of friction are not used as information, so intervals there are
+    rather too wide.
+
+    Args:
+        model: The model, with bodies.
+        base: Base parameters that the recording determines.
+        equations: Regression equations of the recording.
+        selection: (., r) selection of their columns in the equations.
+        unconstrained: Unconstrained estimate of the base parameters, for its noise.
+        prior: Prior of all parameters; default the described bodies.
+
+    Returns:
+        Estimate of all parameters (p,).
+
+    Raises:
+        InputError: A body is described without mass.
+    """
+    count = 10 * len(model.bodies)
+    described = (model.nominal if prior is None else prior[0])[:count]
+    for link, mass in zip(model.bodies, described[::10].tolist(), strict=True):
+        if not mass > 0:
+            raise InputError(
+                f"'{link}' is described without mass, give it a rough one, or leave feasible out"
+            )
+    mean = np.array(model.nominal if prior is None else prior[0])
+    body_weights = np.full(len(model.bodies), _DEFAULT_RELATIVE_STD**-2)
+    parameter_std, parameter_weights = np.full(len(mean) - count, np.inf), np.zeros(count)
+    if prior is not None:
+        # the divergence takes the relative standard deviation of a body as prior, what single
+        # parameters are known better by is beside it
+        std, parameter_std = prior[1][:count], prior[1][count:]
+        units = np.array([body_units(*body_size(body)) for body in mean[:count].reshape(-1, 10)])
+        share = np.minimum((std.reshape(-1, 10) / units).max(axis=1), _UNINFORMATIVE_STD)
+        excess = std**-2.0 - (share[:, None] * units).ravel() ** -2.0
+        body_weights = share**-2.0
+        parameter_weights = np.where(excess * std**2 > _ROUNDING, excess, 0.0)
+    for i in range(0, count, 10):
+        mean[i : i + 10] = thicken_body(mean[i : i + 10])
+    nonnegative = [i for i, sign in enumerate(model.nonnegative) if sign and i >= count]
+    # the triangular factors have the same column norms and products as the rows
+    K = selection @ base.grouping
+    W, y = (
+        equations.stacked_factors(K),
+        equations.triangular_factors[:, :, -1].ravel(),
+    )
+    size = np.linalg.norm(y) / np.sqrt(len(equations.y))
+    noise = np.maximum(unconstrained.noise, _MIN_NOISE_SHARE * size)
+    # no other parameter exceeds the whole force; without this, two parameters with the same effect
+    # could grow without bound
+    single_forces = np.linalg.norm(W[:, count:], axis=0) / np.sqrt(len(equations.y))
+    parameter_std = np.minimum(
+        parameter_std, size / np.where(single_forces > 0, single_forces, size)
+    )
+    weights = np.repeat(1 / noise, equations.triangular_factors.shape[1])
+    # prior of single parameters of a body beyond that of the body
+    prior_rows = np.diag(np.sqrt(parameter_weights))[parameter_weights > 0]
+    W = np.vstack(
+        [W, np.column_stack([prior_rows, np.zeros((len(prior_rows), len(parameter_std)))])]
+    )
+    y = np.append(y, prior_rows @ described)
+    weights = np.append(weights, np.ones(len(prior_rows)))
+    solution = solve_feasible(
+        W, y, weights, model.bodies, mean, body_weights, parameter_std, nonnegative
+    )
+    prior_root = np.zeros((16 * len(model.bodies) + len(mean), len(mean)))
+    for i, each in enumerate(body_weights):
+        body = slice(10 * i, 10 * i + 10)
+        prior_root[16 * i : 16 * i + 16, body] = np.sqrt(each) * divergence_hessian_root(
+            solution[body]
         )
-    return np.asarray(np.linalg.cholesky(P), dtype=np.float64)
+    prior_root[-len(mean) :] = np.diag(np.append(np.sqrt(parameter_weights), 1 / parameter_std))
+    # the covariance of weighted least squares for a prior with these rows
+    rows = RegressionProblem(
+        ProjectedRegressor(equations, K),
+        None,
+        equations.y,
+        equations.groups,
+        equations.samples,
+        None,
+        prior_root,
+    )
+    return rows.evaluate_estimate(solution, rows.residuals(solution), noise, math.inf)
 
 
-def _scaled_parameter_map(L: Array) -> Array:
-    """Matrix (10, 16) from vec(X) to the ten parameters of P = L X L^T."""
-    basis = np.eye(16).reshape(16, 4, 4)
-    symmetric = 0.5 * (basis + np.swapaxes(basis, 1, 2))
-    return body_parameters(L @ symmetric @ L.T).T
+def thicken_body(body: Array) -> Array:
+    """Body with a least thickness in every direction.
 
-
-def _normalized_inertia(P: Array, prior: Array) -> Array:
-    """P in a length unit in which the second moments of the prior have the trace of its mass."""
-    length = np.sqrt(np.trace(prior[:3, :3]) / prior[3, 3])
-    unit = np.array([1 / length] * 3 + [1.0])
-    return P * np.outer(unit, unit)
+    Rods and plates without thickness are on the boundary of feasibility.
+    """
+    P = pseudo_inertia(body)
+    mass, length = body_size(body)
+    com = P[:3, 3] / mass
+    values, axes = np.linalg.eigh(P[:3, :3] - mass * np.outer(com, com))
+    least = mass * (_MIN_THICKNESS * length) ** 2
+    P[:3, :3] = axes @ np.diag(np.maximum(values, least)) @ axes.T + mass * np.outer(com, com)
+    return body_parameters(P)

@@ -3,29 +3,26 @@
 import fnmatch
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name, suggest_names
 from crane.common.samples import Array, as_number, as_samples
 from crane.description.estimation_settings import TermValues
 from crane.dynamics.joint_forces import JointForces
-from crane.identification.mechanics.force_terms import (
+from crane.identification.mechanics.model_terms import (
+    ForceDirection,
     FrictionalMemory,
     GasSpringTerm,
-    PreslidingFriction,
-    friction_term,
-    root_friction_term,
-)
-from crane.identification.mechanics.model_term import (
-    ForceDirection,
     InertialTerm,
     ModelTerm,
     MotionSamples,
+    PreslidingFriction,
     RotorInertiaTerm,
     body_names,
+    friction_term,
+    root_friction_term,
 )
 from crane.machine.machine import Machine
 
@@ -70,27 +67,20 @@ class IdentificationModel:
         self.terms = list(terms)
         self.terms.sort(key=lambda term: not isinstance(term, InertialTerm))
         self.names = tuple(name for term in self.terms for name in term.names)
-        repeated_names = {name for name in self.names if self.names.count(name) > 1}
-        if repeated_names:
-            raise InputError(
-                f"two terms have the parameter '{sorted(repeated_names)[0]}', keep one"
-            )
+        for name in sorted(self.names):
+            if self.names.count(name) > 1:
+                raise InputError(f"two terms have the parameter '{name}', keep one")
         self.nominal = np.concatenate([term.nominal for term in self.terms])
         self.nonnegative = tuple(sign for term in self.terms for sign in term.nonnegative)
-        has_bodies = isinstance(self.terms[0], InertialTerm)
-        self.bodies = body_names(machine) if has_bodies else ()
-        estimated_springs = {
-            name.removesuffix(".gas_scale") for name in self.names if name.endswith(".gas_scale")
-        }
+        self.bodies = body_names(machine) if isinstance(self.terms[0], InertialTerm) else ()
         fixed_springs = tuple(
-            spring for spring in machine.gas_springs if spring.joint not in estimated_springs
+            x for x in machine.gas_springs if f"{x.joint}.gas_scale" not in self.names
         )
         self._joint_forces = JointForces(machine.replace(gas_springs=fixed_springs))
-        estimated_rotors = [
-            joint for joint in machine.joints if f"{joint}.rotor_inertia" in self.names
-        ]
         self._rotor_inertias = np.array(machine.model.armature)
-        self._rotor_inertias[[machine.column(joint) for joint in estimated_rotors]] = 0.0
+        for joint in machine.joints:
+            if f"{joint}.rotor_inertia" in self.names:
+                self._rotor_inertias[machine.column(joint)] = 0.0
         self._known_forces_function = known_forces
 
     def samples(
@@ -129,25 +119,13 @@ class IdentificationModel:
         return np.einsum("kij,ki->kj", samples.gamma, force)
 
 
-@dataclass(frozen=True)
-class TermKind:
-    """Kind of a term.
-
-    Attributes:
-        description: Text of its values.
-        value_count: Least and largest number of values.
-    """
-
-    description: str = ""
-    value_count: tuple[int, int] = (0, 0)
-
-
 TERM_KINDS = {
-    **{name: TermKind() for name in (*_FRICTION_KINDS, "root", "rotor_inertia", "gas_scale")},
-    "stiction": TermKind("the Stribeck velocities", (0, 9)),
-    "presliding": TermKind("the characteristic distance", (1, 1)),
-    "memory": TermKind("the time constant and the characteristic speed", (2, 2)),
+    **dict.fromkeys((*_FRICTION_KINDS, "root", "rotor_inertia", "gas_scale"), (0, 0, "")),
+    "stiction": (0, 9, "the Stribeck velocities"),
+    "presliding": (1, 1, "the characteristic distance"),
+    "memory": (2, 2, "the time constant and the characteristic speed"),
 }
+"""Least and largest number of values of a kind of term, and what they are."""
 
 
 def default_terms(machine: Machine) -> list[ModelTerm]:
@@ -172,15 +150,12 @@ def select_terms(machine: Machine, changes: TermChanges) -> list[ModelTerm]:
     values_by_element, requested = _default_kinds(machine), set()
     for name, values in (*machine.estimation.terms.items(), *changes.items()):
         where, _, kind = name.rpartition(".")
-        if kind not in TERM_KINDS:
-            raise InputError(
-                f"term '{name}': '{kind}' is unknown, {suggest_names(TERM_KINDS, kind)}"
-            )
+        check_name(kind, TERM_KINDS, f"term '{name}': '{kind}' is unknown")
         if not where:
             raise InputError(f"term '{name}' does not say of what, write q1.{kind} or q*.{kind}")
-        low, high = TERM_KINDS[kind].value_count
+        low, high, description = TERM_KINDS[kind]
         if values is not None and not low <= len(values) <= high:
-            hint = f"give {TERM_KINDS[kind].description}" if high else "it takes none"
+            hint = f"give {description}" if high else "it takes none"
             raise InputError(f"term '{name}' has {len(values)} values, {hint}")
         for number in values or ():
             as_number(number, f"a value of term '{name}'", "", greater_than=0)
@@ -228,8 +203,7 @@ def _default_kinds(machine: Machine) -> dict[str, dict[str, TermValues]]:
     }
     for joint in machine.joints:
         law = machine.friction.get(joint)
-        has_coulomb = law is not None and law.coulomb > 0
-        kinds = ("coulomb", "viscous") if has_coulomb else ("viscous",)
+        kinds = ("coulomb", "viscous") if law is not None and law.coulomb > 0 else ("viscous",)
         values_by_element.setdefault(joint, dict.fromkeys(kinds, ()))
     return values_by_element
 
@@ -239,7 +213,8 @@ def _matching_elements(machine: Machine, where: str, kind: str) -> list[str]:
     if kind == "gas_scale":
         names = [spring.joint for spring in machine.gas_springs]
     elif where not in machine.joints and (direction := parse_combination(where)) is not None:
-        return [] if direction.has_locked_joint(machine) else [where]
+        is_locked = not machine.locked_joints.keys().isdisjoint(direction.factors or ())
+        return [] if is_locked else [where]
     else:
         names = list(machine.joints)
     found = [where] if where in names else fnmatch.filter(names, where)
@@ -262,14 +237,16 @@ def _build_terms(
             terms.append(RotorInertiaTerm(machine, direction))
         friction_kinds = [kind for kind in _FRICTION_KINDS if kind in kinds]
         if friction_kinds or "stiction" in kinds:
-            stribeck_velocities = kinds.get("stiction")
-            if stribeck_velocities == ():
-                stribeck_velocities = (_described_stribeck_velocity(machine, where),)
-            terms.append(
-                friction_term(
-                    machine, direction, friction_kinds, stribeck=stribeck_velocities or ()
-                )
-            )
+            stribeck = kinds.get("stiction", ())
+            if "stiction" in kinds and not stribeck:
+                law = machine.friction.get(where)
+                if law is None or not law.stiction:
+                    raise InputError(
+                        f"term '{where}.stiction' needs the velocity over which it fades, which "
+                        "the machine does not have: give it"
+                    )
+                stribeck = (law.stribeck,)
+            terms.append(friction_term(machine, direction, friction_kinds, stribeck=stribeck))
         if "root" in kinds:
             terms.append(root_friction_term(machine, direction))
         if "presliding" in kinds:
@@ -277,14 +254,3 @@ def _build_terms(
         if "memory" in kinds:
             terms.append(FrictionalMemory(machine, direction, *kinds["memory"]))
     return terms
-
-
-def _described_stribeck_velocity(machine: Machine, joint: str) -> float:
-    """Stribeck velocity of a joint by the description."""
-    law = machine.friction.get(joint)
-    if law is None or not law.stiction:
-        raise InputError(
-            f"term '{joint}.stiction' needs the velocity over which it fades, which the machine "
-            "does not have: give it"
-        )
-    return law.stribeck

@@ -14,7 +14,7 @@ from crane.common.atomic_output import replace_file
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.units import format_table
-from crane.identification.estimation.regression_problem import Estimate, confidence_intervals
+from crane.identification.estimation.estimators import Estimate, EstimatedValues
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.force_comparison import ForceComparison
 from crane.identification.mechanics.identifiability import weak_directions
@@ -26,7 +26,7 @@ _MAX_SHOWN = 3  # directions in a table
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Identification(Result):
+class Identification(EstimatedValues, Result):
     """Result of an identification.
 
     Attributes:
@@ -41,7 +41,8 @@ class Identification(Result):
         method: Name of the estimator.
         feasible: Whether every body of `parameters` is physically feasible.
         training: Comparison of forces on the training data.
-        magnitude: (r,) magnitudes of the base parameters, see `base_magnitudes`.
+        magnitude: (r,) magnitudes of the base parameters: sqrt(sum_j (K_ij s_j)^2) for the group
+            K_i and the `parameter_magnitudes` s.
         advice: Text that recommends a motion for the parameters that are not determined.
         speeds: Least and largest speed of the training data by direction of friction [m/s],
             [rad/s].
@@ -88,13 +89,9 @@ class Identification(Result):
         return tuple(self.base.names[i] for i in self.base.independent)
 
     @property
-    def std(self) -> Array:
-        """Standard deviations (r,)."""
-        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))  # negative by rounding only
-
-    def interval(self, level: float = 0.95) -> Array:
-        """Confidence intervals (r, 2) of a level."""
-        return confidence_intervals(self.values, self.std, self.estimate.degrees_of_freedom, level)
+    def degrees_of_freedom(self) -> float:  # type: ignore[override]
+        """Degrees of freedom of the covariance."""
+        return self.estimate.degrees_of_freedom
 
     @cached_property
     def marks(self) -> tuple[str, ...]:

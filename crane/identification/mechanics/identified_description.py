@@ -1,7 +1,7 @@
 """Description of an identified machine: friction laws, and URDF content."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
@@ -16,14 +16,19 @@ from crane.common.samples import Array
 from crane.description.force_elements import Friction
 from crane.dynamics.dynamics import Dynamics
 from crane.formats.visuals.mesh_files import find_mesh_file
-from crane.identification.mechanics.feasible_estimate import thicken_body
-from crane.identification.mechanics.feasible_parameters import body_parameters, pseudo_inertia
-from crane.identification.mechanics.force_terms import (
-    FrictionTerm,
-    VelocityFriction,
+from crane.identification.mechanics.feasible_parameters import (
+    body_parameters,
+    pseudo_inertia,
+    thicken_body,
 )
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.model_term import ForceDirection, body_names
+from crane.identification.mechanics.model_terms import (
+    DirectionalTerm,
+    ForceDirection,
+    FrictionTerm,
+    VelocityFriction,
+    body_names,
+)
 from crane.machine.machine import Machine
 
 SpeedRanges = Mapping[str, tuple[float, float]]
@@ -60,22 +65,9 @@ _URDF_TEMPLATE = """<?xml version="1.0"?>
 """
 
 
-@dataclass(frozen=True)
-class FrictionLawFit:
-    """Friction law that replaces identified friction terms.
-
-    Attributes:
-        law: The friction law.
-        max_deviation: Largest difference at a steady speed [N], [N m]; 0 if the law is exact.
-    """
-
-    law: Friction
-    max_deviation: float = 0.0
-
-
 def friction_laws(
     model: IdentificationModel, parameters: Array, speed_ranges: SpeedRanges
-) -> dict[str, FrictionLawFit]:
+) -> tuple[dict[str, Friction], dict[str, float]]:
     """Friction law of each direction with friction terms in the model.
 
     Terms that a machine file does not contain (presliding, frictional memory, root of the speed,
@@ -87,6 +79,10 @@ def friction_laws(
         parameters: All parameters (p,).
         speed_ranges: Least and largest speed of the comparison by direction [m/s], [rad/s].
 
+    Returns:
+        Laws by direction; and of those that are not exact the largest difference at a steady
+        speed [N], [N m].
+
     Raises:
         InputError: Identified friction is negative.
     """
@@ -95,16 +91,18 @@ def friction_laws(
     for term in model.terms:
         if isinstance(term, FrictionTerm):
             terms_by_direction.setdefault(term.direction.name, []).append(term)
-    return {
-        name: _exact_law(model, name, terms, values)
-        or _nearest_law(name, terms, values, speed_ranges[name])
-        for name, terms in terms_by_direction.items()
-    }
+    laws, deviations = dict[str, Friction](), dict[str, float]()
+    for name, terms in terms_by_direction.items():
+        law = _exact_law(model, name, terms, values)
+        if law is None:
+            law, deviations[name] = _nearest_law(terms, values, speed_ranges[name])
+        laws[name] = law
+    return laws, deviations
 
 
 def _exact_law(
     model: IdentificationModel, name: str, terms: list[FrictionTerm], values: Mapping[str, float]
-) -> FrictionLawFit | None:
+) -> Friction | None:
     found = {each.removeprefix(f"{name}."): values[each] for term in terms for each in term.names}
     if not found.keys() <= set(_FRICTION_PARAMETERS) or found.get("stiction", 0.0) < 0:
         return None
@@ -115,17 +113,14 @@ def _exact_law(
     ]
     try:
         stribeck = stribeck_velocities[0] if stribeck_velocities else law.stribeck
-        return FrictionLawFit(Friction(smoothing=law.smoothing, stribeck=stribeck, **found))
+        return Friction(smoothing=law.smoothing, stribeck=stribeck, **found)
     except InputError as error:
         raise InputError(f"'{name}': {error}, give feasible=True") from None
 
 
 def _nearest_law(
-    name: str,
-    terms: list[FrictionTerm],
-    values: Mapping[str, float],
-    speed_range: tuple[float, float],
-) -> FrictionLawFit:
+    terms: list[FrictionTerm], values: Mapping[str, float], speed_range: tuple[float, float]
+) -> tuple[Friction, float]:
     from scipy.optimize import lsq_linear
 
     low, high = speed_range
@@ -143,14 +138,12 @@ def _nearest_law(
         bounds = np.array([0.0, -np.inf, 0.0, -np.inf, 0.0]), np.full(5, np.inf)
         found = lsq_linear(basis, identified_force, bounds)
         if found.cost < lowest_cost:
-            lowest_cost, max_deviation = (
-                found.cost,
-                float(np.abs(basis @ found.x - identified_force).max()),
-            )
+            lowest_cost = found.cost
+            max_deviation = float(np.abs(basis @ found.x - identified_force).max())
             coulomb, offset, viscous, viscous_offset, stiction = np.round(found.x, 12).tolist()
             stiction_parameters = {"stiction": stiction, "stribeck": stribeck} if stiction else {}
             best = Friction(coulomb, offset, viscous, viscous_offset, 0.0, **stiction_parameters)
-    return FrictionLawFit(best, max_deviation)
+    return best, max_deviation
 
 
 def divide_locked_bodies(
@@ -175,46 +168,39 @@ def divide_locked_bodies(
     Raises:
         InputError: A body is not feasible.
     """
-    described = (
-        Dynamics(unlocked_machine)
-        .parameters[: 10 * (unlocked_machine.model.njoints - 1)]
-        .reshape(-1, 10)
-    )
+    names = body_names(unlocked_machine)
+    described = Dynamics(unlocked_machine).parameters[: 10 * len(names)].reshape(-1, 10)
     links_by_body: dict[int, list[tuple[str, Array, Array]]] = {}
     out = {}
-    for name, body in zip(body_names(unlocked_machine), described, strict=True):
+    for name, body in zip(names, described, strict=True):
         frame = machine.model.frames[machine.frame(name)]
         A = frame.placement.homogeneous  # the pseudo-inertia about the body's joint is A P A^T
         if frame.parentJoint == 0:
             out[name] = body
         else:
-            P = pseudo_inertia(body if is_solid(body) else thicken_body(body))
+            P = pseudo_inertia(body)
+            units = np.sqrt(np.maximum(np.diag(P), np.finfo(float).tiny))
+            if np.linalg.eigvalsh(P / np.outer(units, units))[0] <= _FLATNESS_TOLERANCE:
+                P = pseudo_inertia(thicken_body(body))
             links_by_body.setdefault(frame.parentJoint - 1, []).append((name, A, P))
     for i, links in links_by_body.items():
-        body_parameters_given = parameters[10 * i : 10 * i + 10]
+        body = parameters[10 * i : 10 * i + 10]
         if len(links) == 1:
-            out[links[0][0]] = body_parameters_given
+            out[links[0][0]] = body
             continue
         try:
-            L = np.linalg.cholesky(pseudo_inertia(body_parameters_given))
+            L = np.linalg.cholesky(pseudo_inertia(body))
             D = np.linalg.cholesky(sum(A @ P @ A.T for _, A, P in links))
         except np.linalg.LinAlgError:
-            names = ", ".join(f"'{name}'" for name, *_ in links)
+            listed = ", ".join(f"'{name}'" for name, *_ in links)
             raise InputError(
-                f"the body of the locked links {names} is not feasible, give feasible=True"
+                f"the body of the locked links {listed} is not feasible, give feasible=True"
             ) from None
         T = L @ np.linalg.inv(D)
         for name, A, P in links:
             link_transform = np.linalg.inv(A) @ T @ A
             out[name] = body_parameters(link_transform @ P @ link_transform.T)
     return out
-
-
-def is_solid(body: Array) -> bool:
-    """Whether a body of parameters (10,) has an extent in all directions."""
-    P = pseudo_inertia(body)
-    units = np.sqrt(np.maximum(np.diag(P), np.finfo(float).tiny))
-    return bool(np.linalg.eigvalsh(P / np.outer(units, units))[0] > _FLATNESS_TOLERANCE)
 
 
 def replace_inertials(
@@ -228,8 +214,7 @@ def replace_inertials(
         fixed_links: Links fixed to one of these, whose inertials are removed.
         origin_text: Source of the values, for a comment.
     """
-    parser = etree.XMLParser(resolve_entities=False, no_network=True)
-    tree = etree.parse(str(file), parser)
+    tree = etree.parse(str(file), etree.XMLParser(resolve_entities=False, no_network=True))
     robot = tree.getroot()
     for link in robot.iterfind("link"):
         name = link.get("name").strip()
@@ -244,10 +229,19 @@ def replace_inertials(
         elif name in fixed_links and inertial is not None:
             _remove_element(inertial)
     for mesh in robot.iter("mesh"):
-        _resolve_mesh_path(mesh, file.parent)
+        mesh_file = find_mesh_file(mesh.get("filename", ""), file.parent)
+        if mesh_file is not None:
+            mesh.set("filename", str(mesh_file.resolve()))
     for loop in robot.findall("loop"):
-        for end in ("predecessor", "successor"):
-            _add_loop_frame(robot, loop, end)
+        for end in (loop.find("predecessor"), loop.find("successor")):
+            # a link with the frame at this end, as in a sub-chain
+            name = f"{loop.get('name').strip()}_{end.tag}"
+            etree.SubElement(robot, "link", name=name)
+            joint = etree.SubElement(robot, "joint", name=f"{name}_fixed", type="fixed")
+            if (origin := end.find("origin")) is not None:
+                etree.SubElement(joint, "origin", dict(origin.attrib))
+            etree.SubElement(joint, "parent", link=end.get("link").strip())
+            etree.SubElement(joint, "child", link=name)
         _remove_element(loop)
     comment = etree.Comment(f" Inertials: {origin_text}. ")
     comment.tail = robot.text or "\n"
@@ -281,33 +275,10 @@ def _remove_element(element: etree._Element) -> None:
         previous.tail = (previous.tail or "") + (tail or "")
 
 
-def _resolve_mesh_path(mesh: etree._Element, folder: Path) -> None:
-    """Replace the path of a mesh by the absolute path, if the file exists."""
-    file = find_mesh_file(mesh.get("filename", ""), folder)
-    if file is not None:
-        mesh.set("filename", str(file.resolve()))
-
-
-def _add_loop_frame(robot: etree._Element, loop: etree._Element, end: str) -> None:
-    """Add the frame at the end of a loop as a link, as in a sub-chain."""
-    loop_end = loop.find(end)
-    name = f"{loop.get('name').strip()}_{end}"
-    etree.SubElement(robot, "link", name=name)
-    joint = etree.SubElement(robot, "joint", name=f"{name}_fixed", type="fixed")
-    if (origin := loop_end.find("origin")) is not None:
-        etree.SubElement(joint, "origin", dict(origin.attrib))
-    etree.SubElement(joint, "parent", link=loop_end.get("link").strip())
-    etree.SubElement(joint, "child", link=name)
-
-
 def joint_combinations(model: IdentificationModel) -> list[ForceDirection]:
     """Directions of a model that combine several active joints."""
-    found = {
-        direction.name: direction
-        for term in model.terms
-        if (direction := getattr(term, "direction", None)) is not None and direction.factors
-    }
-    return list(found.values())
+    directions = [term.direction for term in model.terms if isinstance(term, DirectionalTerm)]
+    return list({x.name: x for x in directions if x.factors}.values())
 
 
 def motor_chain(

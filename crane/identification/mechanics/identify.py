@@ -1,61 +1,73 @@
 """Identification of base parameters from recordings."""
 
+import fnmatch
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.errors import CraneWarning, InputError, RecordingError, suggest_names
+from crane.common.errors import CraneWarning, InputError, RecordingError, check_name, suggest_names
 from crane.common.progress import progress_reporter
-from crane.common.samples import Array
+from crane.common.samples import Array, as_number, as_sample
 from crane.common.threads import with_single_threaded_blas
-from crane.identification.estimation.estimators import huber, least_squares, weighted_least_squares
-from crane.identification.estimation.regression_problem import Prior, condition_numbers
-from crane.identification.mechanics.base_parameters import BaseParameters
-from crane.identification.mechanics.equation_setup import (
-    RecordingOrMotion,
-    as_list,
-    build_equations,
-    multi_pass_progress,
-    prepare_motions,
-    speed_ranges,
+from crane.identification.estimation.estimators import (
+    Prior,
+    condition_numbers,
+    huber,
+    least_squares,
+    weighted_least_squares,
 )
-from crane.identification.mechanics.feasible_estimate import feasible_estimate
-from crane.identification.mechanics.feasible_parameters import load_convex_solver
+from crane.identification.mechanics.base_parameters import BaseParameters, base_parameters
+from crane.identification.mechanics.feasible_parameters import (
+    feasible_estimate,
+    load_convex_solver,
+)
 from crane.identification.mechanics.force_comparison import (
     ForceComparison,
     check_forces,
     check_shared_samples,
+    force_delays,
     warn_delays,
     warn_validation,
 )
-from crane.identification.mechanics.force_delays import force_delays
 from crane.identification.mechanics.identifiability import (
-    base_magnitudes,
-    motion_advice,
-    parameter_magnitudes,
-)
-from crane.identification.mechanics.identification_model import IdentificationModel, TermChanges
-from crane.identification.mechanics.identification_result import Identification
-from crane.identification.mechanics.model_term import ModelTerm, body_names
-from crane.identification.mechanics.priors import (
     check_identifiable,
     check_prior,
+    motion_advice,
+    parameter_magnitudes,
     prior_from_names,
     read_priors,
 )
-from crane.identification.mechanics.recording_checks import reject_unless_trusted
+from crane.identification.mechanics.identification_model import IdentificationModel, TermChanges
+from crane.identification.mechanics.identification_result import Identification
+from crane.identification.mechanics.model_terms import FrictionTerm, ModelTerm, body_names
 from crane.identification.mechanics.regression_equations import (
-    Progress,
+    ProjectedRegressor,
     RegressionEquations,
     is_long_enough,
 )
-from crane.identification.signals.signal_processing import Motion
+from crane.identification.mechanics.smoothed_motion import reject_unless_trusted, smoothed_motion
+from crane.identification.signals.signal_processing import Motion, Progress
+from crane.identification.signals.signal_quality import spectral_edge_frequency
 from crane.machine.machine import Machine
+from crane.recordings.recording import Recording
 
 METHODS = {"ols": least_squares, "wls": weighted_least_squares, "huber": huber}
 _MIN_COMPARED_ROWS = 50  # least number of rows for a comparison of forces with the model
+RecordingOrMotion = Recording | Motion
+_SLOW_SPEED_SHARE = 0.02  # of a joint's largest velocity, below which its rows are omitted
+# [rad/s], [m/s] default end of stiction
+_DEFAULT_STICTION_SPEED = {"rad": 1e-2, "m": 1e-3}
+_SMOOTHING_FACTOR = 4.0  # times the smoothing velocity, tanh 4 = 0.9993
+_MAX_SLOW_SHARE = 0.5  # of a joint's largest velocity, above which rows are always used
+_PASSBAND_SHARE = 0.75  # of the passband of a smoother: there it passes 91 %
+_MIN_BANDWIDTH_FACTOR = 3.0  # least bandwidth, times the spectral edge frequency of the velocities
+_POWER_SHARE = 0.99
+_MAX_BANDWIDTH_FACTOR = 40.0  # times the spectral edge frequency of the accelerations
+_SPEED_SAMPLES = 500  # samples for ranges of speeds
+_PASS_SHARE = 0.3  # of the remaining progress, per pass over a recording
 
 
 @with_single_threaded_blas
@@ -112,8 +124,7 @@ def identify(
         RecordingError: A recording is not suitable, or does not determine any parameter.
     """
     progress = progress_reporter(progress)
-    if method not in METHODS:
-        raise InputError(f"method '{method}' is unknown, {suggest_names(METHODS, method)}")
+    check_name(method, METHODS, f"method '{method}' is unknown")
     model = IdentificationModel(machine, terms)
     if feasible:
         if not model.bodies:
@@ -126,18 +137,17 @@ def identify(
     if model.bodies:
         _check_forces(model, motions, equations, trust)
     selection = equations.column_selection(identifiable)
-    columns = equations.projected_regressor(selection)
+    columns = ProjectedRegressor(equations, selection)
     factors = columns.triangular_factors(equations.y, equations.groups)
     parameter_sizes = parameter_magnitudes(model, identifiable, factors)
-    known_prior = _build_prior(model, prior, equations.base, parameter_sizes, feasible)
+    known_prior = _build_prior(model, prior, equations, parameter_sizes, feasible)
     estimator_prior, T = (None, selection) if feasible else (known_prior, selection)
-    if known_prior is None:
-        _check_mass_scale(machine, equations)
-    elif not feasible:
+    if known_prior is not None and not feasible:
         T = equations.base.grouping
         check_identifiable(model.names, equations.stacked_factors(T), known_prior)
-    start = equations.base.values(model.nominal)
-    equations, estimate = equations.estimate(T, METHODS[method], estimator_prior, start)
+    equations, estimate = equations.estimate(
+        T, METHODS[method], estimator_prior, equations.base.values(model.nominal)
+    )
     values, covariance, parameters = estimate.values, estimate.covariance, None
     if feasible:
         estimate = feasible_estimate(
@@ -167,7 +177,7 @@ def identify(
             warn_validation(training, validation_comparison)
     if final_progress is not None:
         final_progress(1.0)
-    magnitudes = base_magnitudes(identifiable, parameter_sizes)
+    magnitudes = np.sqrt(identifiable.grouping**2 @ parameter_sizes**2)
     identification = Identification(
         model, identifiable, values, covariance, parameters, estimate, method, feasible, training,
         magnitudes, advice, speeds, bandwidth, slow_speeds, validation_comparison,
@@ -177,21 +187,6 @@ def identify(
     elif identification.warning:
         warnings.warn(identification.warning, CraneWarning, stacklevel=3)
     return identification
-
-
-def _check_mass_scale(machine: Machine, equations: RegressionEquations) -> None:
-    """Check that the mass scale is determined: not all forces are zero.
-
-    Raises:
-        RecordingError: All forces are zero.
-    """
-    if machine.free and not equations.y.any():
-        body = body_names(machine)[-1]
-        raise RecordingError(
-            "nothing drives what moves in this recording: it determines ratios of masses only; "
-            f"give a prior of one mass, as prior={{'{body}.m': '100 +- 1'}} "
-            f"(--prior {body}.m=100+-1)"
-        )
 
 
 def _compare_held_out(
@@ -210,42 +205,51 @@ def _compare_held_out(
         held_out = RegressionEquations(model, base, long_motions, bandwidth, slow_speeds, progress)
         if held_out.is_moving.any():
             comparison = held_out.compare(values)
-    if comparison is None or len(long_motions) < len(motions):
-        _warn_short_validations(motions, long_motions, bandwidth)
-    return comparison
-
-
-def _warn_short_validations(
-    motions: Sequence[Motion], long_motions: Sequence[Motion], bandwidth: float
-) -> None:
-    """Warn of held-out data that are not usable."""
     short_count = len(motions) - len(long_motions)
-    text = (
-        f"{short_count} of {len(motions)} held-out recordings are too short for a low-pass of "
-        f"{bandwidth:g} Hz and are not used"
-        if short_count
-        else "no held-out recording moves faster than standstill, none is used"
-    )
-    warnings.warn(f"{text}, give longer ones that move", CraneWarning, stacklevel=5)
+    if short_count:
+        text = (
+            f"{short_count} of {len(motions)} held-out recordings are too short for a low-pass of "
+            f"{bandwidth:g} Hz and are not used"
+        )
+    else:
+        text = "no held-out recording moves faster than standstill, none is used"
+    if short_count or comparison is None:
+        warnings.warn(f"{text}, give longer ones that move", CraneWarning, stacklevel=4)
+    return comparison
 
 
 def _build_prior(
     model: IdentificationModel,
     given: float | Mapping[str, object] | Prior | None,
-    base: BaseParameters,
+    equations: RegressionEquations,
     parameter_sizes: Array,
     feasible: bool,
 ) -> Prior | None:
-    """Prior means and standard deviations (p,) of all parameters; None without a prior."""
+    """Prior means and standard deviations (p,) of all parameters; None without a prior.
+
+    Raises:
+        InputError: The prior is not valid.
+        RecordingError: Without a prior nothing determines the scale of masses, as all forces are
+            zero.
+    """
     known = dict(model.machine.estimation.prior)
     if given is not None:
         if not isinstance(given, Mapping | int | float):
-            return check_prior(model, base, given, feasible)
+            return check_prior(model, equations.base, given, feasible)
         given_priors = read_priors(given)  # takes precedence over the machine file
         known = {
             name: what for name, what in known.items() if name not in given_priors
         } | given_priors
-    return prior_from_names(model, known, parameter_sizes) if known else None
+    if known:
+        return prior_from_names(model, known, parameter_sizes)
+    if model.machine.free and not equations.y.any():
+        body = body_names(model.machine)[-1]
+        raise RecordingError(
+            "nothing drives what moves in this recording: it determines ratios of masses only; "
+            f"give a prior of one mass, as prior={{'{body}.m': '100 +- 1'}} "
+            f"(--prior {body}.m=100+-1)"
+        )
+    return None
 
 
 def _check_forces(
@@ -264,3 +268,161 @@ def _check_forces(
             model.machine.active, *force_delays(model, equations.base, motion, equations.slow)
         )
         first += len(here)
+
+
+def build_equations(
+    model: IdentificationModel,
+    motions: Sequence[Motion],
+    bandwidth: float | None = None,
+    slow: Mapping[str, float] | ArrayLike | None = None,
+    progress: Progress | None = None,
+) -> tuple[RegressionEquations, BaseParameters]:
+    """Regression equations of motions, and the identifiable part of the base parameters.
+
+    Arguments and errors as for `identify`.
+    """
+    if bandwidth is None:
+        bandwidth = model.machine.estimation.bandwidth or min(map(_default_bandwidth, motions))
+    bandwidth = as_number(bandwidth, "the bandwidth", "Hz", greater_than=0)
+    fastest = np.max([np.abs(motion.v).max(axis=0) for motion in motions], axis=0)
+    slow_speeds = _slow_speeds(model.machine, slow, fastest)
+    equations = RegressionEquations(
+        model, base_parameters(model), motions, bandwidth, slow_speeds, progress
+    )
+    if not equations.is_moving.any():
+        raise RecordingError("no joint moves faster than what counts as standstill, move it more")
+    for joint, count in zip(model.machine.active, equations.is_moving.sum(axis=0), strict=True):
+        if count == 1:  # one row does not determine the noise
+            raise RecordingError(
+                f"'{joint}' is in one sample only faster than what counts as standstill, move it "
+                "more, or raise its slow"
+            )
+    # the triangular factors have the column dependences of all rows
+    return equations, equations.base.identifiable_part(
+        np.vstack(list(equations.triangular_factors[:, :, :-1]))
+    )
+
+
+def prepare_motions(
+    machine: Machine,
+    recordings: RecordingOrMotion | Sequence[RecordingOrMotion],
+    trust: bool,
+    progress: Progress | None,
+    role: str = "",
+) -> list[Motion]:
+    """Motions of recordings, with velocities and accelerations.
+
+    Raises:
+        InputError: There are no recordings.
+        RecordingError: A recording is not suitable; the message names it if there are several.
+    """
+    sources = as_list(recordings)
+    if not sources:
+        raise InputError("no recording is given, give at least one")
+    motions = []
+    for number, one in enumerate(sources, start=1):
+        try:
+            if not isinstance(one, Motion):
+                one = smoothed_motion(machine, one, trust=trust, progress=progress)
+        except RecordingError as error:
+            if not role and len(sources) == 1:
+                raise
+            which = f"{role or 'recording'} {number} of {len(sources)}"
+            raise RecordingError(f"{which}: {error}") from None
+        motions.append(one)
+    return motions
+
+
+def as_list(
+    recordings: RecordingOrMotion | Sequence[RecordingOrMotion] | None,
+) -> list[RecordingOrMotion]:
+    """List of one or several recordings; empty for None."""
+    if recordings is None:
+        return []
+    return [recordings] if isinstance(recordings, Recording | Motion) else list(recordings)
+
+
+def speed_ranges(
+    model: IdentificationModel, motions: Sequence[Motion], slow: Array
+) -> dict[str, tuple[float, float]]:
+    """Least and largest speed along each direction of friction."""
+    directions = {
+        x.direction.name: x.direction for x in model.terms if isinstance(x, FrictionTerm)
+    }
+    fastest = dict.fromkeys(directions, 0.0)
+    for motion in motions:
+        sample_slice = slice(None, None, max(1, len(motion.time) // _SPEED_SAMPLES))
+        at = model.samples(motion.q[sample_slice], motion.v[sample_slice], motion.a[sample_slice])
+        for name, direction in directions.items():
+            speed = np.einsum("ij,ij->i", direction.jacobian(model.machine, at), at.v_a)
+            fastest[name] = max(fastest[name], float(np.abs(speed).max()))
+    lowest = dict(zip(model.machine.active, slow.tolist(), strict=True))
+    return {
+        name: (lowest.get(name, _SLOW_SPEED_SHARE * most), most) for name, most in fastest.items()
+    }
+
+
+def multi_pass_progress(progress: Progress | None) -> Progress | None:
+    """Progress over an unknown number of passes: each takes a share of the remainder."""
+    if progress is None:
+        return None
+    done = 0.0
+
+    def report(share: float) -> None:
+        nonlocal done
+        now = done + _PASS_SHARE * (1 - done) * share
+        progress(now)
+        if share >= 1:
+            done = now
+
+    return report
+
+
+def _slow_speeds(
+    machine: Machine, slow: Mapping[str, float] | ArrayLike | None, fastest: Array
+) -> Array:
+    """Standstill velocities (n,), below which rows are omitted.
+
+    The default is a share of the largest velocity, or the velocity at which the described friction
+    is fully developed.
+    """
+    out = _SLOW_SPEED_SHARE * fastest
+    for i, joint in enumerate(machine.active):
+        law = machine.friction.get(joint)
+        if law is not None:
+            smoothing_speed = law.smoothing or (
+                _DEFAULT_STICTION_SPEED[machine.unit(joint)] if law.has_stick_slip else 0.0
+            )
+            stiction_speed = _SMOOTHING_FACTOR * (
+                max(law.stribeck, law.smoothing) if law.stiction else smoothing_speed
+            )
+            out[i] = max(out[i], min(stiction_speed, _MAX_SLOW_SHARE * fastest[i]))
+    if slow is not None and not isinstance(slow, Mapping):
+        each = np.full(out.shape, slow) if np.ndim(slow) == 0 else slow
+        each = as_sample(each, len(out), "slow", machine.active)
+        slow = dict(zip(machine.active, each.tolist(), strict=True))
+    for name, value in (*machine.estimation.slow.items(), *(slow or {}).items()):
+        joints = fnmatch.filter(machine.active, name)
+        if not joints and name not in machine.locked_joints:
+            raise InputError(f"slow is for '{name}', {suggest_names(machine.active, name)}")
+        if (limit := as_number(value, f"slow of '{name}'", "")) < 0:
+            raise InputError(f"slow of '{name}' is {limit:g}, it must not be negative")
+        out[[machine.active.index(joint) for joint in joints]] = limit
+    return out
+
+
+def _default_bandwidth(motion: Motion) -> float:
+    """Default bandwidth [Hz] of the low-pass, far above the frequencies of the motion.
+
+    The band above the motion contains the noise to be estimated. But smoothing removes parts of
+    the accelerations from the regressor, not from the forces, mostly at reversals, where friction
+    jumps: so the bandwidth is at most the passband of smoothing, unless that is close to the
+    motion.
+    """
+    step = float(motion.time[1] - motion.time[0])
+    highest = max(
+        _PASSBAND_SHARE * motion.passband,
+        _MIN_BANDWIDTH_FACTOR * spectral_edge_frequency(motion.v, step, _POWER_SHARE),
+    )
+    fastest = _MAX_BANDWIDTH_FACTOR * spectral_edge_frequency(motion.a, step, _POWER_SHARE)
+    return min(fastest, highest, 0.24 / step)

@@ -7,20 +7,18 @@ from typing import NoReturn
 
 import numpy as np
 
-from crane.common.errors import InputError, RecordingError, suggest_names
+from crane.common.errors import InputError, RecordingError, check_name
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
 from crane.dynamics.dynamics import Dynamics
-from crane.identification.estimation.regression_problem import Estimate
+from crane.identification.estimation.estimators import Estimate
 from crane.identification.estimation.regressor import triangular_factor
 from crane.identification.mechanics.base_parameters import BaseParameters
-from crane.identification.mechanics.equation_setup import build_equations, multi_pass_progress
 from crane.identification.mechanics.force_comparison import ForceComparison, check_forces
-from crane.identification.mechanics.force_terms import friction_term
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.identify import METHODS
-from crane.identification.mechanics.model_term import MotionSamples
+from crane.identification.mechanics.identify import METHODS, build_equations, multi_pass_progress
+from crane.identification.mechanics.model_terms import ModelTerm, MotionSamples, friction_term
 from crane.identification.mechanics.payload_estimate import (
     MIN_FRICTION_SHARE,
     PayloadEstimate,
@@ -30,13 +28,11 @@ from crane.identification.mechanics.payload_estimate import (
     static_cutoff,
     static_mass,
 )
-from crane.identification.mechanics.recording_checks import reject_unless_trusted
 from crane.identification.mechanics.regression_equations import (
-    Progress,
     RegressionEquations,
 )
-from crane.identification.mechanics.smoothed_motion import smoothed_motion
-from crane.identification.signals.signal_processing import Motion
+from crane.identification.mechanics.smoothed_motion import reject_unless_trusted, smoothed_motion
+from crane.identification.signals.signal_processing import Motion, Progress
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 
@@ -89,8 +85,7 @@ def identify_payload(
     Source: Efron, Stein 1981, Annals of Statistics 9(3), the jackknife.
     """
     progress = progress_reporter(progress)
-    if method not in METHODS:
-        raise InputError(f"method '{method}' is unknown, {suggest_names(METHODS, method)}")
+    check_name(method, METHODS, f"method '{method}' is unknown")
     if frame is None and machine.tip is None:
         raise InputError(f"'{machine.name}' has no tip, give the frame that holds the load")
     frame = frame or str(machine.tip)
@@ -99,10 +94,10 @@ def identify_payload(
         motion = smoothed_motion(machine, motion, trust=trust, progress=progress)
     drive_moves = np.ptp(motion.v, axis=0) > 0
     names = [joint for joint, moved in zip(machine.active, drive_moves, strict=True) if moved]
-    v = low_passed_motion(motion).v.T
-    one_way_drives = [
-        joint for joint, v in zip(names, v[drive_moves], strict=True) if _moves_one_way(v)
-    ]
+    v = low_passed_motion(motion).v[:, drive_moves]
+    travel = np.sort([np.maximum(v, 0).sum(axis=0), np.maximum(-v, 0).sum(axis=0)], axis=0)
+    moves_one_way = travel[0] < _MIN_RETURN_SHARE * travel[1]
+    one_way_drives = [x for x, one_way in zip(names, moves_one_way, strict=True) if one_way]
     case = _PayloadCase(machine, frame, motion, method, names, one_way_drives)
     first, reason = None, ""
     try:
@@ -114,7 +109,7 @@ def identify_payload(
             _check_mass(first, trust)
             return replace(
                 first,
-                static_mass=case.estimate_static_mass(first.friction_corrections, com)
+                static_mass=static_mass(machine, frame, motion, first.friction_corrections, com)
                 if is_significant
                 else None,
             )
@@ -122,9 +117,8 @@ def identify_payload(
         reason = str(error)
     point = case.estimate_point_mass(progress)
     if point is None or case.is_uncertain(point):
-        _raise_unidentifiable(
-            one_way_drives, first or point, reason, case.estimate_static_mass({}, np.zeros(3))
-        )
+        held_mass = static_mass(machine, frame, motion, {}, np.zeros(3))
+        _raise_unidentifiable(one_way_drives, first or point, reason, held_mass)
     _check_mass(point, trust)
     return point
 
@@ -155,24 +149,19 @@ class _PayloadCase:
 
     def model(self, parameter_count: int) -> IdentificationModel:
         """Model of a load with a number of parameters, and of corrections of Coulomb friction."""
-        machine, dynamics = self.machine, Dynamics(self.machine)
+        dynamics = Dynamics(self.machine)
 
         def machine_forces(at: MotionSamples) -> Array:
-            """Forces (N, n) of the machine without the load."""
             return dynamics.evaluate_closed("inverse with friction", at.q, at.v_a, at.a_a)
 
-        machine_without_forces = machine.replace(
+        bare_machine = self.machine.replace(
             friction={}, forces=(), gas_springs=(), ropes=(), end_stops=()
         )
-        extra = [
-            friction_term(machine_without_forces, joint, ("coulomb",), smoothing=0.0)
-            for joint in self.moving_drives
+        terms: list[ModelTerm] = [
+            PayloadTerm(self.machine, self.frame, parameter_count),
+            *(friction_term(bare_machine, x, ("coulomb",), 0.0) for x in self.moving_drives),
         ]
-        return IdentificationModel(
-            machine_without_forces,
-            [PayloadTerm(machine, self.frame, parameter_count), *extra],
-            machine_forces,
-        )
+        return IdentificationModel(bare_machine, terms, machine_forces)
 
     def estimate_body(
         self, parameter_count: int, trust: bool, progress: Progress | None
@@ -252,7 +241,6 @@ class _PayloadCase:
             equations, columns, parameters, derivatives, np.diag(1 / prior[1])
         )
         covariance[1:] = covariance[:, 1:] = np.nan
-        unknown_com = np.full(3, np.nan)
         corrections = {
             joint: float(value)
             for joint, value in zip(self.moving_drives, parameters.values[1:], strict=True)
@@ -261,12 +249,12 @@ class _PayloadCase:
         estimate = PayloadEstimate(
             self.frame,
             float(parameters.values[0]),
-            unknown_com,
+            np.full(3, np.nan),
             covariance,
             freedom,
             np.zeros((0, 3)),
             corrections,
-            self.estimate_static_mass(corrections, np.zeros(3)),
+            static_mass(self.machine, self.frame, self.motion, corrections, np.zeros(3)),
             self._force_comparison(equations, columns @ parameters.values),
         )
         if estimate.static_mass is not None:  # the difference of both estimates is an uncertainty
@@ -275,10 +263,8 @@ class _PayloadCase:
 
     def _weight_loads_drive(self, motion: Motion) -> bool:
         """Whether the weight of a point mass loads a moving drive."""
-        load, q = (
-            PayloadTerm(self.machine, self.frame, 1),
-            motion.q[:: max(1, len(motion.q) // 100)],
-        )
+        load = PayloadTerm(self.machine, self.frame, 1)
+        q = motion.q[:: max(1, len(motion.q) // 100)]
         at = IdentificationModel(self.machine, [load]).samples(q, 0 * q, 0 * q)
         drive_indices = [self.machine.active.index(joint) for joint in self.moving_drives]
         weight = np.abs(load.columns(at)[:, drive_indices, 0])
@@ -289,13 +275,12 @@ class _PayloadCase:
 
     def _force_comparison(self, equations: RegressionEquations, values: Array) -> ForceComparison:
         load_forces = equations.forces - equations.offset
-        joints = self.machine.active
         return ForceComparison(
             equations.time,
             load_forces,
             equations.modelled_forces(values),
             equations.is_moving,
-            joints,
+            self.machine.active,
         )
 
     def is_uncertain(self, estimate: PayloadEstimate) -> bool:
@@ -303,13 +288,6 @@ class _PayloadCase:
         low, high = estimate.interval()[0].tolist()
         machine_mass = sum(inertia.mass for inertia in list(self.machine.model.inertias)[1:])
         return not high - low <= 2 * max(abs(estimate.mass), _MAX_INTERVAL_SHARE * machine_mass)
-
-    def estimate_static_mass(
-        self, friction_corrections: dict[str, float], com: Array
-    ) -> tuple[float, float] | None:
-        """See `static_mass`."""
-        load = PayloadTerm(self.machine, self.frame, 4)
-        return static_mass(self.machine, load, self.motion, friction_corrections, com)
 
 
 def _widen_covariance(
@@ -319,14 +297,25 @@ def _widen_covariance(
     derivatives: Array,
     prior_root: Array | None = None,
 ) -> tuple[Array, Array]:
-    """Covariance (4, 4), widened by the jackknife, and its degrees of freedom (4,)."""
+    """Covariance (4, 4) and its degrees of freedom (4,), widened by a delete-one jackknife.
+
+    Rows (k, s) of a prior about zero belong to all segments of the jackknife.
+    """
+    size = columns.shape[1]
+    prior_rows = np.zeros((0, size)) if prior_root is None else prior_root
+    prior_rows = np.column_stack([prior_rows, np.zeros(len(prior_rows))])
+    T = np.zeros((len(columns) + 1, size + 1))
+    T[:-1, :-1], T[-1, -1] = columns, 1.0
+    parts = equations.segment_factors(_SEGMENT_COUNT) @ T / estimate.noise[:, None, None]
+    found = []
+    for i in range(_SEGMENT_COUNT):
+        others = np.delete(parts, i, axis=0).reshape(-1, size + 1)
+        R = triangular_factor(np.vstack([others, prior_rows]))
+        found.append(np.linalg.lstsq(R[:-1, :-1], R[:-1, -1])[0])
+    spread = (np.array(found) - np.mean(found, axis=0)) @ derivatives.T
+    variances = (_SEGMENT_COUNT - 1) / _SEGMENT_COUNT * (spread**2).sum(axis=0)
     covariance = derivatives @ estimate.covariance @ derivatives.T
-    jackknife_variances = np.diag(
-        derivatives
-        @ _jackknife_covariance(equations, columns, estimate.noise, prior_root)
-        @ derivatives.T
-    )
-    inflation = jackknife_variances / np.maximum(np.diag(covariance), np.finfo(float).tiny)
+    inflation = variances / np.maximum(np.diag(covariance), np.finfo(float).tiny)
     scale = np.sqrt(np.maximum(inflation, 1.0))
     freedom = np.where(inflation > 1, _SEGMENT_COUNT - 1, estimate.degrees_of_freedom)
     return covariance * np.outer(scale, scale), freedom
@@ -352,7 +341,7 @@ def _raise_unidentifiable(
     one_way_drives: Sequence[str],
     estimate: PayloadEstimate | None,
     reason: str,
-    static_mass: tuple[float, float] | None,
+    held_mass: tuple[float, float] | None,
 ) -> NoReturn:
     if estimate is None:
         raise RecordingError(reason)
@@ -363,41 +352,12 @@ def _raise_unidentifiable(
         text += f"{names} moved one way only, where friction looks like weight, record both ways"
     else:
         text += "its parts give different loads, identify the machine without a load first"
-    if static_mass is not None:
+    if held_mass is not None:
         text += (
             f"; with its centre at '{estimate.frame}' the forces at rest hold "
-            f"{static_mass[0]:.4g} +- {static_mass[1]:.2g} kg, by the described friction"
+            f"{held_mass[0]:.4g} +- {held_mass[1]:.2g} kg, by the described friction"
         )
     raise RecordingError(text)
-
-
-def _jackknife_covariance(
-    equations: RegressionEquations, columns: Array, noise: Array, prior_root: Array | None
-) -> Array:
-    """Delete-one jackknife covariance (s, s) of the parameters over segments.
-
-    Rows (k, s) of a prior about zero belong to all segments.
-    """
-    size = columns.shape[1]
-    prior_rows = np.zeros((0, size)) if prior_root is None else prior_root
-    prior_rows = np.column_stack([prior_rows, np.zeros(len(prior_rows))])
-    T = np.zeros((len(columns) + 1, size + 1))
-    T[:-1, :-1], T[-1, -1] = columns, 1.0
-    parts = equations.segment_factors(_SEGMENT_COUNT) @ T / noise[:, None, None]
-    found = []
-    for i in range(_SEGMENT_COUNT):
-        R = triangular_factor(
-            np.vstack([np.delete(parts, i, axis=0).reshape(-1, size + 1), prior_rows])
-        )
-        found.append(np.linalg.lstsq(R[:-1, :-1], R[:-1, -1])[0])
-    spread = np.array(found) - np.mean(found, axis=0)
-    return np.asarray((_SEGMENT_COUNT - 1) / _SEGMENT_COUNT * spread.T @ spread)
-
-
-def _moves_one_way(v: Array) -> bool:
-    """Whether a drive with the velocity (N,) moves in one direction only."""
-    travel = np.maximum(v, 0).sum(), np.maximum(-v, 0).sum()
-    return bool(min(travel) < _MIN_RETURN_SHARE * max(travel))
 
 
 def _identifiable_moments(base: BaseParameters) -> tuple[Array, Array]:

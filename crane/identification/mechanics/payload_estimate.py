@@ -5,21 +5,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from crane.common.errors import InputError
-from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.common.units import format_table
 from crane.dynamics.dynamics import Dynamics
-from crane.identification.estimation.regression_problem import confidence_intervals
+from crane.identification.estimation.estimators import EstimatedValues
 from crane.identification.mechanics.feasible_parameters import body_parameters, pseudo_inertia
 from crane.identification.mechanics.force_comparison import ForceComparison
-from crane.identification.mechanics.force_delays import motion_frequency
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.model_term import (
+from crane.identification.mechanics.model_terms import (
     BODY_PARAMETERS,
     MotionSamples,
     inertial_regressor,
 )
-from crane.identification.signals.signal_processing import Motion, is_moving, low_pass
+from crane.identification.signals.signal_processing import Motion, low_pass
+from crane.identification.signals.signal_quality import spectral_edge_frequency
 from crane.machine.machine import Machine
 
 _REST_SPEED_SHARE = 0.05  # of a joint's largest velocity, below which it is at rest
@@ -61,7 +60,7 @@ class PayloadTerm:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PayloadEstimate(OneLineRepr):
+class PayloadEstimate(EstimatedValues):
     """Estimated payload on a frame.
 
     Attributes:
@@ -92,19 +91,9 @@ class PayloadEstimate(OneLineRepr):
     fit: ForceComparison
 
     @property
-    def std_mass(self) -> float:
-        """Standard deviation of the mass [kg]."""
-        return float(np.sqrt(self.covariance[0, 0]))
-
-    @property
-    def std_com(self) -> Array:
-        """Standard deviations (3,) of the centre of mass [m]."""
-        return np.sqrt(np.diag(self.covariance)[1:])
-
-    def interval(self, level: float = 0.95) -> Array:
-        """Confidence intervals (4, 2) of mass and centre of mass."""
-        values, std = np.append(self.mass, self.com), np.sqrt(np.diag(self.covariance))
-        return confidence_intervals(values, std, self.degrees_of_freedom, level)
+    def values(self) -> Array:  # type: ignore[override]
+        """Mass and centre of mass (4,)."""
+        return np.append(self.mass, self.com)
 
     @property
     def warning(self) -> str:
@@ -123,16 +112,14 @@ class PayloadEstimate(OneLineRepr):
     def to_text(self) -> str:
         """Table of mass and centre of mass."""
         rows = [["", "value", "std", "95 % interval", ""]]
-        values, names = np.append(self.mass, self.com), ("mass", "com x", "com y", "com z")
-        units = ("kg", "m", "m", "m")
-        std = np.sqrt(np.diag(self.covariance))
-        table = zip(names, units, values, std, self.interval(), strict=True)
+        names, units = ("mass", "com x", "com y", "com z"), ("kg", "m", "m", "m")
+        table = zip(names, units, self.values, self.std, self.interval(), strict=True)
         for name, unit, value, deviation, (low, high) in table:
             if np.isnan(value):
                 rows.append([name, "-", "", "not determined by this motion", ""])
                 continue
-            interval_text = f"{low:.5g} to {high:.5g} {unit}"
-            rows.append([name, f"{value:.5g}", f"{deviation:.2g}", interval_text, ""])
+            interval = f"{low:.5g} to {high:.5g} {unit}"
+            rows.append([name, f"{value:.5g}", f"{deviation:.2g}", interval, ""])
         at = ", taken as a point there" if np.isnan(self.com).all() else ""
         lines = [f"load on {self.frame}{at}", *format_table(rows, (0, 3))]
         if self.interval()[0, 0] <= 0:
@@ -162,13 +149,13 @@ def low_passed_motion(motion: Motion) -> Motion:
 def static_cutoff(motion: Motion) -> float:
     """Cutoff [Hz] below which forces are weights and friction."""
     step, duration = float(motion.time[1] - motion.time[0]), float(np.ptp(motion.time))
-    wanted = max(_CUTOFF_FACTOR * motion_frequency(motion.q, step), _MIN_PERIODS / duration)
+    wanted = max(_CUTOFF_FACTOR * spectral_edge_frequency(motion.q, step), _MIN_PERIODS / duration)
     return min(wanted, 0.24 / step)
 
 
 def static_mass(
     machine: Machine,
-    load: PayloadTerm,
+    frame: str,
     motion: Motion,
     friction_corrections: dict[str, float],
     com: Array,
@@ -179,7 +166,7 @@ def static_mass(
     """
     step = float(motion.time[1] - motion.time[0])
     v = low_passed_motion(motion).v
-    is_resting = ~is_moving(v, _REST_SPEED_SHARE * np.abs(v).max(axis=0)).any(axis=1)
+    is_resting = (np.abs(v) <= _REST_SPEED_SHARE * np.abs(v).max(axis=0)).all(axis=1)
     edges = np.flatnonzero(np.diff(is_resting.astype(np.int8), prepend=0, append=0))
     runs = [
         (i, j) for i, j in edges.reshape(-1, 2).tolist() if (j - i) * step >= _MIN_REST_DURATION
@@ -190,8 +177,9 @@ def static_mass(
     tau = np.array([motion.tau[i:j].mean(axis=0) for i, j in runs])
     zero = np.zeros_like(q)
     tau = tau - Dynamics(machine).inverse(q, zero, zero)
+    load = PayloadTerm(machine, frame, 4)
     at = IdentificationModel(machine, [load]).samples(q, zero, zero)
-    unit_forces = load.columns(at)[:, :, :4] @ np.append(1.0, com)
+    unit_forces = load.columns(at) @ np.append(1.0, com)
     friction_forces = np.array([breakaway_force(machine, joint) for joint in machine.active])
     friction_forces += [abs(friction_corrections.get(joint, 0.0)) for joint in machine.active]
     friction_forces = np.maximum(

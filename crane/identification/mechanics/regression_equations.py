@@ -9,29 +9,26 @@ import numpy as np
 
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.identification.estimation.regression_problem import Estimate, Prior
+from crane.identification.estimation.estimators import Estimate, Prior
 from crane.identification.estimation.regressor import triangular_factor, update_triangular_factor
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.force_comparison import ForceComparison
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.model_term import MotionSamples
+from crane.identification.mechanics.model_terms import MotionSamples
 from crane.identification.signals.signal_processing import (
     Motion,
+    Progress,
     filter_kernel,
     filter_rows,
-    is_moving,
 )
 
 _MIN_PERIODS = 5.0  # least duration of a recording in periods of the cutoff
 _BLOCK_BYTES = 1 << 25  # bytes of an unfiltered regressor per block
 # bytes of cached filtered blocks; others are computed again
 _CACHE_BYTES = 3 << 27
-Progress = Callable[[float], None]
 _MAX_ITERATIONS = 31
 _CONVERGENCE_TOLERANCE = 1e-2  # of a standard deviation
 _ROUNDING_TOLERANCE = 1e-9  # of the largest value
-RegressorFunction = Callable[[MotionSamples], tuple[Array, Array]]
-"""Function samples -> W (N, n, r) and known forces (N, n)."""
 
 
 class _FilteredMotion:
@@ -61,15 +58,11 @@ class _FilteredMotion:
             kernel_reach = len(filter_kernel(self.step, bandwidth)) // 2
         self.filter_reach = -(-kernel_reach // self.thinning) * self.thinning
         # friction laws are not valid near standstill, nor in rows within the reach of the filter
-        is_resting = ~is_moving(motion.v, slow)
+        is_resting = np.abs(motion.v) <= slow
         is_near_rest = maximum_filter1d(
             is_resting.view(np.uint8), 2 * kernel_reach + 1, axis=0, mode="constant"
         )
         self.is_moving = is_near_rest[:: self.thinning] == 0
-
-    def __len__(self) -> int:
-        """Number of decimated instants."""
-        return len(self.is_moving)
 
 
 @dataclasses.dataclass
@@ -102,13 +95,15 @@ class RegressionEquations:
         bandwidth: Bandwidth of the low-pass [Hz].
         slow: (n,) standstill velocities, below which rows are omitted.
         progress: Called with the finished share of each pass over the motions.
-        values: (r,) parameters at which rows of free joints are evaluated, see `free_joint_rows`.
+        values: (r,) parameters at which rows of free joints are evaluated, see `_free_joint_rows`.
 
     Attributes:
         time: (M,) decimated instants of all motions, one after the other [s].
         forces: (M, n) measured, filtered forces.
         offset: (M, n) known forces, available when all blocks have been read.
         is_moving: (M, n) mask of the rows that are used.
+        samples: (m,) instants of the used rows.
+        groups: (m,) groups of the used rows: joints 0, 1, ... without those that have no rows.
         base, bandwidth, slow: See above.
 
     Raises:
@@ -130,6 +125,10 @@ class RegressionEquations:
         self._motions = motions
         self._filtered_motions = [_FilteredMotion(motion, bandwidth, slow) for motion in motions]
         self.is_moving = np.concatenate([part.is_moving for part in self._filtered_motions])
+        instant, joint = np.nonzero(self.is_moving)
+        self.samples = instant.astype(np.int32)
+        used_joints = np.cumsum(self.is_moving.any(axis=0)) - 1
+        self.groups = used_joints.astype(np.int8)[joint]
         self.time = _concatenate_times(
             [part.motion.time[:: part.thinning] for part in self._filtered_motions]
         )
@@ -138,17 +137,13 @@ class RegressionEquations:
         self._blocks, first = list[_EquationBlock](), 0
         for part in self._filtered_motions:
             length = max(wanted, 2 * part.filter_reach) // part.thinning + 1
-            for i in range(0, len(part), length):
-                rows = slice(i, min(i + length, len(part)))
+            count = len(part.is_moving)
+            for i in range(0, count, length):
+                rows = slice(i, min(i + length, count))
                 span = slice(first + rows.start, first + rows.stop)
                 self._blocks.append(_EquationBlock(part, rows, span))
-            first += len(part)
+            first += count
         self._block_cache: dict[int, Array] = {}
-
-    def at_values(self, values: Array) -> "RegressionEquations":
-        """Equations with rows of free joints at parameters (r,), see `free_joint_rows`."""
-        same = self._model, self.base, self._motions, self.bandwidth, self.slow, self._progress
-        return RegressionEquations(*same, values)
 
     def blocks(self, backwards: bool = False) -> Iterator[tuple[slice, Array]]:
         """Slices of instants, and blocks of W (L, n, r)."""
@@ -199,34 +194,72 @@ class RegressionEquations:
             at = self._model.samples(q, v, a, part.step, (0,) if low == 0 else ())
             at = dataclasses.replace(at, term_states=term_states)
             here = both[low - start : high - start]
-            here[:, :, :-1], here[:, :, -1] = self._regressor_and_forces(at)
+            if self._values is None:
+                here[:, :, :-1], here[:, :, -1] = self._sides(at)
+            else:
+                here[:, :, :-1], here[:, :, -1] = self._free_joint_rows(at, self._values)
             if high == first:
                 next_blocks[0].term_states = dict(term_states)
         return both
 
-    def _regressor_and_forces(self, samples: MotionSamples) -> tuple[Array, Array]:
-        """Regressor W (N, n, r) and known forces (N, n)."""
-        model = self._model
+    def _sides(self, at: MotionSamples) -> tuple[Array, Array]:
+        """W (N, n, r) and known forces (N, n)."""
+        W = self._model.regressor(at)[:, :, self.base.independent]
+        return W, self._model.known_forces(at)
 
-        def sides(at: MotionSamples) -> tuple[Array, Array]:
-            return model.regressor(at)[:, :, self.base.independent], model.known_forces(at)
+    def _free_joint_rows(self, samples: MotionSamples, values: Array) -> tuple[Array, Array]:
+        """W (N, n, r) and known forces (N, n) with rows of free joints at parameters b.
 
-        if self._values is None:
-            return sides(samples)
-        return free_joint_rows(
-            sides, samples, np.flatnonzero(~model.machine.is_driven), self._values
-        )
+        The force of a free joint is known to be zero, and noise is in its motion. The equation
+        0 = W beta + known determines ratios of parameters only, and least squares would be biased
+        by the noise of the measured accelerations in W. With the accelerations a_f(b) of the free
+        joints f by the model (hybrid dynamics, see `Dynamics.hybrid`) the error is
+
+            e = -(W(a) b + known(a))_f = M_ff(b) (a_f(b) - a_f).
+
+        Gauss-Newton steps with the weights M_ff give rows at the accelerations of the model,
+        without measured noise:
+
+            W_f(a(b)) beta = e + W_f(a(b)) b.
+
+        They do not determine the scale of b, which driven joints, known forces or a prior
+        determine.
+
+        Args:
+            samples: Samples of the motion.
+            values: (r,) parameters b.
+        """
+        free_joints = np.flatnonzero(~self._model.machine.is_driven)
+        term_states = dict(samples.term_states)  # states of terms with memory
+        W, known = self._sides(samples)
+        residual = (W @ values + known)[:, free_joints]
+
+        def free_rows_at(a_a: Array) -> tuple[Array, Array]:
+            at = dataclasses.replace(samples, a_a=a_a, term_states=dict(term_states))
+            W, known = self._sides(at)
+            return W[:, free_joints], (W @ values + known)[:, free_joints]
+
+        columns = [
+            free_rows_at(samples.a_a + np.eye(samples.a_a.shape[1])[i])[1] - residual
+            for i in free_joints.tolist()
+        ]
+        a_a = samples.a_a.copy()
+        a_a[:, free_joints] -= np.linalg.solve(np.stack(columns, axis=2), residual[:, :, None])[
+            :, :, 0
+        ]
+        W[:, free_joints], _ = free_rows_at(a_a)
+        known[:, free_joints] = residual - W[:, free_joints] @ values
+        return W, known
 
     def thinned_motions(self) -> list[Motion]:
         """The motions at the decimated instants, with filtered forces."""
         forces = np.split(
-            self.forces, np.cumsum([len(part) for part in self._filtered_motions[:-1]])
+            self.forces, np.cumsum([len(part.is_moving) for part in self._filtered_motions[:-1]])
         )
-        out = []
-        for part, tau in zip(self._filtered_motions, forces, strict=True):
-            x, kept = part.motion, slice(None, None, part.thinning)
-            out.append(Motion(x.time[kept], x.q[kept], x.v[kept], x.a[kept], tau))
-        return out
+        return [
+            dataclasses.replace(part.motion[:: part.thinning], tau=tau)
+            for part, tau in zip(self._filtered_motions, forces, strict=True)
+        ]
 
     def modelled_forces(self, values: Array) -> Array:
         """Products of W with parameters (r,): (M, n), or with (r, k): (M, n, k)."""
@@ -238,25 +271,9 @@ class RegressionEquations:
     def compare(self, values: Array) -> ForceComparison:
         """Measured and modelled forces for parameters (r,)."""
         modelled = self.modelled_forces(values) + self.offset
-        joints = self._model.machine.active
-        return ForceComparison(self.time, self.forces, modelled, self.is_moving, joints)
-
-    @cached_property
-    def _row_indices(self) -> tuple[np.ndarray, np.ndarray]:
-        """Instants and joints of the used rows, by time."""
-        instant, joint = np.nonzero(self.is_moving)
-        return instant.astype(np.int32), joint.astype(np.int8)
-
-    @property
-    def samples(self) -> np.ndarray:
-        """Instants (m,) of the used rows."""
-        return self._row_indices[0]
-
-    @cached_property
-    def groups(self) -> np.ndarray:
-        """Groups (m,) of the used rows: joints 0, 1, ... without those that have no rows."""
-        there = self.is_moving.any(axis=0)
-        return (np.cumsum(there) - 1).astype(np.int8)[self._row_indices[1]]
+        return ForceComparison(
+            self.time, self.forces, modelled, self.is_moving, self._model.machine.active
+        )
 
     @cached_property
     def y(self) -> Array:
@@ -302,13 +319,30 @@ class RegressionEquations:
         Returns:
             The equations of the last iteration, and the estimate.
         """
-        equations, values, previous = self, start, None
+        equations, values = self, start
+        previous = np.full(T.shape[1], np.nan)  # nothing converges to it
         has_free_joints = bool(self._model.machine.free)
         for _ in range(_MAX_ITERATIONS):
-            equations = equations.at_values(values) if has_free_joints else equations
-            W = equations.projected_regressor(T)
-            found = estimator(W, equations.y, equations.groups, equations.samples, prior)
-            if not has_free_joints or previous is not None and _is_converged(found, previous):
+            if has_free_joints:
+                equations = RegressionEquations(
+                    self._model,
+                    self.base,
+                    self._motions,
+                    self.bandwidth,
+                    self.slow,
+                    self._progress,
+                    values,
+                )
+            found = estimator(
+                ProjectedRegressor(equations, T),
+                equations.y,
+                equations.groups,
+                equations.samples,
+                prior,
+            )
+            tolerance = _CONVERGENCE_TOLERANCE * found.std
+            tolerance += _ROUNDING_TOLERANCE * np.abs(previous).max()
+            if not has_free_joints or (np.abs(found.values - previous) <= tolerance).all():
                 break
             values, previous = T @ found.values, found.values
         return equations, found
@@ -316,10 +350,6 @@ class RegressionEquations:
     def column_selection(self, base: BaseParameters) -> Array:
         """Selection matrix (r, s) of the columns of a subset of the base parameters."""
         return np.eye(self.base.rank)[:, np.searchsorted(self.base.independent, base.independent)]
-
-    def projected_regressor(self, T: Array) -> "ProjectedRegressor":
-        """Regressor W T of the used rows for T (r, p)."""
-        return ProjectedRegressor(self, T)
 
 
 def is_long_enough(motion: Motion, bandwidth: float) -> bool:
@@ -360,65 +390,6 @@ class ProjectedRegressor:
 
     def triangular_factors(self, y: Array, groups: np.ndarray) -> Array:
         """See `regressor.triangular_factors`."""
-        size = self.shape[1]
-        T = np.zeros((len(self._T) + 1, size + 1))
+        T = np.zeros((len(self._T) + 1, self.shape[1] + 1))
         T[:-1, :-1], T[-1, -1] = self._T, 1.0
         return np.array([triangular_factor(R @ T) for R in self._equations.triangular_factors])
-
-
-def free_joint_rows(
-    regressor_function: RegressorFunction,
-    samples: MotionSamples,
-    free_joints: np.ndarray,
-    values: Array,
-) -> tuple[Array, Array]:
-    """W (N, n, r) and known forces (N, n) with rows of free joints at parameters b.
-
-    The force of a free joint is known to be zero, and noise is in its motion. The equation 0 = W
-    beta + known determines ratios of parameters only, and least squares would be biased by the
-    noise of the measured accelerations in W. With the accelerations a_f(b) of the free joints f by
-    the model (hybrid dynamics, see `Dynamics.hybrid`) the error is
-
-        e = -(W(a) b + known(a))_f = M_ff(b) (a_f(b) - a_f).
-
-    Gauss-Newton steps with the weights M_ff give rows at the accelerations of the model, without
-    measured noise:
-
-        W_f(a(b)) beta = e + W_f(a(b)) b.
-
-    They do not determine the scale of b, which driven joints, known forces or a prior determine.
-
-    Args:
-        regressor_function: Regressor function of the model.
-        samples: Samples of the motion.
-        free_joints: (f,) indices of the free joints.
-        values: (r,) parameters b.
-    """
-    term_states = dict(samples.term_states)  # states of terms with memory
-    W, known = regressor_function(samples)
-    residual = (W @ values + known)[:, free_joints]
-
-    def free_rows_at(a_a: Array) -> tuple[Array, Array]:
-        W, known = regressor_function(
-            dataclasses.replace(samples, a_a=a_a, term_states=dict(term_states))
-        )
-        return W[:, free_joints], (W @ values + known)[:, free_joints]
-
-    columns = [
-        free_rows_at(samples.a_a + np.eye(samples.a_a.shape[1])[i])[1] - residual
-        for i in free_joints.tolist()
-    ]
-    a_a = samples.a_a.copy()
-    a_a[:, free_joints] -= np.linalg.solve(np.stack(columns, axis=2), residual[:, :, None])[
-        :, :, 0
-    ]
-    W[:, free_joints], _ = free_rows_at(a_a)
-    known[:, free_joints] = residual - W[:, free_joints] @ values
-    return W, known
-
-
-def _is_converged(estimate: Estimate, previous: Array) -> bool:
-    """Whether an estimate differs from previous values (p,) by a small part of its std."""
-    tolerance = _CONVERGENCE_TOLERANCE * estimate.std
-    step = np.abs(estimate.values - previous)
-    return bool((step <= tolerance + _ROUNDING_TOLERANCE * np.abs(previous).max()).all())

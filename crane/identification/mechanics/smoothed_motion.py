@@ -1,40 +1,48 @@
-"""Motions from recordings: checked samples, derivatives, and recorded loads."""
+"""Motions from recordings: checks of units, delays, outliers and hum, derivatives, loads."""
 
 import math
 import warnings
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from crane.common.errors import CraneWarning, RecordingError, suggest_names
+from crane.common.errors import CraneWarning, RecordingError, check_name, suggest_names
 from crane.common.samples import Array
 from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.dynamics.dynamics import Dynamics
-from crane.identification.mechanics.force_delays import motion_frequency
-from crane.identification.mechanics.recording_checks import (
-    check_recording,
-    check_samples,
-    reject_unless_trusted,
-    remove_outliers,
-    warn_hum,
-)
-from crane.identification.mechanics.regression_equations import Progress
 from crane.identification.signals.signal_processing import (
     Derivatives,
     Motion,
+    Progress,
+    check_gaps,
     differentiate,
+    low_pass,
     resample_evenly,
+    sampling_step,
 )
-from crane.identification.signals.signal_quality import outlier_mask, replace_outliers
+from crane.identification.signals.signal_quality import (
+    outlier_mask,
+    replace_outliers,
+    spectral_edge_frequency,
+    strongest_spectral_line,
+)
 from crane.machine.machine import Machine
 from crane.recordings.measured_recordings import locked_joint_conflicts
 from crane.recordings.recording import FORCE_SUFFIX, VELOCITY_SUFFIX, VELOCITY_UNITS, Recording
-from crane.recordings.recording_columns import time_derivative
+from crane.recordings.timeseries import time_derivative
 
 _MOTION_FACTOR = 3.0  # standard deviations of a velocity, above which a joint moves
 # times the velocity limit of a joint, above which a recording is rejected
 _MAX_SPEED_FACTOR = 30.0
 _HUM_FACTOR = 10.0  # times the frequency of the motion, above which a spectral line is hum
 _LOAD_PREFIX, _PART_UNITS = "load_", {"force": "N", "moment": "N m"}
+_MIN_SAMPLES = 50  # samples
+_COMPARISON_CUTOFF = 10.0  # [Hz] of the comparison of velocities and positions
+_CORRELATION_TOLERANCE = 0.01  # of a correlation
+_MAX_DELAY = 1.0  # [s] longest delay of the search
+_MAX_OUTLIER_SHARE = 0.05  # of the samples of a column, above which it is rejected
+# units that are confused with SI units
+_COMMON_UNITS = {"rad": ("deg", 180 / math.pi), "m": ("mm", 1e3)}
 
 
 def smoothed_motion(
@@ -70,20 +78,40 @@ def smoothed_motion(
     ):
         reject_unless_trusted(f"{text}, do not lock it, or lock it where it is", trust)
     time, n = recording.time, len(machine.active)
-    check_samples(time)
     names = [x + suffix for suffix in ("", FORCE_SUFFIX) for x in machine.active]
     columns = remove_outliers(time, names, np.hstack([recording.q, recording.tau]), trust)
-    _check_columns(machine, time, columns, recording.v, trust)
+    recorded = None
+    if np.any(recording.v):  # for comparison only, without outliers
+        recorded = np.column_stack([replace_outliers(x, outlier_mask(x)) for x in recording.v.T])
+    limits = np.column_stack([machine.lower, machine.upper])
+    check_recording(
+        time,
+        columns[:, :n],
+        columns[:, n:],
+        machine.active,
+        {joint: machine.unit(joint) for joint in machine.active},
+        recorded,
+        limits if np.isfinite(limits).all() else None,
+        free=machine.free,
+        trust=trust,
+    )
     columns[:, n:] += recorded_load_forces(machine, original, columns[:, :n], trust)
     time, columns = resample_evenly(time, columns)
     step = float(np.median(np.diff(time)))
-    lowest = _HUM_FACTOR * motion_frequency(columns[:, :n], step)
+    lowest = _HUM_FACTOR * spectral_edge_frequency(columns[:, :n], step)
     warn_hum(time, dict(zip(names, columns.T, strict=True)), lowest)
     found = differentiate(time, columns[:, :n], derivatives, cutoff, progress)
-    v, a = np.where(_is_moving(found), (found.v, found.a), 0.0)
+    is_moving = np.ones(n, dtype=bool)  # by more than the uncertainty of the velocity
+    if found.std_v is not None:
+        uncertainty = np.sqrt(np.mean(found.std_v**2, axis=0))
+        is_moving = found.v.std(axis=0) > _MOTION_FACTOR * uncertainty
+    v, a = np.where(is_moving, (found.v, found.a), 0.0)
     _check_speeds(machine, v, trust)
     _warn_standstill(machine, found, v)
-    return Motion(time, found.q, v, a, columns[:, n:], _lowest_passband(found))
+    passband = math.inf
+    if found.passband is not None:
+        passband = float(found.passband[is_moving].min(initial=math.inf))
+    return Motion(time, found.q, v, a, columns[:, n:], passband)
 
 
 def _select_active_joints(machine: Machine, recording: Recording) -> Recording:
@@ -125,19 +153,6 @@ def _select_active_joints(machine: Machine, recording: Recording) -> Recording:
     return Recording(recording.time, machine.active, q, v, tau, joint_units, free=machine.free)
 
 
-def _check_columns(machine: Machine, time: Array, columns: Array, v: Array, trust: bool) -> None:
-    """Check coordinates and forces (N, 2 n) and recorded velocities (N, n)."""
-    q, tau = np.split(columns, 2, axis=1)
-    recorded = None
-    if np.any(v):  # for comparison only, without outliers
-        recorded = np.column_stack([replace_outliers(x, outlier_mask(x)) for x in v.T])
-    limits = np.column_stack([machine.lower, machine.upper])
-    bounded = limits if np.isfinite(limits).all() else None
-    units = {joint: machine.unit(joint) for joint in machine.active}
-    free = machine.free
-    check_recording(time, q, tau, machine.active, units, recorded, bounded, free=free, trust=trust)
-
-
 def _check_speeds(machine: Machine, v: Array, trust: bool) -> None:
     """Reject velocities (N, n) far above the velocity limits."""
     limits = machine.model.velocityLimit[machine.closure.active]
@@ -153,30 +168,16 @@ def _check_speeds(machine: Machine, v: Array, trust: bool) -> None:
             )
 
 
-def _lowest_passband(found: Derivatives) -> float:
-    """Lowest passband [Hz] of the moving joints."""
-    if found.passband is None:
-        return math.inf
-    return float(found.passband[_is_moving(found)].min(initial=math.inf))
-
-
-def _is_moving(found: Derivatives) -> np.ndarray:
-    """Mask (n,) of joints that move by more than the uncertainty of their velocities."""
-    if found.std_v is None:
-        return np.ones(found.v.shape[1], dtype=bool)
-    uncertain = np.sqrt(np.mean(found.std_v**2, axis=0))
-    return np.asarray(found.v.std(axis=0) > _MOTION_FACTOR * uncertain)
-
-
 def _warn_standstill(machine: Machine, found: Derivatives, v: Array) -> None:
     """Warn of joints that have noise, but no motion: static friction makes any force."""
     for i in np.flatnonzero(~v.any(axis=0) & found.v.any(axis=0)).tolist():
         joint, place = machine.active[i], float(found.q[:, i].mean())
-        text = (
+        warnings.warn(
             f"'{joint}' stands still but for noise: its forces are not informative, move it, or "
-            f"lock it ({joint}={place:.4g})"
+            f"lock it ({joint}={place:.4g})",
+            CraneWarning,
+            stacklevel=3,
         )
-        warnings.warn(text, CraneWarning, stacklevel=3)
 
 
 def recorded_load_forces(machine: Machine, recording: Recording, q_a: Array, trust: bool) -> Array:
@@ -200,20 +201,18 @@ def recorded_load_forces(machine: Machine, recording: Recording, q_a: Array, tru
     frames = {force.name: force.frame for force in machine.external_forces}
     wrenches: dict[str, Array] = {}
     for column, values in recording.channels.items():
-        part = next(
-            (x for x in WRENCH_COMPONENTS if column == f"{_LOAD_PREFIX}{_load_name(column)}_{x}"),
-            None,
-        )
-        if part is None:
+        pieces = column.removeprefix(_LOAD_PREFIX).rsplit("_", 2)
+        part = "_".join(pieces[1:])
+        if not column.startswith(_LOAD_PREFIX) or part not in WRENCH_COMPONENTS:
             continue
-        name, unit = _load_name(column), recording.channel_units[column]
+        name, unit = pieces[0], recording.channel_units[column]
         if unit != _PART_UNITS[part[:-2]]:
             raise RecordingError(
                 f"'{column}' is recorded in {unit}, give {_PART_UNITS[part[:-2]]}"
             )
-        if name not in frames and name not in machine.tree.links:
-            links = suggest_names(machine.tree.links, name)
-            raise RecordingError(f"'{column}' acts on no link of '{machine.name}', {links}")
+        if name not in frames:
+            problem = f"'{column}' acts on no link of '{machine.name}'"
+            check_name(name, machine.tree.links, problem, RecordingError)
         rows = wrenches.setdefault(name, np.zeros((len(values), len(WRENCH_COMPONENTS))))
         rows[:, WRENCH_COMPONENTS.index(part)] = values
     for name in frames:
@@ -229,6 +228,200 @@ def recorded_load_forces(machine: Machine, recording: Recording, q_a: Array, tru
     return total
 
 
-def _load_name(column: str) -> str:
-    """Name of the load of a column."""
-    return column.removeprefix(_LOAD_PREFIX).rsplit("_", 2)[0]
+def signal_delay(time: Array, one: Array, other: Array) -> float:
+    """Delay [s] of the second signal (N,) with respect to the first, at most 1 s.
+
+    It is the maximum of the correlation of the overlapping parts, refined by a parabola.
+    """
+    from scipy.signal import correlate
+
+    step = sampling_step(time)
+    one, other = one - one.mean(), other - other.mean()
+    shifts = np.arange(-(reach := min(round(_MAX_DELAY / step), len(time) // 4)), reach + 1)
+    products = correlate(other, one, method="fft")[shifts + len(time) - 1]
+    first, second = (np.append(0, np.cumsum(x**2)) for x in (one, other))
+    low, high = np.maximum(shifts, 0), len(time) + np.minimum(shifts, 0)
+    energy = (first[high - shifts] - first[low - shifts]) * (second[high] - second[low])
+    correlation = products / np.sqrt(np.maximum(energy, 1e-12 * first[-1] * second[-1] + 1e-300))
+    # the shortest of equal maxima, as for periodic signals
+    best = np.flatnonzero(correlation >= correlation.max() - _CORRELATION_TOLERANCE)
+    at = int(np.clip(best[np.abs(shifts[best]).argmin()], 1, 2 * reach - 1))
+    if correlation[at - 1 : at + 2].argmax() != 1:  # not at a local maximum
+        direction = 1 if correlation[at + 1] > correlation[at] else -1
+        while 1 < at < 2 * reach - 1 and correlation[at + direction] > correlation[at]:
+            at += direction
+    before, here, after = correlation[at - 1 : at + 2]
+    curvature = before - 2 * here + after
+    shift = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
+    return float((at - reach + shift) * step)
+
+
+def reject_unless_trusted(text: str, trust: bool) -> None:
+    """Reject a recording that is probably wrong, or warn if it is trusted.
+
+    Raises:
+        RecordingError: It is not trusted.
+    """
+    if not trust:
+        raise RecordingError(f"{text}; if the recording is right, trust it (trust)")
+    warnings.warn(f"{text}: trusted", CraneWarning, stacklevel=3)
+
+
+def remove_outliers(
+    time: Array, names: Sequence[str], columns: Array, trust: bool = False
+) -> Array:
+    """Replace outliers in columns (N, k) by linear interpolation.
+
+    Outliers are removed before filters, which would smear them. Columns of a trusted recording are
+    not changed.
+
+    Raises:
+        RecordingError: A column has too many outliers.
+    """
+    messages = []
+    for name, column in () if trust else zip(names, columns.T, strict=True):
+        bad = outlier_mask(column)
+        if not bad.any():
+            continue
+        first = f"the first at {time[bad.argmax()]:.6g} s"
+        if bad.mean() > _MAX_OUTLIER_SHARE:
+            reject_unless_trusted(
+                f"'{name}' has {bad.sum()} outliers in {len(bad)} samples, {first}", trust
+            )
+        messages.append(f"{bad.sum()} in '{name}' ({first})")
+        column[:] = replace_outliers(column, bad)
+    if messages:
+        warnings.warn(
+            f"outliers are left out and bridged: {', '.join(messages)} of {len(time)} samples",
+            CraneWarning,
+            stacklevel=3,
+        )
+    return columns
+
+
+def warn_hum(time: Array, columns: Mapping[str, Array], min_frequency: float) -> None:
+    """Warn of spectral lines in columns (N,) above a frequency [Hz] without motion."""
+    step, messages = float(np.median(np.diff(time))), []
+    for name, column in columns.items():
+        if (
+            np.ptp(column) > 0
+            and (found := strongest_spectral_line(column, step, min_frequency)) is not None
+        ):
+            share = 100 * found[1] / float(np.std(column))
+            messages.append(f"'{name}' of {found[0]:.3g} Hz ({found[1]:.3g}, {share:.2g} % of it)")
+    if messages:
+        warnings.warn(
+            f"hum in {', '.join(messages)}: keep the bandwidth well below it",
+            CraneWarning,
+            stacklevel=3,
+        )
+
+
+def check_recording(
+    time: Array,
+    q: Array,
+    tau: Array,
+    joints: Sequence[str],
+    units: Mapping[str, str],
+    v: Array | None = None,
+    limits: Array | None = None,
+    longest_delay: float = 0.05,
+    free: Sequence[str] = (),
+    trust: bool = False,
+) -> None:
+    """Reject a recording that is not suitable for an identification.
+
+    Args:
+        time: Instants (N,) [s].
+        q: Coordinates (N, n).
+        tau: Generalized forces (N, n).
+        joints: Names (n,).
+        units: "rad" or "m" of each coordinate.
+        v: Recorded velocities (N, n), compared with the derivatives of q.
+        limits: Lower and upper limits (n, 2).
+        longest_delay: Largest delay [s] between recorded velocity and q, for filters of sensors.
+        free: Names of free joints.
+        trust: Whether to warn only of what is probably wrong.
+
+    Raises:
+        RecordingError: There are too few samples, a gap or no motion, units are wrong, or columns
+            are inconsistent; the message names the column.
+    """
+    if len(time) < _MIN_SAMPLES:
+        raise RecordingError(f"{len(time)} samples are too few, record at least {_MIN_SAMPLES}")
+    check_gaps(time)
+    # steps between samples of pure noise have twice its variance
+    if all(np.ptp(x) == 0 or np.var(np.diff(x)) >= np.var(x) for x in q.T):
+        raise RecordingError("no joint moves, record a motion")
+    for i, joint in enumerate(joints):
+        if joint not in free and np.ptp(tau[:, i]) == 0 and np.ptp(q[:, i]) > 0:
+            reject_unless_trusted(
+                f"'{joint}_force' is constant while '{joint}' moves, check it", trust
+            )
+        if limits is not None:
+            _check_range(q[:, i], limits[i], joint, units[joint], trust)
+        if v is not None and np.var(np.diff(q[:, i])) < np.var(q[:, i]):
+            _check_velocity(time, q[:, i], v[:, i], joint, units[joint], longest_delay, trust)
+
+
+def _check_range(x: Array, limits: Array, joint: str, unit: str, trust: bool) -> None:
+    low, high = limits
+    slack = 0.1 * (high - low)
+
+    def inside(values: Array) -> bool:
+        return low - slack <= values.min() and values.max() <= high + slack
+
+    if not inside(x):
+        other, factor = _COMMON_UNITS[unit]
+        is_other_unit = inside(x / factor) and np.ptp(x) > 0.02 * factor * (high - low)
+        hint = f"it looks like {other}" if is_other_unit else "check its zero and unit"
+        reject_unless_trusted(
+            f"'{joint}' goes from {x.min():.4g} to {x.max():.4g} {unit}, its limits are "
+            f"{low:.4g} and {high:.4g} {unit}, {hint}",
+            trust,
+        )
+
+
+def _check_velocity(
+    time: Array, x: Array, v: Array, joint: str, unit: str, longest_delay: float, trust: bool
+) -> None:
+    """Compare a velocity with the derivative of its coordinate below 10 Hz."""
+    time, columns = resample_evenly(time, np.column_stack([x, v]))
+    step = sampling_step(time)
+    if 0.4 / step > _COMPARISON_CUTOFF:
+        columns = low_pass(time, columns, _COMPARISON_CUTOFF)
+    derivative = np.gradient(columns[:, 0], step, axis=0, edge_order=2)
+    v = columns[:, 1]
+    # less than a micrometre is noise or rounding, not motion
+    if np.std(columns[:, 0]) < 1e-6:
+        return
+    ratio = math.sqrt(np.mean(v**2) / np.mean(derivative**2))
+    other, factor = _COMMON_UNITS[unit]
+    for wrong, scale in ((f"{joint}_velocity", factor), (joint, 1 / factor)):
+        if 0.8 < ratio / scale < 1.25:
+            return reject_unless_trusted(
+                f"'{joint}_velocity' is {ratio:.3g} times the derivative of '{joint}', "
+                f"'{wrong}' looks like {other}, give {unit}",
+                trust,
+            )
+    delay = signal_delay(time, derivative, v)
+    shift = round(delay / step)
+    first, second = (derivative, v) if shift >= 0 else (v, derivative)
+    overlap = len(v) - abs(shift)
+    first, second = first[:overlap], second[abs(shift) :]
+    correlation = float(np.corrcoef(first, second)[0, 1]) if np.ptp(v) > 0 else 0.0
+    if correlation < 0.7 or not 0.5 < ratio < 2:
+        return reject_unless_trusted(
+            f"'{joint}_velocity' is not the derivative of '{joint}' (correlation "
+            f"{correlation:.2f}, ratio {ratio:.3g}), check the columns",
+            trust,
+        )
+    if abs(delay) > longest_delay:
+        reject_unless_trusted(delay_message(f"{joint}_velocity", delay, f"'{joint}'"), trust)
+    return None
+
+
+def delay_message(name: str, delay: float, reference: str) -> str:
+    """Message about the delay [s] of a column with respect to another."""
+    side = "behind" if delay > 0 else "ahead of"
+    return f"'{name}' is {abs(delay) * 1e3:.0f} ms {side} {reference}, record them with one clock"

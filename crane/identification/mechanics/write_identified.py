@@ -16,6 +16,7 @@ from crane.common.errors import CraneError, CraneWarning, InputError, OutputErro
 from crane.common.samples import Array
 from crane.description.force_elements import Friction
 from crane.description.inertia_feasibility import inertia_problem
+from crane.description.machine_schema import END_STOP, FORCE, GAS_SPRING, LOOP, ROPE
 from crane.description.parameter_changes import lock_joints
 from crane.description.specification import Chain, MachineSpec
 from crane.dynamics.dynamics import Dynamics
@@ -25,17 +26,15 @@ from crane.formats.machine_file.yaml_text import KeyPath, format_yaml
 from crane.formats.machine_loading import load
 from crane.formats.parallel_robots import is_parallel_robot
 from crane.identification.mechanics.base_parameters import random_samples
-from crane.identification.mechanics.force_terms import FrictionTerm
 from crane.identification.mechanics.identification_result import Identification
 from crane.identification.mechanics.identified_description import (
-    FrictionLawFit,
     divide_locked_bodies,
     friction_laws,
     joint_combinations,
     motor_chain,
     replace_inertials,
 )
-from crane.identification.mechanics.model_term import BODY_PARAMETERS
+from crane.identification.mechanics.model_terms import BODY_PARAMETERS, FrictionTerm
 from crane.machine.machine import Machine
 
 _FORCE_TOLERANCE = 1e-9  # of the largest force, for the check of the written machine
@@ -76,8 +75,8 @@ def write_identified(identification: Identification, folder: str | Path) -> Path
     check_rewritable(machine)
     if parameters is None or not identification.model.bodies:
         raise InputError("forces determine base parameters only: give prior or feasible=True")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)  # reported when the machine was loaded
+    # warnings were reported when the machine was loaded
+    with warnings.catch_warnings(action="ignore", category=CraneWarning):
         spec = read_machine_spec(machine.path)
         unlocked_machine = load(machine.path) if machine.locked_joints else machine
     bodies = divide_locked_bodies(machine, parameters, unlocked_machine)
@@ -96,10 +95,8 @@ def write_identified(identification: Identification, folder: str | Path) -> Path
         origin_text += (
             f", {undetermined_count} of {len(identification.marks)} base parameters not determined"
         )
-    law_fits = friction_laws(identification.model, parameters, identification.speeds)
-    content, motor_urdfs = _machine_file_content(
-        identification, spec, names, origin_text, law_fits
-    )
+    laws, deviations = friction_laws(identification.model, parameters, identification.speeds)
+    content, motor_urdfs = _machine_file_content(identification, spec, names, origin_text, laws)
     with replace_folder(folder) as part:
         for chain in spec.chains:
             tree = replace_inertials(chain.urdf, bodies, _fixed_links(spec), origin_text)
@@ -111,13 +108,16 @@ def write_identified(identification: Identification, folder: str | Path) -> Path
         for name, text in motor_urdfs.items():
             (part / name).write_text(text, encoding="utf-8")
         (part / file).write_text(content, encoding="utf-8")
-        _check_written_machine(
-            identification,
-            bodies,
-            part / file,
-            exact=not any(each.max_deviation for each in law_fits.values()),
+        _check_written_machine(identification, bodies, part / file, exact=not deviations)
+    if deviations:
+        worst = max(deviations, key=lambda name: deviations[name])
+        unit = "N" if worst in machine.joints and machine.unit(worst) == "m" else "N m"
+        text = (
+            f"a machine file has no place for all of the friction of {', '.join(deviations)}: "
+            "the nearest law at steady speeds is written, off by at most "
+            f"{deviations[worst]:.3g} {unit} ({worst})"
         )
-    _warn_inexact_friction(machine, law_fits)
+        warnings.warn(text, CraneWarning, stacklevel=3)
     return Path(folder) / file
 
 
@@ -127,9 +127,8 @@ def check_rewritable(machine: Machine) -> None:
     Raises:
         InputError: The format is not supported, or the machine has parameter changes.
     """
-    urdf = machine.path.suffix.lower() == ".urdf"
     if any(chain.urdf.suffix.lower() != ".urdf" for chain in machine.chains) or (
-        not urdf and is_parallel_robot(machine.path)
+        not (machine.path.suffix.lower() == ".urdf") and is_parallel_robot(machine.path)
     ):
         raise InputError(
             f"{machine.path.name}: an identified machine needs a machine file or URDF, make "
@@ -185,20 +184,16 @@ def _machine_file_content(
     spec: MachineSpec,
     names: Mapping[str, str],
     origin_text: str,
-    law_fits: Mapping[str, FrictionLawFit],
+    laws: Mapping[str, Friction],
 ) -> tuple[str, dict[str, str]]:
     """Content of the machine file, and of URDF files of motors that turn several joints."""
     machine = result.described_machine
-    data: dict[str, Any]
     if machine.path.suffix.lower() == ".urdf":
-        data = {"name": machine.name, "chains": [{"name": spec.chains[0].name}]}
-        loops = [dataclasses.asdict(loop) for loop in spec.loops]
-        data |= {
-            "loops": [{k: v for k, v in loop.items() if k != "source_location"} for loop in loops]
-        }
-        for loop in data["loops"]:
-            loop["axis"] = list(loop["axis"])
-        data |= {"active": list(spec.active if spec.active is not None else machine.active)}
+        data: dict[str, Any] = {"name": machine.name, "chains": [{"name": spec.chains[0].name}]}
+        data["loops"] = [
+            LOOP.values_of(loop) | {"axis": [float(x) for x in loop.axis]} for loop in spec.loops
+        ]
+        data["active"] = list(spec.active if spec.active is not None else machine.active)
         if machine.tip is not None:
             data["tip"] = machine.tip
     else:
@@ -209,13 +204,23 @@ def _machine_file_content(
     if spec.payload is not None:
         data["payload"] = {"urdf": names[spec.payload.chain.name]}
     motor_urdfs = {}
-    for direction in joint_combinations(result.model):
+    combinations = joint_combinations(result.model)
+    for direction in combinations:
         chain, coupling, text = motor_chain(direction, spec.tree.root_link)
         data["chains"].append(chain)
         data["couplings"] = [*(data.get("couplings") or ()), coupling]
         motor_urdfs[chain["urdf"]] = text
-    data["friction"] = _friction_data(result, spec, law_fits)
-    data["rotor_inertia"] = _rotor_inertias(result, spec)
+    friction = {x: law for x, law in spec.friction.items() if x in machine.locked_joints}
+    for joint in (*machine.joints, *(x.name for x in combinations)):
+        if joint in laws or joint in spec.friction:  # without friction in the model it has none
+            friction[joint] = laws.get(joint, Friction())
+    data["friction"] = {joint: friction_data(law) for joint, law in friction.items()}
+    rotors = {joint.name: joint.rotor_inertia for joint in spec.tree.moving_joints}
+    rotors |= _parameters_of_kind(result, "rotor_inertia")
+    for joint, value in rotors.items():
+        if value < 0:
+            raise InputError(f"'{joint}': rotor inertia is {value:g}, give feasible=True")
+    data["rotor_inertia"] = {joint: value for joint, value in rotors.items() if value}
     scales = _parameters_of_kind(result, "gas_scale")
     moving = lock_joints(spec, machine.locked_joints) if machine.locked_joints else spec
 
@@ -224,17 +229,14 @@ def _machine_file_content(
         kept = getattr(moving, kind)
         return [*getattr(machine, kind), *(x for x in getattr(spec, kind) if x not in kept)]
 
-    data["forces"] = [_non_default_fields(item) for item in elements_of("forces")]
+    data["forces"] = [FORCE.values_of(item) for item in elements_of("forces")]
     data["gas_springs"] = {
-        item.joint: _non_default_fields(
-            item, joint=None, pressure=item.pressure * scales.get(item.joint, 1.0)
-        )
+        item.joint: GAS_SPRING.values_of(item)
+        | {"pressure": item.pressure * scales.get(item.joint, 1.0)}
         for item in elements_of("gas_springs")
     }
-    data["ropes"] = [_non_default_fields(item) for item in elements_of("ropes")]
-    data["end_stops"] = {
-        item.joint: _non_default_fields(item, joint=None) for item in elements_of("end_stops")
-    }
+    data["ropes"] = [ROPE.values_of(item) for item in elements_of("ropes")]
+    data["end_stops"] = {item.joint: END_STOP.values_of(item) for item in elements_of("end_stops")}
     for key in ("loops", "forces", "gas_springs", "ropes", "end_stops", "rotor_inertia"):
         if not data.get(key):
             data.pop(key, None)
@@ -268,61 +270,6 @@ def _parameters_of_kind(result: Identification, kind: str) -> dict[str, float]:
     }
 
 
-def _rotor_inertias(result: Identification, spec: MachineSpec) -> dict[str, float]:
-    """Rotor inertias by joint, identified or described."""
-    described = {joint.name: joint.rotor_inertia for joint in spec.tree.moving_joints}
-    found = described | _parameters_of_kind(result, "rotor_inertia")
-    for joint, value in found.items():
-        if value < 0:
-            raise InputError(f"'{joint}': rotor inertia is {value:g}, give feasible=True")
-    return {joint: value for joint, value in found.items() if value}
-
-
-def _friction_data(
-    result: Identification, spec: MachineSpec, law_fits: Mapping[str, FrictionLawFit]
-) -> dict[str, dict[str, Any]]:
-    """Friction by joint; joints without friction in the model have none."""
-    machine = result.described_machine
-    friction = {
-        joint: friction_data(law)
-        for joint, law in spec.friction.items()
-        if joint in machine.locked_joints
-    }
-    for joint in (*machine.joints, *(x.name for x in joint_combinations(result.model))):
-        if joint in law_fits:
-            friction[joint] = friction_data(law_fits[joint].law)
-        elif joint in spec.friction:
-            friction[joint] = {"viscous": 0.0}
-    return friction
-
-
-def _warn_inexact_friction(machine: Machine, law_fits: Mapping[str, FrictionLawFit]) -> None:
-    """Warn of friction that is replaced by the nearest law."""
-    deviations = {
-        name: each.max_deviation for name, each in law_fits.items() if each.max_deviation
-    }
-    if deviations:
-        worst = max(deviations, key=lambda name: deviations[name])
-        unit = "N" if worst in machine.joints and machine.unit(worst) == "m" else "N m"
-        text = (
-            f"a machine file has no place for all of the friction of {', '.join(deviations)}: "
-            "the nearest law at steady speeds is written, off by at most "
-            f"{deviations[worst]:.3g} {unit} ({worst})"
-        )
-        warnings.warn(text, CraneWarning, stacklevel=4)
-
-
-def _non_default_fields(element: Any, **changed: Any) -> dict[str, Any]:
-    """Fields of a dataclass that differ from their defaults."""
-    values = {
-        field.name: changed.get(field.name, getattr(element, field.name))
-        for field in dataclasses.fields(element)
-        if field.name not in changed or changed[field.name] is not None
-    }
-    defaults = {field.name: field.default for field in dataclasses.fields(element)}
-    return {key: value for key, value in values.items() if value != defaults[key]}
-
-
 def _check_written_machine(
     result: Identification, bodies: Mapping[str, Array], file: Path, exact: bool
 ) -> None:
@@ -335,8 +282,7 @@ def _check_written_machine(
         exact: Whether friction is exact; otherwise it is excluded from the comparison.
     """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", CraneWarning)
+        with warnings.catch_warnings(action="ignore", category=CraneWarning):
             written = load(file, lock=dict(result.described_machine.locked_joints))
     except CraneError as error:
         # an infeasible body is no error of the file that a user could correct
@@ -352,8 +298,9 @@ def _check_written_machine(
             parameter_values[first : first + len(term.names)] = 0.0
         first += len(term.names)
     expected_forces = model.regressor(at) @ parameter_values + model.known_forces(at)
-    dynamics = Dynamics(written, backend="pinocchio")
-    written_forces = dynamics.inverse(at.q_a, at.v_a, at.a_a, friction=exact)
+    written_forces = Dynamics(written, backend="pinocchio").inverse(
+        at.q_a, at.v_a, at.a_a, friction=exact
+    )
     force_differences = np.abs(written_forces - expected_forces).max(axis=0)
     if force_differences.max() <= _FORCE_TOLERANCE * np.abs(expected_forces).max():
         return

@@ -43,6 +43,7 @@ def kalman_smooth(y: Array, step: float) -> tuple[Array, Array, float, float]:
 
     Source: Rauch, Tung, Striebel 1965; de Jong 1991 (unknown initial states).
     """
+    from scipy.linalg import solve_discrete_lyapunov
     from scipy.optimize import minimize_scalar
 
     if np.ptp(y) == 0:
@@ -73,7 +74,7 @@ def kalman_smooth(y: Array, step: float) -> tuple[Array, Array, float, float]:
 
     # The covariance is stationary in the interior; the end and mu change it near the ends.
     end = update @ P
-    interior = _solve_stein(C, end - C @ P @ C.T)
+    interior = solve_discrete_lyapunov(C, end - C @ P @ C.T)
     reach = _decay_length(np.linalg.eigvals(C), len(y))
     powers = _matrix_powers(C, reach)
     covariance = np.repeat(np.diag(interior)[None, :3], len(y), axis=0)
@@ -176,10 +177,3 @@ def _linear_recursion(A: Array, B: Array, u: Array, start: Array) -> Array:
 def _backward_recursion(C: Array, F: Array, filtered: Array) -> Array:
     """Backward recursion x_k = filtered_k + C (x_k+1 - F filtered_k)."""
     return _linear_recursion(C, np.eye(4) - C @ F, filtered[-2::-1], filtered[-1])[::-1]
-
-
-def _solve_stein(A: Array, B: Array) -> Array:
-    """Solution X of X = A X A^T + B."""
-    from scipy.linalg import solve_discrete_lyapunov
-
-    return np.asarray(solve_discrete_lyapunov(A, B))

@@ -5,13 +5,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from crane.common.errors import InputError, RecordingError, suggest_names
+from crane.common.errors import InputError, RecordingError, check_name
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, as_number
 from crane.identification.signals.kalman_smoother import kalman_smooth
 
+Progress = Callable[[float], None]
 METHODS = ("kalman", "lowpass")
 _MIN_SAMPLES = 50  # samples
 _MAX_GAP = 5.0  # steps
@@ -43,6 +43,11 @@ class Motion(OneLineRepr):
     tau: Array
     passband: float = math.inf
 
+    def __getitem__(self, part: slice) -> "Motion":
+        """The motion at some of its samples."""
+        q, v, a, tau = (x[part] for x in (self.q, self.v, self.a, self.tau))
+        return Motion(self.time[part], q, v, a, tau, self.passband)
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Derivatives(OneLineRepr):
@@ -72,7 +77,7 @@ def differentiate(
     q: Array,
     method: str = "kalman",
     cutoff: float | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Derivatives:
     """Velocities and accelerations from measured coordinates.
 
@@ -89,16 +94,15 @@ def differentiate(
         RecordingError: Samples are not equidistant, or too few.
     """
     step = sampling_step(time)
-    if method not in METHODS:
-        raise InputError(f"method '{method}' is unknown, {suggest_names(METHODS, method)}")
+    check_name(method, METHODS, f"method '{method}' is unknown")
     if (method == "lowpass") != (cutoff is not None):
         verb = "needs" if cutoff is None else "estimates its own and takes no"
         raise InputError(f"method '{method}' {verb} cutoff, give one to 'lowpass' alone")
     if cutoff is not None:
         filtered = low_pass(time, q, cutoff)
-        v = central_differences(time, filtered)
-        half = np.full(q.shape[1], float(cutoff))
-        return Derivatives(filtered, v, central_differences(time, v), passband=half)
+        v = np.gradient(filtered, step, axis=0, edge_order=2)
+        a = np.gradient(v, step, axis=0, edge_order=2)
+        return Derivatives(filtered, v, a, passband=np.full(q.shape[1], float(cutoff)))
     position, v, a, std_v, std_a = (np.empty(q.shape) for _ in range(5))
     noise, half = np.empty((2, q.shape[1]))
     for i, column in enumerate(q.T):
@@ -141,8 +145,7 @@ def resample(time: Array, columns: Array, step: float) -> tuple[Array, Array]:
 
     as_number(step, "the step", "s", greater_than=0)
     check_gaps(time)
-    count = math.floor((time[-1] - time[0]) / step * (1 + 1e-9)) + 1
-    instants = time[0] + step * np.arange(count)
+    instants = time[0] + step * np.arange(math.floor((time[-1] - time[0]) / step * (1 + 1e-9)) + 1)
     return instants, CubicSpline(time, columns)(instants)
 
 
@@ -204,11 +207,6 @@ def filter_kernel(step: float, cutoff: float) -> Array:
     return np.asarray(weights / weights.sum())
 
 
-def central_differences(time: Array, x: Array) -> Array:
-    """Central differences (x_k+1 - x_k-1) / (2 dt) of x (N, ...); one-sided at the ends."""
-    return np.gradient(x, sampling_step(time), axis=0, edge_order=2)
-
-
 def average_periods(time: Array, x: Array, period: float) -> tuple[Array, Array, Array]:
     """Mean over the complete periods of a recording.
 
@@ -238,8 +236,7 @@ def average_periods(time: Array, x: Array, period: float) -> tuple[Array, Array,
             f"{len(time) * step:g} s hold fewer than two periods of {period:g} s, record longer"
         )
     stacked = x[: periods * count].reshape(periods, count, *x.shape[1:])
-    error = stacked.std(axis=0, ddof=1) / math.sqrt(periods)
-    return time[:count], stacked.mean(axis=0), error
+    return time[:count], stacked.mean(axis=0), (stacked.std(axis=0, ddof=1) / math.sqrt(periods))
 
 
 def filter_rows(
@@ -298,13 +295,4 @@ def _weighted_means(x: Array, weights: Array, decimation: int) -> Array:
         whole = upfirdn(weights, np.pad(x, edges), down=decimation, axis=0)
         return np.asarray(whole[kept_samples][: -(-count // decimation)])
 
-    weight_sums = convolved(np.ones(count))
-    return convolved(x) / weight_sums.reshape(-1, *[1] * (x.ndim - 1))
-
-
-def is_moving(v: Array, threshold: ArrayLike) -> np.ndarray:
-    """Mask (N, n) of |v| (N, n) above a threshold, one for all or (n,).
-
-    Near zero velocity the friction laws of the model are not valid.
-    """
-    return np.abs(v) > np.asarray(threshold)
+    return convolved(x) / convolved(np.ones(count)).reshape(-1, *[1] * (x.ndim - 1))

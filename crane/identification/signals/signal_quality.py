@@ -1,10 +1,13 @@
-"""Outliers, spectral lines and spectral edge frequencies of recorded signals."""
+"""Outliers, spectral lines and steady samples of recorded signals."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
-from crane.common.samples import Array
+from crane.common.errors import InputError, RecordingError
+from crane.common.samples import Array, as_number
+from crane.identification.signals.signal_processing import low_pass, sampling_step
 
 _SEGMENT_COUNT = 8
 _MIN_SEGMENTS = 7  # segments in which a line must stand out
@@ -18,21 +21,27 @@ _STEP_FACTOR = 4.0  # times the largest step between the neighbours, likewise
 _NEIGHBOUR_COUNT = 3  # neighbours on either side
 # standard deviation over median absolute deviation of normal noise
 _MAD_TO_STD = 1.482602218505602
+_MAX_CHANGE = 0.02  # largest change relative to the range of a signal
+_MIN_PERIODS = 3  # least number of periods of a ringing
+_MAX_RESIDUAL_SHARE = 0.5  # largest share of the squares that a sinusoid leaves
 
 
-def spectral_edge_frequency(share: float, x: Array, step: float) -> float:
-    """Spectral edge frequency [Hz], below which a share of the power of a signal lies.
+def spectral_edge_frequency(x: Array, step: float, share: float = 0.995) -> float:
+    """Spectral edge frequency [Hz] of a motion: the largest of those of its signals.
 
     Args:
-        share: Share of the power, 0 to 1.
-        x: Equidistant samples (N,), not constant.
+        x: Equidistant samples (N, n); constant signals do not count.
         step: Step between samples [s].
+        share: Share of the power below it, 0 to 1.
     """
     from scipy.signal import periodogram
 
-    frequency, power = periodogram(x, 1 / step, window="hann")
-    whole = np.cumsum(power, out=power)
-    return float(frequency[max(1, np.searchsorted(whole, share * whole[-1]))])
+    edges = []
+    for column in x.T[np.ptp(x, axis=0) > 0]:
+        frequency, power = periodogram(column / max(column.std(), 1e-300), 1 / step, window="hann")
+        whole = np.cumsum(power, out=power)
+        edges.append(float(frequency[max(1, np.searchsorted(whole, share * whole[-1]))]))
+    return max(edges, default=1 / (len(x) * step))
 
 
 def strongest_spectral_line(
@@ -92,7 +101,12 @@ def outlier_mask(x: Array) -> np.ndarray:
     found = np.zeros(len(x), dtype=bool)
     if len(x) <= 2 * _NEIGHBOUR_COUNT + _MAX_RUN:
         return found
-    noise = _neighbour_noise(x)
+    # robust standard deviation of samples about the mean of their neighbours; coarse samples may
+    # coincide with it: at least the median nonzero step
+    noise = _MAD_TO_STD * float(np.median(np.abs(x[1:-1] - 0.5 * (x[:-2] + x[2:]))))
+    steps = np.abs(np.diff(x))
+    if steps.any():
+        noise = max(noise, float(np.median(steps[steps > 0])))
     while True:  # outliers masked by others appear after these are replaced
         bridged, before = replace_outliers(x, found), found.sum()
         for length in range(1, _MAX_RUN + 1):
@@ -109,17 +123,6 @@ def replace_outliers(x: Array, mask: np.ndarray) -> Array:
     out = x.copy()
     out[mask] = np.interp(np.flatnonzero(mask), good, x[good])
     return out
-
-
-def _neighbour_noise(x: Array) -> float:
-    """Robust standard deviation of samples about the mean of their neighbours.
-
-    Coarse samples may coincide with it: at least the median nonzero step is returned.
-    """
-    deviation = _MAD_TO_STD * float(np.median(np.abs(x[1:-1] - 0.5 * (x[:-2] + x[2:]))))
-    steps = np.abs(np.diff(x))
-    steps = steps[steps > 0]
-    return max(deviation, float(np.median(steps)) if len(steps) else 0.0)
 
 
 def _outlier_runs(x: Array, length: int, noise: float) -> np.ndarray:
@@ -143,3 +146,155 @@ def _outlier_runs(x: Array, length: int, noise: float) -> np.ndarray:
             exceeds_limit[0] & exceeds_limit[-1] & exceeds_limit[k]
         )
     return found
+
+
+def steady_samples(
+    time: Array, settle: float, *signals: Array, share: float = _MAX_CHANGE, relative: bool = False
+) -> np.ndarray:
+    """Mask of samples before which signals were steady.
+
+    Each signal, low-passed at 4 / settle Hz, changed by less than a share of its range in the last
+    `settle` seconds.
+
+    Args:
+        time: Equidistant instants (N,) [s].
+        settle: Duration [s].
+        signals: Signals (N,).
+        share: Largest change relative to the range.
+        relative: Whether the share refers to the signal at the sample instead.
+
+    Returns:
+        Mask (N,), false during the first `settle` seconds.
+
+    Raises:
+        InputError: `settle` is not above two steps.
+        RecordingError: No sample is steady.
+    """
+    is_steady = _steady_mask(time, settle, *signals, share=share, relative=relative)
+    if not is_steady.any():
+        raise RecordingError(
+            f"no sample is steady for {settle:g} s, record slower ramps or longer steps"
+        )
+    return is_steady
+
+
+def _steady_mask(
+    time: Array, settle: float, *signals: Array, share: float = _MAX_CHANGE, relative: bool = False
+) -> np.ndarray:
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+    step = sampling_step(time)
+    as_number(settle, "settle", "s", greater_than=0)
+    count = round(settle / step)
+    if count < 2:
+        raise InputError(f"settle is {settle:g} s, give at least {2 * step:g} s")
+    kept = np.ones(len(time), dtype=bool)
+    kept[:count] = False
+    for signal in signals:
+        smooth = signal
+        if 4 / settle < 0.4 / step:
+            smooth = low_pass(time, signal, 4 / settle)
+        # the window of sample k ends with it
+        size, back = count + 1, count // 2
+        span = maximum_filter1d(smooth, size, origin=back)
+        span -= minimum_filter1d(smooth, size, origin=back)
+        kept &= span <= share * (np.abs(smooth) if relative else np.ptp(smooth))
+    return kept
+
+
+@dataclass(frozen=True)
+class SteadyMeans:
+    """Steady samples of a signal and its response, with means over periods of a ringing response.
+
+    Attributes:
+        kept: Mask (N,) of the steady samples.
+        signal: (N,) the signal, or its mean over the last period.
+        answer: (N,) the response likewise.
+        frequency: Lowest and highest frequency of the ringing [Hz], None without ringing.
+        amplitude: Largest amplitude of the ringing, in the unit of the response.
+    """
+
+    kept: np.ndarray
+    signal: Array
+    answer: Array
+    frequency: tuple[float, float] | None = None
+    amplitude: float = 0.0
+
+
+def steady_means(time: Array, settle: float, signal: Array, answer: Array) -> SteadyMeans:
+    """Steady samples of a signal and its response, which may ring about a steady mean.
+
+    Samples of `steady_samples` are not changed. Others are used if both have steady means over one
+    period of the ringing, which is determined in each segment with a steady signal.
+
+    Args:
+        time: Equidistant instants (N,) [s].
+        settle: As for `steady_samples`.
+        signal: (N,) signal.
+        answer: (N,) response.
+
+    Raises:
+        InputError: `settle` is not above two steps.
+        RecordingError: No sample is steady.
+    """
+    plain = _steady_mask(time, settle, signal, answer)
+    held = _steady_mask(time, settle, signal)
+    step = sampling_step(time)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], held, [False]]).astype(int)))
+    means, found = plain.copy(), []
+    pairs = np.stack([signal, answer])
+    for start, end in edges.reshape(-1, 2).tolist():
+        if plain[start:end].all():
+            continue
+        period, amplitude = _ringing(time[start:end], answer[start:end], settle)
+        if not period or end - start <= round((period + settle) / step):
+            continue
+        part = _period_means(time[start:end], pairs[:, start:end], period)
+        whole = pairs.copy()  # keeps the range of the whole signal
+        whole[:, start:end] = part
+        new = _steady_mask(time, settle, *whole)[start:end] & ~plain[start:end]
+        new[: round((period + settle) / step)] = False
+        if new.any():
+            means[start:end] |= new
+            pairs[:, start:end] = np.where(new, part, pairs[:, start:end])
+            found.append((1 / period, amplitude))
+    if not means.any():
+        return SteadyMeans(steady_samples(time, settle, signal, answer), signal, answer)  # raises
+    if not found:
+        return SteadyMeans(means, signal, answer)
+    frequencies, amplitudes = zip(*found, strict=True)
+    ends = min(frequencies), max(frequencies)
+    return SteadyMeans(means, pairs[0], pairs[1], ends, max(amplitudes))
+
+
+def _ringing(time: Array, x: Array, settle: float) -> tuple[float, float]:
+    """Period [s] and amplitude of a ringing about a straight line, zeros without ringing."""
+    length = float(time[-1] - time[0])
+    if length < max(_MIN_PERIODS * settle, 16 * float(time[1] - time[0])):
+        return 0.0, 0.0
+    is_settled = time >= time[0] + 0.25 * length  # transients of the preceding step have decayed
+    t, x = time[is_settled], x[is_settled]
+    rest = x - np.polynomial.Polynomial.fit(t, x, 1)(t)
+    windowed = rest * np.hanning(len(rest))
+    size = 16 * len(windowed)  # zero padding resolves frequencies to a few thousandths
+    power = np.abs(np.fft.rfft(windowed, size)) ** 2
+    at = np.fft.rfftfreq(size, t[1] - t[0])
+    power[(at * (t[-1] - t[0]) < _MIN_PERIODS) | (at > 4 / settle)] = 0
+    frequency = float(at[power.argmax()])
+    if not power.any():
+        return 0.0, 0.0
+    angle = 2 * np.pi * frequency * t
+    rows = np.column_stack([np.cos(angle), np.sin(angle)])
+    coefficients = np.linalg.lstsq(rows, rest, rcond=None)[0]
+    if np.sum((rest - rows @ coefficients) ** 2) > _MAX_RESIDUAL_SHARE * np.sum(rest**2):
+        return 0.0, 0.0
+    return 1 / frequency, float(np.hypot(*coefficients))
+
+
+def _period_means(time: Array, rows: Array, period: float) -> Array:
+    """Means (m, N) over the period before each sample, or over its available part."""
+    steps = np.diff(time) * 0.5 * (rows[:, 1:] + rows[:, :-1])
+    whole = np.concatenate([np.zeros((len(rows), 1)), np.cumsum(steps, axis=1)], axis=1)
+    since = np.maximum(time - period, time[0])
+    before = np.stack([np.interp(since, time, row) for row in whole])
+    return np.asarray((whole - before) / np.maximum(time - since, time[1] - time[0]))

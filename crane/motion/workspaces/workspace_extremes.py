@@ -43,12 +43,10 @@ def workspace_extremes(
         limits: Limits (n,) of the active coordinates.
         curves: Singular curves.
     """
-    active = kinematics.machine.closure.active
-    results = []
-    names, signs = (
-        enumerate(kinematics.section.coordinate_names),
-        ((1.0, "least"), (-1.0, "largest")),
-    )
+    curve_positions = np.concatenate([np.empty((0, 2)), *(x.section_positions for x in curves)])
+    curve_q_a = [q_a for curve in curves for q_a in curve.q_a]
+    results, signs = [], ((1.0, "least"), (-1.0, "largest"))
+    names = enumerate(kinematics.section.coordinate_names)
     for (axis, name), (sign, adjective) in itertools.product(names, signs):
 
         def objective(
@@ -63,12 +61,12 @@ def workspace_extremes(
         value, configuration = maximize_on_branch(
             kinematics.machine, q[best_index], kinematics.strokes, limits, objective
         )
-        value, q_a = -sign * value, configuration[active]
-        for curve in curves:
-            k = int((sign * curve.section_positions[:, axis]).argmin())
-            if sign * curve.section_positions[k, axis] < sign * value:
-                value, q_a = float(curve.section_positions[k, axis]), curve.q_a[k]
-        results.append(WorkspaceExtreme(f"{adjective} {name}", value, q_a))
+        value, q_a = -sign * value, configuration[kinematics.machine.closure.active]
+        coordinates = np.array([value, *curve_positions[:, axis]])
+        k = int((sign * coordinates).argmin())
+        results.append(
+            WorkspaceExtreme(f"{adjective} {name}", float(coordinates[k]), [q_a, *curve_q_a][k])
+        )
     return tuple(results)
 
 
@@ -135,8 +133,19 @@ def maximize_on_branch(
         *zip(low / stroke_lengths, (low + stroke_lengths) / stroke_lengths, strict=True),
         *[(None, None)] * len(closure.passive),
     ]
+    rows, evaluate = closure.structure.independent_rows, closure.equations.evaluate_scaled
+    closed_loops: Any = {
+        "type": "eq",
+        "fun": lambda x: evaluate(configuration(x))[0][rows],
+        "jac": lambda x: (evaluate(configuration(x))[1][rows] / closure.units)[:, free] * units,
+    }
+    same_branch: Any = {
+        "type": "ineq",
+        "fun": lambda x: _relative_determinants(machine, configuration(x)),
+        "jac": lambda x: _determinant_derivatives(machine, configuration(x), free) * units,
+    }
     # few extremes are at the end of a branch, whose derivatives are expensive
-    for loop_constraints in _loop_constraints(machine, configuration, free, units):
+    for loop_constraints in ([closed_loops], [closed_loops, same_branch]) if len(rows) else ([],):
         result = minimize(
             cost,
             q[free] / units,
@@ -164,29 +173,7 @@ def maximize_on_branch(
     return (initial_value if is_initially_feasible else -np.inf), q
 
 
-def _loop_constraints(
-    machine: Machine, configuration: Callable[[Array], Array], free: Array, units: Array
-) -> list[list[Any]]:
-    """Constraints of the loops for SLSQP: closed loops alone, and with the ends of the branch."""
-    closure, rows = machine.closure, machine.closure.structure.independent_rows
-    evaluate = closure.equations.evaluate_scaled
-    if not len(rows):
-        return [[]]
-    closed_loops = {
-        "type": "eq",
-        "fun": lambda x: evaluate(configuration(x))[0][rows],
-        "jac": lambda x: (evaluate(configuration(x))[1][rows] / closure.units)[:, free] * units,
-    }
-    same_branch = {
-        "type": "ineq",
-        "fun": lambda x: _relative_determinants(machine, configuration(x)),
-        "jac": lambda x: _determinant_derivatives(machine, configuration(x), free) * units,
-    }
-    return [[closed_loops], [closed_loops, same_branch]]
-
-
 def _satisfies_constraints(constraints: Sequence[ObjectiveConstraint], q: Array) -> bool:
-    """Whether a configuration satisfies all constraints."""
     values = [(kind, demand(q)[0]) for kind, demand in constraints]
     return all((abs(x) if kind == "eq" else -x) < _CONSTRAINT_TOLERANCE for kind, x in values)
 

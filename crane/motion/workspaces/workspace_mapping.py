@@ -1,18 +1,20 @@
 """Computation of a workspace from patches of configurations over the strokes."""
 
 import itertools
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_count, as_seed
 from crane.machine.machine import Machine
 from crane.motion.kinematics import Kinematics
-from crane.motion.workspaces.covered_triangles import covered_triangles
-from crane.motion.workspaces.singular_curves import branch_edges, patch_curves, singular_curves
+from crane.motion.workspaces.section_shapes import (
+    branch_edges,
+    covered_triangles,
+    patch_curves,
+    singular_curves,
+)
 from crane.motion.workspaces.workspace_extremes import workspace_extremes
 from crane.motion.workspaces.workspace_patch import (
     WorkspacePatch,
@@ -21,7 +23,6 @@ from crane.motion.workspaces.workspace_patch import (
 )
 from crane.motion.workspaces.workspace_result import (
     CoverageRaster,
-    SingularCurve,
     StrokeMap,
     Workspace,
 )
@@ -41,20 +42,9 @@ _RANDOM_PATCH_VALUES = 16  # values of both strokes of a random patch
 _INTERIOR_SHARE = 0.5  # share of random patches in the interior of the box
 
 
-class _PlannedPatch(NamedTuple):
-    """Specification of a patch; see `WorkspacePatch`.
-
-    Attributes:
-        stroke_pair: Indices of both strokes.
-        held_coordinates: (n,) coordinates of the others.
-        value_count: Number of values of each stroke.
-        counts_for_share: Whether it contributes to the share of the box that closes.
-    """
-
-    stroke_pair: tuple[int, int]
-    held_coordinates: Array
-    value_count: int
-    counts_for_share: bool
+# indices of both strokes, coordinates (n,) of the others, number of values of each stroke, and
+# whether the patch contributes to the share of the box that closes
+_PlannedPatch = tuple[tuple[int, int], Array, int, bool]
 
 
 def workspace(
@@ -117,20 +107,21 @@ def workspace(
     closed_share = _closed_share(
         [patches[i] for i in counted_patches], len(strokes) == _MAX_GRID_JOINTS
     )
+    map_patch, map_curves = patches[0], curves
     if len(strokes) > 2:
-        tip_jacobian = (
-            workspace_kinematics.scaled_tip_jacobian(q, tips, machine.closure.gamma(q))
-            / workspace_kinematics.stroke_scales
-        )
-        displacements = (
-            np.linalg.norm(tip_jacobian, axis=1).mean(axis=0) * (upper - lower)[strokes]
-        )
+        jacobian = workspace_kinematics.scaled_tip_jacobian(q, tips, machine.closure.gamma(q))
+        tip_speeds = np.linalg.norm(jacobian / workspace_kinematics.stroke_scales, axis=1)
+        displacements = tip_speeds.mean(axis=0) * (upper - lower)[strokes]
         map_patch = _map_patch(machine, strokes, displacements, lower, upper)
-        map_curves = patch_curves(
-            workspace_kinematics, map_patch, branch_edges(machine, map_patch)
-        )
-    else:
-        map_patch, map_curves = patches[0], curves
+        edges = branch_edges(machine, map_patch)
+        map_curves = patch_curves(workspace_kinematics, map_patch, edges)
+    map_values = np.full((2, *map_patch.is_closed.shape), np.nan)
+    map_q = map_patch.configurations[map_patch.is_closed]
+    map_values[:, map_patch.is_closed] = workspace_kinematics.condition_measures(
+        map_q, workspace_kinematics.tip_positions(map_q)
+    )
+    spread = np.linalg.svd(section_positions - section_positions.mean(axis=0), compute_uv=False)
+    is_two_dimensional = len(strokes) > 1 and spread[-1] > 1e-6 * spread[0]
     return Workspace(
         machine=machine,
         frame=kinematics.frame,
@@ -144,13 +135,13 @@ def workspace(
         condition=condition,
         least_singular_value=least_singular_value,
         closed_share=closed_share,
-        area=raster.area if len(strokes) > 1 and _is_two_dimensional(section_positions) else 0.0,
+        area=raster.area if is_two_dimensional else 0.0,
         extremes=workspace_extremes(
             workspace_kinematics, q, section_positions, (lower, upper), curves
         ),
         curves=tuple(curves),
         patches=tuple(patches),
-        stroke_map=_stroke_map(workspace_kinematics, map_patch, map_curves),
+        stroke_map=StrokeMap(map_patch, map_values[0], map_values[1], tuple(map_curves)),
         raster=raster,
         is_complete=len(strokes) <= _MAX_GRID_JOINTS,
     )
@@ -166,16 +157,6 @@ def _map_patch(
     patch = fill_patch(machine, home, (first, second), (axes[0], axes[1]))
     assert patch is not None, "home itself closes"
     return patch
-
-
-def _stroke_map(
-    kinematics: WorkspaceKinematics, patch: WorkspacePatch, curves: Sequence[SingularCurve]
-) -> StrokeMap:
-    """Conditions over a patch."""
-    values = np.full((2, *patch.is_closed.shape), np.nan)
-    q = patch.configurations[patch.is_closed]
-    values[:, patch.is_closed] = kinematics.condition_measures(q, kinematics.tip_positions(q))
-    return StrokeMap(patch, values[0], values[1], tuple(curves))
 
 
 def stroke_limits(machine: Machine) -> tuple[Array, Array]:
@@ -212,16 +193,10 @@ def moving_strokes(
         tip_motion = np.maximum(tip_motion, tip_derivatives)
     is_coupled = np.abs(closure.gamma(machine.home)[closure.passive]).max(axis=0, initial=0.0) > 0
     tip_motion[~machine.is_driven] = 0.0
-    relevant_joints = [
-        i
-        for i in np.flatnonzero(machine.is_driven)
-        if tip_motion[i] > _MOTION_TOLERANCE or is_coupled[i]
-    ]
-    return (
-        [int(i) for i in relevant_joints if i != held_joint]
-        if tip_motion.max() > _MOTION_TOLERANCE
-        else []
-    )
+    if tip_motion.max() <= _MOTION_TOLERANCE:
+        return []
+    is_relevant = machine.is_driven & ((tip_motion > _MOTION_TOLERANCE) | is_coupled)
+    return [int(i) for i in np.flatnonzero(is_relevant) if i != held_joint]
 
 
 def _create_patches(
@@ -234,13 +209,11 @@ def _create_patches(
 ) -> tuple[list[WorkspacePatch], list[int]]:
     """Patches over the strokes, and indices of those that count for the closed share."""
     home = machine.home[machine.closure.active]
+    planned: list[_PlannedPatch]
     if len(strokes) == 1:
-        axis = np.linspace(lower[strokes[0]], upper[strokes[0]], min(samples, 2001))
-        patch = fill_patch(machine, home.copy(), (strokes[0], strokes[0]), (axis, home[strokes]))
-        assert patch is not None, "home itself closes"
-        return [patch], [0]
-    if len(strokes) == 2:
-        planned = [_PlannedPatch((strokes[0], strokes[1]), home.copy(), int(samples**0.5), True)]
+        planned = [((strokes[0], strokes[0]), home.copy(), min(samples, 2001), True)]
+    elif len(strokes) == 2:
+        planned = [((strokes[0], strokes[1]), home.copy(), int(samples**0.5), True)]
     elif len(strokes) == _MAX_GRID_JOINTS:
         planned = list(_sliced_patches(home, strokes, lower, upper, samples))
     else:
@@ -250,13 +223,12 @@ def _create_patches(
         first_values, second_values = (
             np.linspace(lower[joint], upper[joint], size) for joint in pair
         )
-        patch = fill_patch(machine, base, pair, (first_values, second_values))
-        if patch is None:
-            none_closed: NDArray[np.bool_] = np.zeros((size, size), dtype=bool)
-            q = np.full((size, size, machine.model.nv), np.nan)
-            patch = WorkspacePatch(pair, base, (first_values, second_values), none_closed, q)
-        patches.append(patch)
-    return patches, [k for k, plan in enumerate(planned) if plan.counts_for_share]
+        axes = first_values, home[strokes] if len(strokes) == 1 else second_values
+        shape = len(axes[0]), len(axes[1])
+        q = np.full((*shape, machine.model.nv), np.nan)
+        none_closed = WorkspacePatch(pair, base, axes, np.zeros(shape, dtype=bool), q)
+        patches.append(fill_patch(machine, base, pair, axes) or none_closed)
+    return patches, [k for k, (*_, counts_for_share) in enumerate(planned) if counts_for_share]
 
 
 def _sliced_patches(
@@ -269,7 +241,7 @@ def _sliced_patches(
         for value in np.linspace(lower[other], upper[other], _SLICE_COUNT):
             base = home.copy()
             base[other] = value
-            yield _PlannedPatch(pair, base, count, pair == (strokes[0], strokes[1]))
+            yield pair, base, count, pair == (strokes[0], strokes[1])
 
 
 def _random_patches(
@@ -283,14 +255,14 @@ def _random_patches(
     """Pairs of strokes through home, then with the others at random values or limits."""
     pairs = list(itertools.combinations(strokes, 2))
     for pair in pairs:
-        yield _PlannedPatch(pair, home.copy(), _RANDOM_PATCH_VALUES, False)
+        yield pair, home.copy(), _RANDOM_PATCH_VALUES, False
     for k in range(max(len(pairs), 4 * samples // _RANDOM_PATCH_VALUES**2)):
         base, random_values = home.copy(), random.uniform(lower, upper)
         is_interior = random.random() < _INTERIOR_SHARE
         if not is_interior:
             random_values = np.where(random.random(len(lower)) < 0.5, lower, upper)
         base[strokes] = random_values[strokes]
-        yield _PlannedPatch(pairs[k % len(pairs)], base, _RANDOM_PATCH_VALUES, is_interior)
+        yield pairs[k % len(pairs)], base, _RANDOM_PATCH_VALUES, is_interior
 
 
 def _closed_share(patches: list[WorkspacePatch], is_sliced: bool) -> float:
@@ -298,24 +270,10 @@ def _closed_share(patches: list[WorkspacePatch], is_sliced: bool) -> float:
     closed = total = 0.0
     for k, patch in enumerate(patches):
         is_face = is_sliced and k in (0, len(patches) - 1)
-        first_weights, second_weights = (_node_weights(len(values)) for values in patch.axes)
-        weights = np.outer(first_weights, second_weights) * (0.5 if is_face else 1.0)
-        closed, total = (
-            closed + float(weights[patch.is_closed].sum()),
-            total + float(weights.sum()),
-        )
+        weights: Array = np.full(patch.is_closed.shape, 0.5 if is_face else 1.0)
+        weights[[0, -1]] *= 0.5
+        if weights.shape[1] > 1:  # more than one stroke
+            weights[:, [0, -1]] *= 0.5
+        closed += float(weights[patch.is_closed].sum())
+        total += float(weights.sum())
     return closed / total if total else 0.0
-
-
-def _node_weights(count: int) -> Array:
-    """Weights (count,) of the nodes along an axis: half at both ends, one for a single node."""
-    weights = np.ones(count)
-    if count > 1:
-        weights[[0, -1]] = 0.5
-    return weights
-
-
-def _is_two_dimensional(positions: Array) -> bool:
-    """Whether positions (N, 2) span more than a line."""
-    values = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
-    return bool(values[-1] > 1e-6 * values[0])

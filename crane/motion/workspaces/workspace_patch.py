@@ -119,8 +119,10 @@ def fill_patch(
         np.full((*shape, machine.model.nv), np.nan),
     )
     begun = machine.home if start is None else start
-    near = begun[closure.active]
-    one, two = (int(np.abs(x - near[i]).argmin()) for i, x in zip(stroke_pair, axes, strict=True))
+    one, two = (
+        int(np.abs(x - begun[closure.active][i]).argmin())
+        for i, x in zip(stroke_pair, axes, strict=True)
+    )
     nearest_node = (one, two)
     q, is_closed = last_closed_configuration(
         machine, begun, patch.active_coordinates(nearest_node)
@@ -131,82 +133,48 @@ def fill_patch(
     pending_nodes = [nearest_node]
     while pending_nodes:
         node = pending_nodes.pop()
-        if closure.is_compiled:
-            pending_nodes += _close_rows(machine, patch, node)
-        else:
-            pending_nodes += _close_neighbours(machine, patch, node)
+        for direction in _GRID_DIRECTIONS:
+            pending_nodes += _close_row(machine, patch, node, direction)
     return patch
 
 
-def _close_neighbours(machine: Machine, patch: WorkspacePatch, node: GridNode) -> list[GridNode]:
-    """Close the neighbours of a closed node; returns the newly closed ones."""
-    closed_nodes = []
-    for neighbour in _neighbours(node, patch.is_closed.shape):
-        if patch.is_closed[neighbour]:
-            continue
-        q, is_closed = last_closed_configuration(
-            machine, patch.configurations[node], patch.active_coordinates(neighbour)
-        )
-        if is_closed:
-            patch.is_closed[neighbour], patch.configurations[neighbour] = True, q
-            closed_nodes.append(neighbour)
-    return closed_nodes
+def _close_row(
+    machine: Machine, patch: WorkspacePatch, node: GridNode, direction: GridNode
+) -> list[GridNode]:
+    """Close the open nodes from a closed node in one direction; returns the newly closed ones.
 
-
-def _close_rows(machine: Machine, patch: WorkspacePatch, closed_node: GridNode) -> list[GridNode]:
-    """Close rows of nodes in all directions from a closed node; returns the newly closed ones."""
-    compiled_closure, cursor = (
-        machine.closure.compiled_closure,
-        machine.closure.compiled_closure.new_cursor(),
-    )
-    closed_nodes = []
-    for direction in _GRID_DIRECTIONS:
-        row = _open_nodes(patch, closed_node, direction)
-        if not row or not compiled_closure.start_cursor_at(
-            cursor, patch.configurations[closed_node]
-        ):
-            continue
-        targets = np.array([patch.active_coordinates(node) for node in row])
-        out = np.empty((len(row), patch.configurations.shape[2]))
-        count = compiled_closure.follow_targets(cursor, targets, out)
-        for node, q in zip(row[:count], out[:count], strict=True):
-            patch.is_closed[node], patch.configurations[node] = True, q
-        closed_nodes += row[:count]
-        previous_node = row[count - 1] if count else closed_node
-        if count < len(row) and _close_by_continuation(machine, patch, previous_node, row[count]):
-            closed_nodes.append(row[count])
-    return closed_nodes
-
-
-def _open_nodes(patch: WorkspacePatch, node: GridNode, direction: GridNode) -> list[GridNode]:
-    """Open nodes from a node in one direction, up to a closed one."""
+    Without machine code it closes the first of them.
+    """
     (a, b), row = patch.is_closed.shape, []
     i, j = node[0] + direction[0], node[1] + direction[1]
     while 0 <= i < a and 0 <= j < b and not patch.is_closed[i, j]:
         row.append((i, j))
         i, j = i + direction[0], j + direction[1]
-    return row
+    if not row:
+        return []
+    start = patch.configurations[node]
+    targets = np.array([patch.active_coordinates(x) for x in row])
+    if machine.closure.is_compiled:
+        closed = _follow(machine, start, targets)
+    else:
+        last_configuration, is_closed = last_closed_configuration(machine, start, targets[0])
+        closed = last_configuration[None][: int(is_closed)]
+    if machine.closure.is_compiled and len(closed) < len(row):
+        previous = closed[-1] if len(closed) else start
+        strokes = previous[machine.closure.active]
+        shares = np.linspace(0, 1, _CONTINUATION_STEPS + 1)[1:, None]
+        path = strokes + shares * (targets[len(closed)] - strokes)
+        steps = _follow(machine, previous, path)
+        if len(steps) == _CONTINUATION_STEPS:
+            closed = np.vstack([closed, steps[-1:]])
+    for x, q in zip(row, closed, strict=False):
+        patch.is_closed[x], patch.configurations[x] = True, q
+    return row[: len(closed)]
 
 
-def _close_by_continuation(
-    machine: Machine, patch: WorkspacePatch, node: GridNode, neighbour: GridNode
-) -> bool:
-    """Close a node from a closed neighbour in small steps; returns whether it closes."""
-    compiled_closure, q = machine.closure.compiled_closure, patch.configurations[node]
-    start_strokes = q[machine.closure.active]
-    targets = start_strokes + np.linspace(0, 1, _CONTINUATION_STEPS + 1)[1:, None] * (
-        patch.active_coordinates(neighbour) - start_strokes
-    )
-    configurations, cursor = np.empty((_CONTINUATION_STEPS, len(q))), compiled_closure.new_cursor()
-    is_closed = (
-        compiled_closure.start_cursor_at(cursor, q)
-        and compiled_closure.follow_targets(cursor, targets, configurations) == _CONTINUATION_STEPS
-    )
-    if is_closed:
-        patch.is_closed[neighbour], patch.configurations[neighbour] = True, configurations[-1]
-    return bool(is_closed)
-
-
-def _neighbours(node: GridNode, grid_shape: GridNode) -> list[GridNode]:
-    candidates = [(node[0] + i, node[1] + j) for i, j in _GRID_DIRECTIONS]
-    return [(k, m) for k, m in candidates if 0 <= k < grid_shape[0] and 0 <= m < grid_shape[1]]
+def _follow(machine: Machine, start: Array, targets: Array) -> Array:
+    """Configurations (k, nq) at the first k of targets (N, n); none if the start is singular."""
+    compiled_closure, out = machine.closure.compiled_closure, np.empty((len(targets), len(start)))
+    cursor = compiled_closure.new_cursor()
+    is_started = compiled_closure.start_cursor_at(cursor, start)
+    return out[: compiled_closure.follow_targets(cursor, targets, out) if is_started else 0]

@@ -36,9 +36,8 @@ class CoverageRaster:
 
     def __init__(self, points: Array):
         low, high = points.min(axis=0), points.max(axis=0)
-        self.spacing = (
-            float((high - low).max()) or 1.0
-        ) / _RASTER_POINTS  # arbitrary for a single point
+        # arbitrary for a single point
+        self.spacing = (float((high - low).max()) or 1.0) / _RASTER_POINTS
         count = np.ceil((high - low) / self.spacing).astype(int) + 3
         self.u = low[0] + self.spacing * (np.arange(count[0]) - 0.5)
         self.w = low[1] + self.spacing * (np.arange(count[1]) - 0.5)
@@ -69,13 +68,12 @@ class CoverageRaster:
             if block.all():
                 continue
             x, y = np.arange(x0, x1), np.arange(y0, y1)[:, None]
-            edge_functions = []
-            for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-                edge_functions.append((bx - ax) * (y - ay) - (by - ay) * (x - ax))
-            is_inside = (np.minimum.reduce(edge_functions) >= -1e-9) | (
-                np.maximum.reduce(edge_functions) <= 1e-9
-            )
-            block |= is_inside
+            edge_functions = [
+                (bx - ax) * (y - ay) - (by - ay) * (x - ax)
+                for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True)
+            ]
+            block |= np.minimum.reduce(edge_functions) >= -1e-9
+            block |= np.maximum.reduce(edge_functions) <= 1e-9
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -176,7 +174,6 @@ class Workspace(Result):
     is_complete: bool
 
     def _one_line(self) -> str:
-        """Frame, strokes, and the share that closes."""
         return (
             f"Workspace of '{self.frame}' of '{self.machine.name}': {len(self.tip_positions)} "
             f"configurations over {', '.join(self.strokes)}, {100 * self.closed_share:.3g} % "
@@ -193,11 +190,8 @@ class Workspace(Result):
     @property
     def slewing_joint_name(self) -> str | None:
         """Name of the slewing joint, None if there is none."""
-        return (
-            None
-            if self.section.slewing_joint is None
-            else self.machine.active[self.section.slewing_joint]
-        )
+        joint = self.section.slewing_joint
+        return None if joint is None else self.machine.active[joint]
 
     def format_strokes(self, q_a: Array) -> str:
         """Text of the strokes of a configuration."""
@@ -226,9 +220,8 @@ class Workspace(Result):
             self.condition,
             self.least_singular_value,
         )
-        write_table(
-            path, Table(units, np.column_stack(columns), {"machine": self.machine.load_expression})
-        )
+        notes = {"machine": self.machine.load_expression}
+        write_table(path, Table(units, np.column_stack(columns), notes))
 
     def curves_to_csv(self, path: str | Path) -> None:
         """Write the singular curves: number, kind (0 branch, 1 tip), then as `to_csv`.
@@ -261,18 +254,16 @@ class Workspace(Result):
 
     def to_markdown(self) -> str:
         """Summary in Markdown: extremes, area, share of the strokes that closes, conditions."""
-        machine, lines = self.machine, []
-        slewing_joint = self.slewing_joint_name
-        u, w = self.section.coordinate_names
-        lines.append(f"# Workspace of {machine.name}\n")
-        lines.append(
-            f"{len(self)} closed configurations; `{self.frame}` in the section ({u}, {w})."
-        )
-        if slewing_joint is not None:
-            i = machine.active.index(slewing_joint)
+        machine, (u, w) = self.machine, self.section.coordinate_names
+        lines = [
+            f"# Workspace of {machine.name}\n",
+            f"{len(self)} closed configurations; `{self.frame}` in the section ({u}, {w}).",
+        ]
+        if self.section.slewing_joint is not None:
+            i = self.section.slewing_joint
             slewing_range = np.rad2deg([self.lower[i], self.upper[i]])
             lines.append(
-                f"The section turns with `{slewing_joint}` from {slewing_range[0]:.4g} to "
+                f"The section turns with `{machine.active[i]}` from {slewing_range[0]:.4g} to "
                 f"{slewing_range[1]:.4g} degrees."
             )
         if not self.is_complete:
@@ -281,32 +272,25 @@ class Workspace(Result):
                 "true workspace is larger."
             )
         lines += ["", "| | | at |", "| --- | --- | --- |"]
-        for extreme_item in self.extremes:
-            lines.append(
-                f"| {extreme_item.name} | {extreme_item.value:.4f} m | "
-                f"{self.format_strokes(extreme_item.q_a)} |"
-            )
+        lines += [
+            f"| {x.name} | {x.value:.4f} m | {self.format_strokes(x.q_a)} |" for x in self.extremes
+        ]
         if self.area:
             lines.append(f"| area of the section | {self.area:.4g} m2 | |")
-        lines.append(f"| share of the strokes that closes | {100 * self.closed_share:.4g} % | |")
-        worst_index = int(self.condition.argmax())
+        worst, least = int(self.condition.argmax()), int(self.least_singular_value.argmin())
         has_branch_ends = any(curve.kind == "branch" for curve in self.curves)
-        location_text = (
-            ", beside the end of the branch"
-            if has_branch_ends and self.condition[worst_index] > 3
-            else ""
-        )
-        lines.append(
-            f"| largest condition of the drive | "
-            f"{self.condition[worst_index]:.3g}{location_text} | "
-            f"{self.format_strokes(self.q_a[worst_index])} |"
-        )
-        least_index = int(self.least_singular_value.argmin())
-        lines.append(
-            f"| least singular value of the tip | {self.least_singular_value[least_index]:.3g} m "
-            f"per scale | {self.format_strokes(self.q_a[least_index])} |"
-        )
-        lines += ["", "| stroke | reaches | of its limits |", "| --- | --- | --- |"]
+        is_beside_end = has_branch_ends and bool(self.condition[worst] > 3)
+        lines += [
+            f"| share of the strokes that closes | {100 * self.closed_share:.4g} % | |",
+            f"| largest condition of the drive | {self.condition[worst]:.3g}"
+            f"{', beside the end of the branch' * is_beside_end} | "
+            f"{self.format_strokes(self.q_a[worst])} |",
+            f"| least singular value of the tip | {self.least_singular_value[least]:.3g} m "
+            f"per scale | {self.format_strokes(self.q_a[least])} |",
+            "",
+            "| stroke | reaches | of its limits |",
+            "| --- | --- | --- |",
+        ]
         for joint in self.strokes:
             i = machine.active.index(joint)
             edges = [curve.q_a[:, i] for curve in self.curves if curve.kind == "branch"]
@@ -315,7 +299,6 @@ class Workspace(Result):
             lines.append(f"| {joint} | {reached.min():.5g} to {reached.max():.5g} | {limits} |")
         lines.append("")
         for kind, description in CURVE_KINDS.items():
-            count = sum(curve.kind == kind for curve in self.curves)
-            if count:
+            if count := sum(curve.kind == kind for curve in self.curves):
                 lines.append(f"- {count} curve{'s' * (count != 1)}: {description}.")
         return "\n".join([*lines, ""])

@@ -186,13 +186,9 @@ class WorkspaceKinematics:
     ):
         self.extent = extent
         self.machine, self.kinematics, self.section = machine, kinematics, section
-        self.strokes = strokes
+        self.strokes, self.tip_positions = strokes, kinematics.positions_at_configurations
         self._coordinate_scales = machine.closure.equations.motion_scales
         self.stroke_scales = self._coordinate_scales[machine.closure.active][strokes]
-
-    def tip_positions(self, q: Array) -> Array:
-        """Positions (N, 3) [m] at configurations (N, nq)."""
-        return self.kinematics.positions_at_configurations(q)
 
     def is_on_axis(self, q: Array) -> bool:
         """Whether the first coordinate is a distance from an axis that the tip is on."""
@@ -207,16 +203,13 @@ class WorkspaceKinematics:
         """
         closure, gamma = self.machine.closure, self.machine.closure.gamma(q)
         jacobian = self.scaled_tip_jacobian(q, tips, gamma)
-        singular_values = np.asarray(np.linalg.svd(jacobian, compute_uv=False), dtype=np.float64)
-        return condition_number(gamma, self._coordinate_scales, closure.active), singular_values[
-            :, -1
-        ]
+        least_singular_values = np.linalg.svd(jacobian, compute_uv=False)[:, -1]
+        condition = condition_number(gamma, self._coordinate_scales, closure.active)
+        return condition, np.asarray(least_singular_values, dtype=np.float64)
 
     def scaled_tip_jacobian(self, q: Array, tips: Array, gamma: Array) -> Array:
         """Scaled Jacobian d(u, w)/dq_A D_A (N, 2, d) of the strokes [m per scale]."""
-        jacobian = (
-            np.array([self.kinematics.tree_jacobian(configuration) for configuration in q]) @ gamma
-        )
+        jacobian = np.array([self.kinematics.tree_jacobian(x) for x in q]) @ gamma
         slopes = self.section.section_jacobian(tips, jacobian)[:, :, self.strokes]
         return np.asarray(slopes * self.stroke_scales)
 
@@ -226,13 +219,8 @@ class WorkspaceKinematics:
             q, self.tip_positions(q), self.machine.closure.gamma(q)
         )
         pair_jacobian = jacobian[:, :, [self.strokes.index(i) for i in stroke_pair]]
-        first_product, second_product = (
-            pair_jacobian[:, 0, 0] * pair_jacobian[:, 1, 1],
-            pair_jacobian[:, 0, 1] * pair_jacobian[:, 1, 0],
-        )
+        first_product = pair_jacobian[:, 0, 0] * pair_jacobian[:, 1, 1]
+        second_product = pair_jacobian[:, 0, 1] * pair_jacobian[:, 1, 0]
+        determinant = first_product - second_product
         size = np.abs(first_product) + np.abs(second_product)
-        return np.where(
-            np.abs(first_product - second_product) < _DETERMINANT_TOLERANCE * size,
-            0.0,
-            first_product - second_product,
-        )
+        return np.where(np.abs(determinant) < _DETERMINANT_TOLERANCE * size, 0.0, determinant)

@@ -1,65 +1,39 @@
 """Integration through dead centres and branch crossings by a change of the chart."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
-from typing import Protocol
 
 import numpy as np
 
-from crane.codegen import Scalar, Tape
+from crane.codegen import Tape
+from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.common.threads import single_threaded_blas
-from crane.control.control_law import Controller, ControllerInputs, TracedController
+from crane.control.control_law import ControlLaw, Controller, ControllerInputs
 from crane.control.valve_drive import ValveDrive
-from crane.simulation.integration.branch_crossing import (
+from crane.simulation.integration.charts import (
     MAX_MOTION_PER_STEP,
     MAX_RELATIVE_RANK,
+    MIN_IMPROVEMENT,
     NODES_BEFORE,
     STEPS_BEFORE,
     STEPS_BEHIND,
+    Chart,
     CrossingPolynomial,
     correct_polynomial,
     extrapolate_states,
     relative_rank,
+    row_layout,
 )
-from crane.simulation.integration.charts import Chart, row_layout
-from crane.simulation.integration.python_stepper import (
-    IntegrationHaltError,
-    PythonStepper,
-    StepProgress,
-)
+from crane.simulation.integration.integrators import StickSlipIntegrator
+from crane.simulation.integration.machine_formulas import raise_undetermined
+from crane.simulation.integration.python_stepper import IntegrationHaltError, StepProgress
 
 _LIMIT_RELAXATION = np.array([2.0, 0.1])  # factors of the limits where no chart is better
 _MAX_RECENT_STATES = 500
 _CONFIGURATION_TOLERANCE = 1e-6  # between predicted and closed configuration, coordinate units
 # least ratios of condition numbers: at a dead centre, and of a chart that is tried after a halt
 _DEAD_CENTRE_IMPROVEMENT, _HALT_IMPROVEMENT = 10.0, 1.5
-
-
-class ChartIntegrator(Protocol):
-    """An integrator in one chart, such as `FixedStepIntegrator` or `ScipyIntegrator`."""
-
-    done: int
-    offset: float  # time of the state after the next instant without a row [s]
-    python_stepper: PythonStepper
-
-    @property
-    def next_instant(self) -> int:
-        """See `FixedStepIntegrator`."""
-
-    def run(
-        self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None
-    ) -> int:
-        """See `FixedStepIntegrator.run`."""
-
-    def final_row(self, time: float, state: Array) -> Array:
-        """See `FixedStepIntegrator.final_row`."""
-
-    def find_finer_step(self, times: Array, rows: Array, step: float) -> float:
-        """See `FixedStepIntegrator.find_finer_step`."""
-
-    def set_chart_limits(self, limits: Array) -> None:
-        """See `FixedStepIntegrator.set_chart_limits`."""
 
 
 class ChartSwitchingIntegrator:
@@ -84,7 +58,7 @@ class ChartSwitchingIntegrator:
         chart: Chart,
         control: Controller,
         controller_state_count: int,
-        make_integrator: Callable[[Chart], ChartIntegrator],
+        make_integrator: Callable[[Chart], StickSlipIntegrator],
     ):
         self._make_integrator, self._control = make_integrator, control
         self._chart, self._integrator = chart, make_integrator(chart)
@@ -99,56 +73,52 @@ class ChartSwitchingIntegrator:
     def run(
         self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None
     ) -> None:
-        """Integrate from each time to the next; see `FixedStepIntegrator.run` for arguments.
+        """Integrate from each time to the next; see `StickSlipIntegrator.run` for arguments.
 
         Raises:
             IntegrationHaltError: The integration halts in all charts.
         """
         with single_threaded_blas(self._chart.machine.model.nv):
-            self._run(times, state, step, rows, progress)
-
-    def _run(
-        self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress
-    ) -> None:
-        i = self.done = 0
-        while i < len(times) or self._integrator.offset < 0:
-            self._segment_start, halt = i, None
-            steps_made = self._integrator.done = 0
-            try:
-                steps_made = self._integrator.run(
-                    times[i:], state, step, rows[i:], self._progress_from(i, progress)
-                )
-            except IntegrationHaltError as error:
-                steps_made, halt = self._integrator.next_instant, error
-            finally:  # also after an interrupt
-                self.done = i + self._integrator.done
-                last = rows[
-                    i + max(steps_made - _MAX_RECENT_STATES, 0) : i + steps_made, : len(state)
-                ]
-                self._recent_states = np.vstack([self._recent_states, last])[-_MAX_RECENT_STATES:]
-                self._to_user_coordinates(times[i : self.done], rows[i : self.done])
-            i += steps_made
-            if i == len(times) and not self._integrator.offset < 0:
-                continue
-            if self._switch_chart(times[0] + i * step, state, halt):
-                continue
-            next_index = self._pass_branch_crossing(times, i, state, step, rows)
-            if next_index is not None:
-                i = next_index
-            elif halt is not None:
-                raise halt
-            else:
-                self._chart_limits = self._chart_limits * _LIMIT_RELAXATION
-                self._integrator.set_chart_limits(self._chart_limits)
+            i = self.done = 0
+            while i < len(times) or self._integrator.offset < 0:
+                self._segment_start, halt = i, None
+                steps_made = self._integrator.done = 0
+                try:
+                    steps_made = self._integrator.run(
+                        times[i:], state, step, rows[i:], self._progress_from(i, progress)
+                    )
+                except IntegrationHaltError as error:
+                    steps_made, halt = self._integrator.next_instant, error
+                finally:  # also after an interrupt
+                    self.done = i + self._integrator.done
+                    first_recent = i + max(steps_made - _MAX_RECENT_STATES, 0)
+                    recent_states = np.vstack(
+                        [self._recent_states, rows[first_recent : i + steps_made, : len(state)]]
+                    )
+                    self._recent_states = recent_states[-_MAX_RECENT_STATES:]
+                    self._to_user_coordinates(times[i : self.done], rows[i : self.done])
+                i += steps_made
+                if i == len(times) and not self._integrator.offset < 0:
+                    continue
+                if self._switch_chart(times[0] + i * step, state, halt):
+                    continue
+                next_index = self._pass_branch_crossing(times, i, state, step, rows)
+                if next_index is not None:
+                    i = next_index
+                elif halt is not None:
+                    raise halt
+                else:
+                    self._chart_limits = self._chart_limits * _LIMIT_RELAXATION
+                    self._integrator.set_chart_limits(self._chart_limits)
 
     def final_row(self, time: float, state: Array) -> Array:
-        """See `FixedStepIntegrator.final_row`."""
+        """See `StickSlipIntegrator.final_row`."""
         row = self._integrator.final_row(time, state)
         self._to_user_coordinates(np.array([time]), row[None])
         return row
 
     def find_finer_step(self, times: Array, rows: Array, step: float) -> float:
-        """See `FixedStepIntegrator.find_finer_step`."""
+        """See `StickSlipIntegrator.find_finer_step`."""
         if not self._chart.has_user_coordinates:
             return 0.0
         return self._integrator.find_finer_step(
@@ -161,11 +131,9 @@ class ChartSwitchingIntegrator:
     def _switch_chart(self, time: float, state: Array, halt: IntegrationHaltError | None) -> bool:
         """Change to a better chart and transform the state; returns whether there is one."""
         at = self._row_layout.view(np.resize(state, self._row_layout.size))
-        chart = self._chart
-        better_chart = (
-            chart.find_better_chart(at.q)
-            if halt is None
-            else chart.find_better_chart(at.q, _HALT_IMPROVEMENT)
+        chart, nq = self._chart, self._chart.machine.model.nv
+        better_chart = chart.find_better_chart(
+            at.q, MIN_IMPROVEMENT if halt is None else _HALT_IMPROVEMENT
         )
         if better_chart is None:
             return False
@@ -174,15 +142,25 @@ class ChartSwitchingIntegrator:
                 halt is not None
                 and chart.find_better_chart(at.q, _DEAD_CENTRE_IMPROVEMENT) is not None
             ):
-                raise self._dead_centre_error(time, at.q, better_chart)
+                active = better_chart.machine.closure.active
+                left = np.setdiff1d(chart.machine.closure.active, active)
+                names = " and ".join(f"'{chart.machine.joints[i]}'" for i in left)
+                raise IntegrationHaltError(
+                    time,
+                    at.q[chart.user_columns],
+                    f": {names} {'come' if len(left) > 1 else 'comes'} to a dead centre, where "
+                    "inverse dynamics has no answer",
+                    ": keep the reference away from there, or drive other joints",
+                )
             return False
         orientation = self._orientation * self._orientation_at(at.q)
         self._enter_chart(self._find_integrator(better_chart, at.q), self._integrator.offset)
         self._orientation = orientation * self._orientation_at(at.q)
-        self._recent_states = self._transform_states(
-            np.vstack([self._recent_states, state]), chart
-        )
-        state[:], self._recent_states = self._recent_states[-1], self._recent_states[:-1]
+        states = np.vstack([self._recent_states, state])
+        rows = chart.machine.closure.gamma(states[:, :nq])[:, self._chart.machine.closure.active]
+        velocities = slice(nq, nq + len(chart.user_columns))
+        states[:, velocities] = np.einsum("nij,nj->ni", rows, states[:, velocities])
+        state[:], self._recent_states = states[-1], states[:-1]
         return True
 
     def _pass_branch_crossing(
@@ -333,24 +311,14 @@ class ChartSwitchingIntegrator:
         return i
 
     def _enter_chart(
-        self, chart_and_integrator: tuple[Chart, ChartIntegrator], offset: float
+        self, chart_and_integrator: tuple[Chart, StickSlipIntegrator], offset: float
     ) -> None:
         """Continue in a chart, at an offset after the next instant [s]."""
         self._chart, self._integrator = chart_and_integrator
         self._chart_limits, self._integrator.offset = self._chart.chart_limits, offset
         self._integrator.set_chart_limits(self._chart_limits)
 
-    def _transform_states(self, states: Array, previous_chart: Chart) -> Array:
-        """States (N, .) in the present chart, from those in the previous chart."""
-        nq, n = previous_chart.machine.model.nv, len(previous_chart.user_columns)
-        out = states.copy()
-        gamma = previous_chart.machine.closure.gamma(states[:, :nq])[
-            :, self._chart.machine.closure.active
-        ]
-        out[:, nq : nq + n] = np.einsum("nij,nj->ni", gamma, states[:, nq : nq + n])
-        return out
-
-    def _find_integrator(self, chart: Chart, q: Array) -> tuple[Chart, ChartIntegrator]:
+    def _find_integrator(self, chart: Chart, q: Array) -> tuple[Chart, StickSlipIntegrator]:
         """A known chart of the same coordinates and branch with its integrator, or this one."""
         active = chart.machine.closure.active
         for known_chart, integrator in self._known_integrators:
@@ -393,46 +361,21 @@ class ChartSwitchingIntegrator:
                 "joints with them"
             )
         at.v_a[:] = np.einsum("nij,nj->ni", velocity_maps, at.v_a)
-        transposed_maps = np.swapaxes(velocity_maps, 1, 2)
-        at.friction[:] = np.einsum("nij,nj->ni", np.linalg.pinv(transposed_maps), at.friction)
+        at.friction[:] = np.einsum(
+            "nij,nj->ni", np.linalg.pinv(np.swapaxes(velocity_maps, 1, 2)), at.friction
+        )
 
     @property
     def _uses_inverse_dynamics(self) -> bool:
         """Whether the controller uses inverse dynamics or gravity in coordinates of the user."""
-        control, call_count = self._control, 0
-        if isinstance(control, ValveDrive) or not isinstance(control, TracedController):
+        control, n, tape = self._control, len(self._chart.user_columns), Tape()
+        if isinstance(control, ValveDrive) or not isinstance(control, ControlLaw):
             return False
-        n, tape = len(self._chart.user_columns), Tape()
-
-        def inverse(a_a: Sequence[Scalar], friction: bool) -> list[Scalar]:
-            nonlocal call_count
-            call_count += 1
-            return tape.load_vector(
-                5, n * call_count, n
-            )  # different at each call, as laws divide by differences
-
-        def gravity() -> list[Scalar]:
-            return inverse([], False)
-
         columns = control.references(np.zeros(1)).shape[1]
         sizes = n, n, self._row_layout.parts["controller"], len(control.settings), columns
-        q_a, v_a, state, settings, reference = (
-            tape.load_vector(i, 0, x) for i, x in enumerate(sizes)
-        )
-        control.trace(ControllerInputs(q_a, v_a, state, settings, reference, inverse, gravity))
-        return call_count > 0
-
-    def _dead_centre_error(
-        self, time: float, q: Array, better_chart: Chart
-    ) -> IntegrationHaltError:
-        """Halt at a dead centre of coordinates that the controller requires."""
-        machine = self._chart.machine
-        left_columns = np.setdiff1d(machine.closure.active, better_chart.machine.closure.active)
-        names = " and ".join(f"'{machine.joints[i]}'" for i in left_columns)
-        verb = "come" if len(left_columns) > 1 else "comes"
-        return IntegrationHaltError(
-            time,
-            q[self._chart.user_columns],
-            f": {names} {verb} to a dead centre, where inverse dynamics has no answer",
-            ": keep the reference away from there, or drive other joints",
-        )
+        values = (tape.load_vector(i, 0, size) for i, size in enumerate(sizes))
+        try:
+            control.law(ControllerInputs(*values, raise_undetermined, raise_undetermined))
+        except InputError:
+            return True
+        return False

@@ -8,16 +8,21 @@ q_B, with gamma_B = dq/dq_B and C the rows of gamma_B that belong to q_A,
 
 A set of coordinates together with a branch around a configuration is a chart of the closed
 configurations of a machine (generalized coordinate partitioning, Wehage and Haug 1982).
+
+Where links become collinear (a folded parallelogram, a slider crank of equal lengths) the loop
+equations lose rank: several branches of motion cross, and no chart is regular. The motion is
+smooth along its own branch, so state and outputs are polynomials of time (`CrossingPolynomial`):
+their rates at instants before the crossing, and then also behind it, are integrated across it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from crane.closure.active_joint_selection import null_space_basis, select_columns
-from crane.closure.constraint_structure import Indices
+from crane.closure.coordinates import Indices
 from crane.closure.kinematics_formulas import folding_pattern
 from crane.codegen import Layout
 from crane.codegen.symbolic import Scalar, SymbolicExpression, dot
@@ -38,7 +43,7 @@ from crane.machine.machine import Machine
 from crane.simulation.integration.stick_slip_modes import StickSlipModes
 
 MAX_GAMMA_ENTRY = 5.0  # entry of gamma in coordinate units from which another chart is sought
-_MIN_IMPROVEMENT = 3.0  # least ratio of the condition numbers of the present and a new chart
+MIN_IMPROVEMENT = 3.0  # least ratio of the condition numbers of the present and a new chart
 _SINGULAR_DETERMINANT_SHARE = 1e-2  # share of the determinant at home near the end of a branch
 _RANK_TOLERANCE = 1e-12  # share of the largest singular value that counts as zero
 
@@ -63,8 +68,12 @@ class Chart:
     def from_dynamics(cls, dynamics: Dynamics) -> "Chart":
         """The chart of the coordinates of the user."""
         machine = dynamics.machine
-        sticking = StickSlipModes(machine, dynamics.forces.sticking)
-        return cls(dynamics, machine.closure.active, sticking, machine.free)
+        return cls(
+            dynamics,
+            machine.closure.active,
+            StickSlipModes(machine, dynamics.forces.sticking),
+            machine.free,
+        )
 
     @property
     def machine(self) -> Machine:
@@ -80,12 +89,11 @@ class Chart:
     def formula_key(self) -> tuple:
         """Properties on which the formulas of the chart depend, besides its loops."""
         dynamics = self.dynamics
-        outside = formula_key(self.machine)
         return (
             folding_pattern(dynamics.constant_pattern),
             dynamics.formula_structure,
             tuple(self.user_columns.tolist()),
-            outside,
+            formula_key(self.machine),
         )
 
     def check_free_joints(self, tau: Sequence[Scalar], when: str = "") -> None:
@@ -184,7 +192,7 @@ class Chart:
         return float(np.abs(shares[closure.passive]).max(initial=0.0))
 
     def find_better_chart(
-        self, q: Array, min_improvement: float = _MIN_IMPROVEMENT
+        self, q: Array, min_improvement: float = MIN_IMPROVEMENT
     ) -> "Chart | None":
         """A chart at a closed configuration (nq,) whose condition number is smaller by a factor.
 
@@ -192,15 +200,15 @@ class Chart:
         """
         machine = self.machine
         closure, scale = machine.closure, machine.closure.equations.motion_scales
-        jacobian = closure.equations.evaluate(q)[1]
-        basis = null_space_basis(jacobian, scale, _RANK_TOLERANCE)
+        basis = null_space_basis(closure.equations.evaluate(q)[1], scale, _RANK_TOLERANCE)
         active = closure.active
         if basis.shape[1] != len(active):
             return None
 
         def condition(columns: Indices) -> float:
-            least = np.linalg.svd(basis[columns], compute_uv=False).min(initial=1.0)
-            return 1.0 / max(float(least), 1e-300)
+            return 1.0 / max(
+                float(np.linalg.svd(basis[columns], compute_uv=False).min(initial=1.0)), 1e-300
+            )
 
         now, everything = condition(active), range(machine.model.nv)
         # keep those of the present coordinates that have small entries of gamma
@@ -243,14 +251,12 @@ def state_layout(machine: Machine, controller_state_count: int) -> Layout:
     `contacts` are the states of external forces: tangential deformations of tyres. `work` is that
     of the active forces, then of each external force.
     """
-    n, work_count = len(machine.active), 1 + len(machine.external_forces)
-    contact_state_count = state_count(machine.external_forces)
     return Layout(
         q=machine.model.nv,
-        v_a=n,
-        contacts=contact_state_count,
+        v_a=len(machine.active),
+        contacts=state_count(machine.external_forces),
         controller=controller_state_count,
-        work=work_count,
+        work=1 + len(machine.external_forces),
         dissipated=1,
     )
 
@@ -280,3 +286,90 @@ def row_layout(machine: Machine, control: Controller, controller_state_count: in
         **state_layout(machine, controller_state_count).parts,
         **output_layout(machine, control).parts,
     )
+
+
+NODES_BEFORE = 7  # nodes before the crossing
+STEPS_BEFORE, STEPS_BEHIND = 2, 4  # steps from the last node to the crossing, and from there
+NODES_BEHIND = 3  # nodes behind the crossing
+MAX_MOTION_PER_STEP = 1e-2  # displacement of the fastest joint in coordinate units
+MAX_RELATIVE_RANK = 0.05  # `relative_rank` at a crossing, as a share of that at home
+_CORRECTOR_ITERATIONS = 6
+
+RateFunction = Callable[[float, Array], tuple[Array, Array]]
+"""(time, state) -> rate of the state, outputs."""
+
+
+def relative_rank(machine: Machine, q: Array) -> float:
+    """Least over largest singular value of the loop equations at a configuration (nq,)."""
+    equations, rows = machine.closure.equations, machine.closure.structure.independent_rows
+    values = np.linalg.svd(
+        equations.evaluate(q)[1][rows] * equations.motion_scales, compute_uv=False
+    )
+    return float(values[-1] / values[0]) if len(values) else 1.0
+
+
+@dataclass(frozen=True)
+class CrossingPolynomial:
+    """State and outputs as polynomials of time.
+
+    Attributes:
+        times: (k,) nodes [s].
+        start_state: State at the last node before the crossing.
+        rates: (k, size) rates of the state at the nodes.
+        outputs: (k, .) outputs at the nodes.
+        nodes_before: Number of nodes before the crossing.
+    """
+
+    times: Array
+    start_state: Array
+    rates: Array
+    outputs: Array
+    nodes_before: int
+
+    def state_at(self, time: float) -> Array:
+        """The state at an instant [s]."""
+        origin = self.times[self.nodes_before - 1]
+        unit = self.times[self.nodes_before - 1] - self.times[self.nodes_before - 2]
+        at, until = (self.times - origin) / unit, (time - origin) / unit
+        powers = np.arange(len(at))
+        weights = np.linalg.solve(
+            (at[:, None] ** powers).T, until ** (powers + 1.0) / (powers + 1.0)
+        )
+        return self.start_state + unit * (weights @ self.rates)
+
+    def outputs_at(self, time: float) -> Array:
+        """The outputs at an instant [s]."""
+        unit = self.times[1] - self.times[0]
+        at, until = (self.times - time) / unit, np.zeros(len(self.times))
+        until[0] = 1.0
+        return np.linalg.solve((at[:, None] ** np.arange(len(at))).T, until) @ self.outputs
+
+
+def extrapolate_states(times: Array, states: Array, rate: RateFunction) -> CrossingPolynomial:
+    """Extrapolation from states (k, size) at times (k,) [s]."""
+    rates_and_outputs = [rate(time, state) for time, state in zip(times, states, strict=True)]
+    rates, outputs = (np.array(part) for part in zip(*rates_and_outputs, strict=True))
+    return CrossingPolynomial(times, states[-1], rates, outputs, len(times))
+
+
+def correct_polynomial(
+    polynomial: CrossingPolynomial, time: float, rate: RateFunction
+) -> CrossingPolynomial:
+    """The polynomial with further nodes from an instant [s] behind the crossing on.
+
+    It interpolates across the crossing; errors of an extrapolation would grow.
+    """
+    original, unit = polynomial, polynomial.times[1] - polynomial.times[0]
+    node_times_behind = time + unit * np.arange(NODES_BEHIND)
+    times = np.append(polynomial.times, node_times_behind)
+    for _ in range(_CORRECTOR_ITERATIONS):
+        rates_and_outputs = [rate(one, polynomial.state_at(one)) for one in node_times_behind]
+        rates, outputs = (np.array(part) for part in zip(*rates_and_outputs, strict=True))
+        polynomial = CrossingPolynomial(
+            times,
+            original.start_state,
+            np.vstack([original.rates, rates]),
+            np.vstack([original.outputs, outputs]),
+            original.nodes_before,
+        )
+    return polynomial

@@ -24,14 +24,14 @@ from crane.codegen.symbolic import (
     subtract_vectors,
 )
 from crane.common.samples import Array
-from crane.control.control_law import TracedController
+from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
 from crane.dynamics.external_forces import state_count
 from crane.machine.machine import Machine
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.machine_code_stepper import MachineCodeStepper
 from crane.simulation.integration.machine_formulas import reference_samples, wrap_rotations
-from crane.simulation.integration.step_loop import MIN_STEP_RATIO, StepCode, StepLoop, StepWriter
+from crane.simulation.integration.step_loop import MIN_STEP_RATIO, StepLoop, StepWriter
 
 MAX_REFERENCE_SPACING = 5e-4  # largest interval between the samples of references [s]
 MIN_SCALE = 0.1  # least scale of states: rad, characteristic lengths, per characteristic time
@@ -107,7 +107,7 @@ class ErrorControlledStepper(MachineCodeStepper):
     def __init__(
         self,
         chart: Chart,
-        control: TracedController,
+        control: ControlLaw,
         controller_state_count: int,
         method: tuple[Hashable, ...],
         fold_settings: bool,
@@ -116,10 +116,10 @@ class ErrorControlledStepper(MachineCodeStepper):
         self._steps_end_at_outputs = isinstance(control, ValveDrive)
         super().__init__(chart, control, controller_state_count, method, fold_settings)
         self.tolerance = np.ascontiguousarray(tolerance)
-        self._step_state = np.zeros(6)  # see `StepLoop`
+        self._step_state = np.zeros(6)
         self._break_times = np.append(break_times(chart.machine, control), np.inf)
 
-    def reset_step_size(self) -> None:
+    def restart(self) -> None:
         """Start the next run with a short step."""
         self._step_state[0] = 0.0
 
@@ -133,7 +133,7 @@ class ErrorControlledStepper(MachineCodeStepper):
             state: State, replaced by the final one.
             offset: Time of the state after the first instant; at least minus one interval [s].
             step: Interval of the output instants [s].
-            rows: (N, row_size) in any memory order, filled; empty to integrate to the next
+            rows: (N, row size) in any memory order, filled; empty to integrate to the next
                 instant.
 
         Returns:
@@ -195,21 +195,16 @@ class ErrorControlledStepper(MachineCodeStepper):
         grid[[0, -1]] += _TIME_TOLERANCE * (grid[1] - start_time) * np.array([1.0, -1.0])
         return reference_samples(self._chart.machine, self._control, grid)
 
-    @property
-    def event(self) -> float:
-        """Whether a stick-slip transition is at the state."""
-        return float(self._step_state[5])
-
     def _build(self, program: Program) -> None:
         for suffix, with_joints_at_rest in self._rest_variants:
-            machine, inputs, tau, _ = self._trace_controlled_machine(Tape())
-            outputs = machine.outputs(tau, with_joints_at_rest)
+            machine = self._trace_controlled_machine(Tape())
+            outputs = machine.outputs(with_joints_at_rest)
             if isinstance(self._control, ValveDrive):
-                outputs += self._control.channel_values(inputs)
-            margin = machine.accelerations(tau, with_joints_at_rest).transition_margin
+                outputs += self._control.channel_values(machine.inputs)
+            margin = machine.accelerations(with_joints_at_rest).transition_margin
             program.add_formula("observe" + suffix, 5, {"outputs": outputs, "margin": [margin]})
-            machine, _, tau, controller_rate = self._trace_controlled_machine(Tape())
-            rate, margin = machine.state_rate(tau, controller_rate, with_joints_at_rest)
+            machine = self._trace_controlled_machine(Tape())
+            rate, margin = machine.state_rate(with_joints_at_rest)
             closure = self._chart.machine.closure
             event_distances = machine.dynamics_formulas.end_stop_distances(
                 closure.units.tolist(), closure.characteristic_length
@@ -217,8 +212,11 @@ class ErrorControlledStepper(MachineCodeStepper):
             event_distances += scale_vector(
                 1.0 / closure.characteristic_length, machine.external_forces.event_lengths
             )
-            parts = {"rate": rate, "margin": [margin], "event_distances": event_distances}
-            program.add_formula("rate" + suffix, 5, parts)
+            program.add_formula(
+                "rate" + suffix,
+                5,
+                {"rate": rate, "margin": [margin], "event_distances": event_distances},
+            )
         if self.external_callback is not None:
             program.add_formula("callback_inputs", 5, machine.external_forces.callback_inputs)
             with program.add_routine(
@@ -228,7 +226,10 @@ class ErrorControlledStepper(MachineCodeStepper):
         self._add_event_formulas(program, len(event_distances))
         self._add_method(program)
         self._add_interpolation(program)
-        self._add_run(program)
+        functions = ("close",) if self.external_callback is None else ("close", "callback")
+        names = ("geometry", "numbers", "control", "refs", "state", "out", "h", "bounds", "tol")
+        with program.add_routine("run", counts=("steps",), functions=functions, arrays=names) as r:
+            StepLoop(self, program, r, self._steps_end_at_outputs).write(self._write_step)
 
     def _add_interpolation(self, program: Program) -> None:
         """reference(rows, s), interpolate(state, dense, x), wrap(state)."""
@@ -260,15 +261,17 @@ class ErrorControlledStepper(MachineCodeStepper):
             size = maximum(apply_function("abs", x), apply_function("abs", y))
             if i >= self.state_layout.start_index("work"):
                 size = ENERGY_TOLERANCE_FACTOR * size
-            tolerance = tape.load(argument, len(start)) * size
-            out.append(1.0 / maximum(tape.load(argument, i), tolerance))
+            out.append(
+                1.0 / maximum(tape.load(argument, i), tape.load(argument, len(start)) * size)
+            )
         return out
 
     def _largest_move(self, tape: Tape, displacements: Sequence[Scalar]) -> Scalar:
         """Largest displacement of a joint [rad], [characteristic lengths]."""
         is_length = [not turns for turns in self.closure_code.geometry.is_revolute[1:]]
-        inverse_length = self.closure_code.inverse_characteristic_length(tape)
-        return largest_scaled_value(displacements, is_length, inverse_length)
+        return largest_scaled_value(
+            displacements, is_length, self.closure_code.inverse_characteristic_length(tape)
+        )
 
     def _finish_outputs(
         self,
@@ -299,8 +302,9 @@ class ErrorControlledStepper(MachineCodeStepper):
         start = program.formula_outputs("rate").start_index("event_distances")
         if not count:
             return
-        signs = [copysign(1.0, x) for x in Tape().load_vector(0, start, count)]
-        program.add_formula("event_signs", 1, signs)
+        program.add_formula(
+            "event_signs", 1, [copysign(1.0, x) for x in Tape().load_vector(0, start, count)]
+        )
         tape = Tape()
         distances = tape.load_vector(0, start, count)
         smallest: Scalar = 1.0
@@ -316,29 +320,18 @@ class ErrorControlledStepper(MachineCodeStepper):
         """
 
     @abstractmethod
-    def _write_step(self, program: Program, step: StepCode) -> tuple[StepWriter, StepWriter]:
+    def _write_step(self, program: Program, step: StepLoop) -> tuple[StepWriter, StepWriter]:
         """Writers of a step up to `finish`, and of `dense` after a step."""
 
-    def _add_run(self, program: Program) -> None:
-        functions = ("close",) if self.external_callback is None else ("close", "callback")
-        names = ("geometry", "numbers", "control", "refs", "state", "out", "h", "bounds", "tol")
-        with program.add_routine("run", counts=("steps",), functions=functions, arrays=names) as r:
-            StepLoop(self, program, r, self._steps_end_at_outputs).write(self._write_step)
 
-
-def break_times(machine: Machine, control: TracedController) -> Array:
+def break_times(machine: Machine, control: ControlLaw) -> Array:
     """Break times (k,) [s] of a controller, or its reference, and of external forces, in order."""
     sources: list[Any] = [control, getattr(control, "reference", None)]
     sources = [*machine.external_forces, *[x for x in sources if hasattr(x, "breaks")][:1]]
-    times = {time for source in sources for time in np.asarray(source.breaks()).tolist()}
-    return np.array(sorted(times), dtype=np.float64)
-
-
-def _scipy_method() -> Any:
-    """The coefficients of the method, needed only where the program is not cached."""
-    from scipy.integrate import DOP853  # slow to import
-
-    return DOP853
+    return np.array(
+        sorted({time for source in sources for time in np.asarray(source.breaks()).tolist()}),
+        dtype=np.float64,
+    )
 
 
 class DormandPrinceStepper(ErrorControlledStepper):
@@ -357,7 +350,7 @@ class DormandPrinceStepper(ErrorControlledStepper):
     def __init__(
         self,
         chart: Chart,
-        control: TracedController,
+        control: ControlLaw,
         controller_state_count: int,
         tolerance: float = DORMAND_PRINCE_TOLERANCE,
     ):
@@ -366,32 +359,39 @@ class DormandPrinceStepper(ErrorControlledStepper):
 
     def _add_method(self, program: Program) -> None:
         """stage1(s, k, h) to stage11, extra0 to extra2; finish(constants, s, k, h, tol); dense."""
-        size, method = self.state_layout.size, _scipy_method()
-        stages = {f"stage{i}": method.A[i] for i in range(1, STAGES)}
-        stages |= {f"extra{i}": row for i, row in enumerate(method.A_EXTRA)}
+        # slow to import, and needed only where the program is not cached
+        from scipy.integrate import DOP853
+
+        size = self.state_layout.size
+        stages = {f"stage{i}": DOP853.A[i] for i in range(1, STAGES)}
+        stages |= {f"extra{i}": row for i, row in enumerate(DOP853.A_EXTRA)}
         for name, weights in stages.items():
             tape = Tape()
             displaced = scale_vector(tape.load(2, 0), weighted_sum(tape, 1, size, weights))
             program.add_formula(name, 3, add_vectors(tape.load_vector(0, 0, size), displaced))
         tape = Tape()
         state, h = tape.load_vector(1, 0, size), tape.load(3, 0)
-        after = add_vectors(state, scale_vector(h, weighted_sum(tape, 2, size, method.B)))
+        after = add_vectors(state, scale_vector(h, weighted_sum(tape, 2, size, DOP853.B)))
         fifth: Scalar = 0.0
         third: Scalar = 0.0
-        errors = weighted_sum(tape, 2, size, method.E5), weighted_sum(tape, 2, size, method.E3)
-        scales = self._inverse_error_scales(tape, 4, state, after)
-        for error5, error3, scale in zip(*errors, scales, strict=True):
+        errors = weighted_sum(tape, 2, size, DOP853.E5), weighted_sum(tape, 2, size, DOP853.E3)
+        for error5, error3, scale in zip(
+            *errors, self._inverse_error_scales(tape, 4, state, after), strict=True
+        ):
             fifth = fifth + error5 * scale * (error5 * scale)
             third = third + error3 * scale * (error3 * scale)
         denominator = maximum(fifth + 0.01 * third, 1e-300)
         error = (
             apply_function("abs", h) * fifth / apply_function("sqrt", denominator * float(size))
         )
-        rates = tape.load_vector(2, 0, self.state_layout.parts["q"])
-        largest_move = h * self._largest_move(tape, rates)
-        ratio = _DORMAND_PRINCE_MAX_STEP_RATIO
-        outputs = self._finish_outputs(after, error, largest_move, 8.0, ratio)
-        program.add_formula("finish", 5, outputs)
+        largest_move = h * self._largest_move(
+            tape, tape.load_vector(2, 0, self.state_layout.parts["q"])
+        )
+        program.add_formula(
+            "finish",
+            5,
+            self._finish_outputs(after, error, largest_move, 8.0, _DORMAND_PRINCE_MAX_STEP_RATIO),
+        )
         # dense output: from the states and rates at both ends, and the extra stages
         tape = Tape()
         state, h = tape.load_vector(0, 0, size), tape.load(2, 0)
@@ -405,16 +405,21 @@ class DormandPrinceStepper(ErrorControlledStepper):
                 scale_vector(2.0, displacement), scale_vector(h, add_vectors(first, last))
             ),
         ]
-        for weights in method.D:
+        for weights in DOP853.D:
             parts += scale_vector(h, weighted_sum(tape, 1, size, weights))
         program.add_formula("dense", 4, parts)
 
-    def _write_step(self, program: Program, step: StepCode) -> tuple[StepWriter, StepWriter]:
+    def _write_step(self, program: Program, step: StepLoop) -> tuple[StepWriter, StepWriter]:
         """See `ErrorControlledStepper`."""
-        r, size, method = step.routine, self.state_layout.size, _scipy_method()
+        from scipy.integrate import DOP853  # slow to import
+
+        r, size = step.routine, self.state_layout.size
         # rates have further outputs, which the next rate overwrites
-        further = program.formula_outputs("rate").size - size
-        k = r.local_array("k", (STAGES + 1 + INTERPOLATION_STAGES) * size + further)
+        k = r.local_array(
+            "k",
+            (STAGES + 1 + INTERPOLATION_STAGES) * size
+            + (program.formula_outputs("rate").size - size),
+        )
         stage = r.local_array("stage", size)
 
         def attempt(t: RoutineValue, length: RoutineValue) -> None:
@@ -422,7 +427,7 @@ class DormandPrinceStepper(ErrorControlledStepper):
             for i in range(1, STAGES):
                 r.call(f"stage{i}", r.state, k, step.length, stage)
                 step.call(
-                    "rate", t + length * float(method.C[i]), stage, k.element_pointer(i * size)
+                    "rate", t + length * float(DOP853.C[i]), stage, k.element_pointer(i * size)
                 )
             r.call("finish", r.geometry, r.state, k, step.length, r.tol, step.step_result)
 
@@ -430,8 +435,12 @@ class DormandPrinceStepper(ErrorControlledStepper):
             r.copy(k.element_pointer(STAGES * size), step.end_rate, size)
             for i in range(INTERPOLATION_STAGES):
                 r.call(f"extra{i}", r.state, k, step.length, stage)
-                rate = k.element_pointer((STAGES + 1 + i) * size)
-                step.call("rate", t + length * float(method.C_EXTRA[i]), stage, rate)
+                step.call(
+                    "rate",
+                    t + length * float(DOP853.C_EXTRA[i]),
+                    stage,
+                    k.element_pointer((STAGES + 1 + i) * size),
+                )
             r.call("dense", r.state, k, step.length, step.step_result, step.dense_output)
 
         return attempt, interpolate

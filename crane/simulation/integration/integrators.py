@@ -1,53 +1,40 @@
 """Integrators in one chart that locate stick-slip transitions, with fixed or controlled steps."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Protocol
 
 import numpy as np
 
 from crane.codegen import FormulaTooLongError
 from crane.common.errors import ClosureError, InputError
 from crane.common.samples import Array
-from crane.control.control_law import Controller, TracedController
+from crane.control.control_law import ControlLaw, Controller
 from crane.control.valve_drive import ValveDrive
-from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.charts import Chart, row_layout
 from crane.simulation.integration.error_controlled_stepper import (
     MAX_REFERENCE_SPACING,
     ErrorControlledStepper,
+)
+from crane.simulation.integration.machine_code_stepper import (
+    MachineCodeStepper,
+    RungeKuttaStepper,
 )
 from crane.simulation.integration.python_stepper import (
     IntegrationHaltError,
     PythonStepper,
     StepProgress,
 )
-from crane.simulation.integration.runge_kutta import RungeKuttaStepper
 from crane.simulation.integration.stick_slip_modes import EVENT_TOLERANCE, locate_event
 
 _TIME_TOLERANCE = 1e-9  # share of the output interval: difference of equal instants
 _MAX_TRANSITIONS = 2000  # stick-slip transitions within an output interval
 
 
-class CompiledMethod(Protocol):
-    """A compiled method."""
-
-    bounds: Array
-
-    @property
-    def event(self) -> float:
-        """Not 0 at a stick-slip transition."""
-
-    def adopt_modes(self) -> None:
-        """See `MachineCodeStepper.adopt_modes`."""
-
-    def observe(self, time: float, state: Array) -> tuple[Array, float]:
-        """See `MachineCodeStepper.observe`."""
-
-
-class StickSlipIntegrator:
+class StickSlipIntegrator(ABC):
     """Base class of integrators in one chart.
 
-    A method with steps of a given size implements `_make_step`.
+    A method implements `_advance`, and `_make_step` if its steps have a given size.
 
     Args:
         chart: The machine in a chart.
@@ -69,11 +56,11 @@ class StickSlipIntegrator:
         chart: Chart,
         control: Controller,
         controller_state_count: int,
-        compiled_method: CompiledMethod | None,
+        compiled_method: MachineCodeStepper | None,
     ):
         self.python_stepper = PythonStepper(chart, control, controller_state_count)
         self.done = self.next_instant = 0
-        self.offset = 0.0
+        self.offset = self._next_time = 0.0
         self._stick_slip, self._compiled_method = chart.stick_slip, compiled_method
         self._dynamics, self._transition_count, self._count_start_time = chart.dynamics, 0, -np.inf
 
@@ -82,6 +69,63 @@ class StickSlipIntegrator:
         self.python_stepper.chart_limits = limits
         if self._compiled_method is not None:
             self._compiled_method.bounds[3:5] = limits
+
+    def run(
+        self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None
+    ) -> int:
+        """Integrate from each of the times to the next, while the chart is regular.
+
+        Args:
+            times: (N,) instants [s].
+            state: State at the first instant or `offset` after it, replaced by the final one.
+            step: Interval of the instants [s].
+            rows: (N, row size) in any memory order, filled with state and outputs.
+            progress: Called with the number of finished steps.
+
+        Returns:
+            Number of steps.
+
+        Raises:
+            IntegrationHaltError: A step fails, or the loops do not close.
+        """
+        first = times[0] if len(times) else self._next_time
+        self.done = self.next_instant = 0
+        self._prepare_modes(first + self.offset, state)
+        try:
+            while self.done < len(times) or self.offset < 0:
+                if not self._advance(first, times, state, step, rows, progress):
+                    break
+                if not self.offset < -_TIME_TOLERANCE * step:  # within rounding errors
+                    self.offset = 0.0
+                if progress is not None:
+                    progress(self.done)
+        finally:
+            self._next_time = first + step * self.next_instant
+        return self.next_instant
+
+    @abstractmethod
+    def _advance(
+        self,
+        first: float,
+        times: Array,
+        state: Array,
+        step: float,
+        rows: Array,
+        progress: StepProgress,
+    ) -> bool:
+        """Make some steps of a run, or integrate to a stick-slip transition.
+
+        Args:
+            first: The first instant [s].
+            times: See `run`, as the others.
+            state: State at `offset` after the instant `next_instant`.
+            step: [s].
+            rows: Rows of all instants.
+            progress: Called within long calls.
+
+        Returns:
+            False where another chart is needed.
+        """
 
     def final_row(self, time: float, state: Array) -> Array:
         """The row of a state.
@@ -121,9 +165,9 @@ class StickSlipIntegrator:
             return
         if not self._stick_slip.has_modes:
             self._find_modes(time, state)
-            return
-        self._stick_slip.apply_to(self._dynamics)
-        if self._compiled_method is not None:
+        elif self._compiled_method is None:
+            self._stick_slip.apply_to(self._dynamics)
+        else:
             self._compiled_method.adopt_modes()
 
     def _find_modes(self, time: float, state: Array) -> None:
@@ -190,25 +234,6 @@ class StickSlipIntegrator:
                 ": forces that jump with the sign of a velocity fight their friction, smooth them",
             )
 
-    def _rounded_offset(self, offset: float, step: float) -> float:
-        """An offset, 0 if it is within rounding errors."""
-        return offset if offset < -_TIME_TOLERANCE * step else 0.0
-
-    def _advance_to_instant(self, now: float, state: Array, step: float) -> None:
-        """Integrate to the next instant, or to a stick-slip transition before it.
-
-        Args:
-            now: The next instant [s].
-            state: State at `offset`.
-            step: Output interval [s].
-        """
-        after, margin = self._make_step(now + self.offset, state, -self.offset)
-        if margin >= -EVENT_TOLERANCE:
-            state[:], self.offset = after, 0.0
-            return
-        time_offset = self._advance_to_transition(now + self.offset, state, -self.offset, step)
-        self.offset = self._rounded_offset(self.offset + time_offset, step)
-
 
 _STEPS_PER_REPORT = 5000  # between reports of progress
 # steps before and after a halt that are repeated with finer steps
@@ -229,55 +254,30 @@ class FixedStepIntegrator(StickSlipIntegrator):
     def __init__(self, chart: Chart, control: Controller, controller_state_count: int):
         self._compiled_stepper: RungeKuttaStepper | None = None
         compiled = not isinstance(control, ValveDrive) and chart.dynamics.backend == "compiled"
-        if (
-            compiled
-            and chart.machine.has_traceable_forces
-            and isinstance(control, TracedController)
-        ):
+        if compiled and chart.machine.has_traceable_forces and isinstance(control, ControlLaw):
             with suppress(FormulaTooLongError):
                 self._compiled_stepper = RungeKuttaStepper(chart, control, controller_state_count)
+        self._row_size = row_layout(chart.machine, control, controller_state_count).size
         super().__init__(chart, control, controller_state_count, self._compiled_stepper)
-        self._next_time = 0.0
 
-    def run(
-        self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None
-    ) -> int:
-        """Integrate from each of the times to the next, while the chart is regular.
-
-        Args:
-            times: (N,) instants [s].
-            state: State at the first instant or `offset` after it, replaced by the final one.
-            step: Interval of the instants [s].
-            rows: (N, row size) in any memory order, filled with state and outputs.
-            progress: Called with the number of finished steps.
-
-        Returns:
-            Number of steps.
-
-        Raises:
-            IntegrationHaltError: A step fails.
-        """
-        first = times[0] if len(times) else self._next_time
-        self.done = self.next_instant = 0
-        self._prepare_modes(first + self.offset, state)
-        while self.done < len(times) or self.offset < 0:
-            now = first + step * self.next_instant
-            if self.offset < 0:
-                self._advance_to_instant(now, state, step)
-                continue
-            if not self._make_steps(times, state, step, rows):
-                break
-            if progress is not None:
-                progress(self.done)
-        self._next_time = first + step * self.next_instant
-        return self.next_instant
-
-    def _make_steps(self, times: Array, state: Array, step: float, rows: Array) -> bool:
-        """Make some steps, or integrate to a stick-slip transition.
-
-        Returns:
-            False where another chart is needed.
-        """
+    def _advance(
+        self,
+        first: float,
+        times: Array,
+        state: Array,
+        step: float,
+        rows: Array,
+        progress: StepProgress,
+    ) -> bool:
+        """See `StickSlipIntegrator._advance`."""
+        if self.offset < 0:
+            time = first + step * self.next_instant + self.offset
+            after, margin = self._make_step(time, state, -self.offset)
+            if margin >= -EVENT_TOLERANCE:
+                state[:], self.offset = after, 0.0
+            else:
+                self.offset += self._advance_to_transition(time, state, -self.offset, step)
+            return True
         size, i = len(state), self.done
         chunk_end, event = min(i + _STEPS_PER_REPORT, len(times)), 0.0
         if self._compiled_stepper is not None:
@@ -301,8 +301,7 @@ class FixedStepIntegrator(StickSlipIntegrator):
             )
         if event and i:
             state[:] = rows[i - 1, :size]
-            event_time_offset = self._advance_to_transition(times[i - 1], state, event, step)
-            self.offset = self._rounded_offset(event_time_offset - step, step)
+            self.offset = self._advance_to_transition(times[i - 1], state, event, step) - step
         elif event:
             self._find_modes(times[0], state)
         return True
@@ -310,7 +309,7 @@ class FixedStepIntegrator(StickSlipIntegrator):
     def _make_step(self, time: float, state: Array, length: float) -> tuple[Array, float]:
         """See `StickSlipIntegrator._make_step`."""
         if self._compiled_stepper is not None:
-            after, row = state.copy(), np.empty((1, self._compiled_stepper.row_size))
+            after, row = state.copy(), np.empty((1, self._row_size))
             if self._compiled_stepper.run(np.array([time]), after, length, row):
                 return after, self._compiled_stepper.observe(time + length, after)[1]
         rate, _ = self.python_stepper.observe(time, state)
@@ -367,13 +366,13 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
     def __init__(
         self,
         chart: Chart,
-        control: TracedController,
+        control: ControlLaw,
         controller_state_count: int,
         stepper_factory: Callable[..., ErrorControlledStepper],
     ):
         self._stepper = stepper_factory(chart, control, controller_state_count)
         super().__init__(chart, control, controller_state_count, self._stepper)
-        self._chart, self._control, self._next_time = chart, control, 0.0
+        self._chart, self._period_in_steps = chart, 0
         self._sampled_drive = (
             control if isinstance(control, ValveDrive) and control.period else None
         )
@@ -381,68 +380,58 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
     def run(
         self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None
     ) -> int:
-        """See `FixedStepIntegrator.run`.
+        """See `StickSlipIntegrator.run`.
 
         Raises:
             InputError: The period of the valve command is no whole number of steps.
             IntegrationHaltError: A step fails.
         """
-        period = self._period_in_steps(step)
-        first = times[0] if len(times) else self._next_time
-        self.done = self.next_instant = 0
-        self._stepper.reset_step_size()
-        self._prepare_modes(first + self.offset, state)
-        while self.done < len(times) or self.offset < 0:
-            self._next_time = now = first + step * self.done
-            chunk = rows[self.done : min(self.done + _INSTANTS_PER_REPORT, len(times))]
-            if period and self.offset < 0:
-                chunk = chunk[:0]
-            elif period:
-                since = round(now / step) % period
-                chunk = chunk[: period - since]
-                if not since:
-                    self._update_command(now, state)
-            count, self.offset = self._stepper.run(now, state, self.offset, step, chunk)
-            self.done = self.next_instant = self.done + count
-            self._next_time = first + step * self.done
-            if self._stepper.event:
-                self._count_transition(self._next_time + self.offset, state, step)
-                # references are those after a jump, as for steps that start there
-                self._find_modes(
-                    self._next_time
-                    + self.offset
-                    + _TIME_TOLERANCE * min(step, MAX_REFERENCE_SPACING),
-                    state,
+        if self._sampled_drive is not None:
+            period_time = self._sampled_drive.period
+            self._period_in_steps = round(period_time / step)
+            if abs(self._period_in_steps * step - period_time) > _TIME_TOLERANCE * period_time:
+                raise InputError(
+                    f"the period {period_time:g} s of the valves' program is no whole number of "
+                    f"steps of {step:g} s, change one"
                 )
-                self.offset = self._rounded_offset(self.offset, step)
-            elif count < len(chunk) or self.offset < 0:
-                if self.python_stepper.exceeds_chart_limits(state):
-                    break
-                raise self.python_stepper.halt_error(self._next_time + self.offset, state)
-            if progress is not None:
-                progress(self.done)
-        return self.done
+        self._stepper.restart()
+        return super().run(times, state, step, rows, progress)
 
-    def _period_in_steps(self, step: float) -> int:
-        """Number of steps in a period of the sampled valve command; 0 without one."""
-        if self._sampled_drive is None:
-            return 0
-        period_time = self._sampled_drive.period
-        period = round(period_time / step)
-        if abs(period * step - period_time) > _TIME_TOLERANCE * period_time:
-            raise InputError(
-                f"the period {period_time:g} s of the valves' program is no whole number of "
-                f"steps of {step:g} s, change one"
-            )
-        return period
+    def _advance(
+        self,
+        first: float,
+        times: Array,
+        state: Array,
+        step: float,
+        rows: Array,
+        progress: StepProgress,
+    ) -> bool:
+        """See `StickSlipIntegrator._advance`."""
+        now = first + step * self.done
+        chunk = rows[self.done : min(self.done + _INSTANTS_PER_REPORT, len(times))]
+        if self._sampled_drive is not None:
+            since = round(now / step) % self._period_in_steps
+            chunk = chunk[: 0 if self.offset < 0 else self._period_in_steps - since]
+            if not since and not self.offset < 0:
+                self._update_command(self._sampled_drive, now, state)
+        count, self.offset = self._stepper.run(now, state, self.offset, step, chunk)
+        self.done = self.next_instant = self.done + count
+        time = first + step * self.done + self.offset
+        if self._stepper.event:
+            self._count_transition(time, state, step)
+            # references are those after a jump, as for steps that start there
+            self._find_modes(time + (_TIME_TOLERANCE * min(step, MAX_REFERENCE_SPACING)), state)
+        elif count < len(chunk) or self.offset < 0:
+            if not self.python_stepper.exceeds_chart_limits(state):
+                raise self.python_stepper.halt_error(time, state)
+            return False
+        return True
 
-    def _update_command(self, time: float, state: Array) -> None:
+    def _update_command(self, drive: ValveDrive, time: float, state: Array) -> None:
         """Sample the valve command."""
         at = self.python_stepper.state_layout.view(state)
-        assert self._sampled_drive is not None
         try:
-            v_a = self._chart.user_velocities(at.q, at.v_a)
-            self._sampled_drive.update(time, at.q, v_a, at.controller)
+            drive.update(time, at.q, self._chart.user_velocities(at.q, at.v_a), at.controller)
         except ClosureError as error:
             raise IntegrationHaltError(
                 time, self.python_stepper.user_coordinates(state), f": {error}"

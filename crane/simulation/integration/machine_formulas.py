@@ -1,13 +1,11 @@
 """Formulas of a machine with its controller, and their machine code."""
 
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from crane.closure.compiled_closure import CompiledClosure
-from crane.closure.kinematics_formulas import FormulaConstants
-from crane.closure.spatial_vectors import wrap_rotation_vector
+from crane.closure.kinematics_formulas import FormulaConstants, wrap_rotation_vector
 from crane.codegen import (
     Layout,
     LayoutView,
@@ -20,7 +18,7 @@ from crane.codegen.differentiation import differentiate
 from crane.codegen.symbolic import add_vectors, dot, subtract_vectors
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.control.control_law import ControllerInputs, TracedController
+from crane.control.control_law import ControlLaw, ControllerInputs
 from crane.control.valve_drive import ValveDrive
 from crane.dynamics import external_forces
 from crane.dynamics.dynamics_formulas import DynamicsFormulas, StickSlipAccelerations
@@ -30,28 +28,31 @@ from crane.simulation.integration.charts import Chart
 AT_REST_SUFFIX = "_rest"  # of formulas for machines with joints at rest
 
 
-def reference_samples(machine: Machine, control: TracedController, times: Array) -> Array:
+def reference_samples(machine: Machine, control: ControlLaw, times: Array) -> Array:
     """References (N, c), which depend on time alone: of the controller, then of loads."""
     external_samples = external_forces.reference_samples(machine.external_forces, times)
     return np.ascontiguousarray(np.hstack([control.references(times), external_samples]))
 
 
-def reference_count(control: TracedController) -> int:
+def reference_count(control: ControlLaw) -> int:
     """Number of references of a controller."""
     return control.references(np.zeros(1)).shape[1]
 
 
 @dataclass(frozen=True)
 class MachineFormulas:
-    """Formulas of a machine at a state.
+    """Formulas of a machine with its controller at a state.
 
     Attributes:
         chart: Chart of the state.
-        dynamics_formulas: Dynamics of the machine.
+        dynamics_formulas: Dynamics of the machine, with the friction of a circuit.
         state_parts: Parts of the state.
         q_a: (n,) active coordinates of the user.
         v_a: (n,) their velocities.
         external_forces: External forces.
+        inputs: Inputs of the controller.
+        tau: (n,) its forces.
+        controller_rate: (k,) rates of its states.
     """
 
     chart: Chart
@@ -60,81 +61,50 @@ class MachineFormulas:
     q_a: list[Scalar]
     v_a: list[Scalar]
     external_forces: external_forces.ExternalForceFormulas
+    inputs: ControllerInputs
+    tau: Sequence[Scalar]
+    controller_rate: Sequence[Scalar]
 
-    def controller_inputs(
-        self, settings: list[Scalar], reference: list[Scalar]
-    ) -> ControllerInputs:
-        """Inputs of a controller."""
-        states = self.q_a, self.v_a, self.state_parts.controller
-        if not self.chart.has_user_coordinates:
-            return ControllerInputs(
-                *states, settings, reference, _raise_undetermined, _raise_undetermined
-            )
-        dynamics = self.dynamics_formulas
-        return ControllerInputs(
-            *states,
-            settings,
-            reference,
-            dynamics.inverse_dynamics,
-            lambda: list(dynamics.gravity_force),
-        )
-
-    def with_circuit_friction(
-        self, control: TracedController, inputs: ControllerInputs
-    ) -> "MachineFormulas":
-        """The machine with the Coulomb friction of seals and brakes of a circuit."""
-        dynamics = self.dynamics_formulas
-        has_friction = bool(dynamics.formula_structure.circuit_friction_columns)
-        if not has_friction or not isinstance(control, ValveDrive):
-            return self
-        friction = control.circuit_friction(inputs)
-        return replace(self, dynamics_formulas=dynamics.with_circuit_friction(friction))
-
-    def accelerations(
-        self, tau: Sequence[Scalar], with_joints_at_rest: bool
-    ) -> StickSlipAccelerations:
-        """Accelerations under the forces of a controller, with or without joints at rest."""
+    def accelerations(self, with_joints_at_rest: bool) -> StickSlipAccelerations:
+        """Accelerations under the forces of the controller, with or without joints at rest."""
         return self.dynamics_formulas.accelerations_with_stick_slip(
-            self._applied_forces(tau), with_joints_at_rest
+            self._applied_forces, with_joints_at_rest
         )
 
-    def state_rate(
-        self, tau: Sequence[Scalar], controller_rate: Sequence[Scalar], with_joints_at_rest: bool
-    ) -> tuple[list[Scalar], Scalar]:
-        """Rate of the state, and the margin of stick-slip transitions.
-
-        Args:
-            tau: (n,) forces of the controller.
-            controller_rate: (k,) rates of its states.
-            with_joints_at_rest: Whether joints can be at rest.
-        """
-        accelerations = self.accelerations(tau, with_joints_at_rest)
+    def state_rate(self, with_joints_at_rest: bool) -> tuple[list[Scalar], Scalar]:
+        """Rate of the state, and the margin of stick-slip transitions."""
+        accelerations = self.accelerations(with_joints_at_rest)
         rate = [
             *self.dynamics_formulas.coordinate_derivatives,
             *accelerations.a_a,
             *self.external_forces.state_rates,
-            *controller_rate,
-            *self._powers(tau),
+            *self.controller_rate,
+            dot(self.tau, self.v_a),
+            *self.external_forces.powers,
+            self.dynamics_formulas.dissipated_power,
         ]
         return rate, accelerations.transition_margin
 
-    def _applied_forces(self, tau: Sequence[Scalar]) -> list[Scalar]:
-        """Forces of a controller and external forces along the coordinates of the chart."""
+    @property
+    def _applied_forces(self) -> list[Scalar]:
+        """Forces of the controller and external forces along the coordinates of the chart."""
         return add_vectors(
-            self.chart.trace_chart_forces(self.dynamics_formulas.gamma, tau),
+            self.chart.trace_chart_forces(self.dynamics_formulas.gamma, self.tau),
             self.external_forces.active_forces,
         )
 
-    def outputs(self, tau: Sequence[Scalar], with_joints_at_rest: bool) -> list[Scalar]:
+    def outputs(self, with_joints_at_rest: bool) -> list[Scalar]:
         """Outputs without the channels of circuits; see `output_layout`."""
-        accelerations = self.accelerations(tau, with_joints_at_rest)
+        accelerations = self.accelerations(with_joints_at_rest)
         dynamics = self.dynamics_formulas
         a: list[Scalar] = []
         if self.chart.machine.supports:
-            rows = sorted(dynamics.gamma.items())
-            a = [dot(row, accelerations.a_a) + dynamics.drift[i] for i, row in rows]
+            a = [
+                dot(row, accelerations.a_a) + dynamics.drift[i]
+                for i, row in sorted(dynamics.gamma.items())
+            ]
         return [
-            *tau,
+            *self.tau,
             *accelerations.active_friction,
             dynamics.kinetic,
             dynamics.potential,
@@ -143,95 +113,92 @@ class MachineFormulas:
             *a,
         ]
 
-    def forces_without_gravity(self, tau: Sequence[Scalar]) -> list[Scalar]:
+    def forces_without_gravity(self) -> list[Scalar]:
         """All forces along the coordinates of the chart except for inertia and gravity."""
         return subtract_vectors(
-            add_vectors(self._applied_forces(tau), self.dynamics_formulas.passive_force),
+            add_vectors(self._applied_forces, self.dynamics_formulas.passive_force),
             self.dynamics_formulas.friction_force,
         )
 
-    def stiffness(
-        self, controller_rate: Sequence[Scalar], tau: Sequence[Scalar]
-    ) -> list[list[Scalar]]:
-        """Derivatives of controller rates and forces by the coordinates q_B of the chart.
+    def stiffness(self, state_count: int) -> list[list[Scalar]]:
+        """Derivatives of rates and forces of the controller by the coordinates q_B of the chart.
 
         They are taken at constant gamma, without gravity and velocity-dependent forces.
 
         Args:
-            controller_rate: (k,) rates of the states of the controller.
-            tau: (n,) forces of the controller.
+            state_count: Number k of the first states of the controller, whose rates are taken.
 
         Returns:
             (k + n, n).
         """
         gamma = self.dynamics_formulas.gamma
         user_coordinates = [x for x in self.q_a if isinstance(x, SymbolicExpression)]
-        outputs = [*controller_rate, *self.chart.trace_chart_forces(gamma, tau)]
-        rows = differentiate(outputs, user_coordinates)
+        forces = self.chart.trace_chart_forces(gamma, self.tau)
+        rows = differentiate([*self.controller_rate[:state_count], *forces], user_coordinates)
         if not self.chart.has_user_coordinates:
             columns = list(
                 zip(*(gamma[i + 1] for i in self.chart.user_columns.tolist()), strict=True)
             )
             rows = [[dot(row, column) for column in columns] for row in rows]
-        passive = zip(rows[len(controller_rate) :], self.dynamics_formulas.stiffness, strict=True)
-        return [
-            *rows[: len(controller_rate)],
-            *(add_vectors(one, other) for one, other in passive),
-        ]
-
-    def _powers(self, tau: Sequence[Scalar]) -> list[Scalar]:
-        """Power of the controller, of each external force, and dissipated power [W]."""
-        return [
-            dot(tau, self.v_a),
-            *self.external_forces.powers,
-            self.dynamics_formulas.dissipated_power,
-        ]
+        passive = zip(rows[state_count:], self.dynamics_formulas.stiffness, strict=True)
+        return [*rows[:state_count], *(add_vectors(one, other) for one, other in passive)]
 
 
-def _raise_undetermined(a_a: Sequence[Scalar] = (), friction: bool = False) -> list[Scalar]:
+def raise_undetermined(a_a: Sequence[Scalar] = (), friction: bool = False) -> list[Scalar]:
+    """Inverse dynamics and gravity of a controller that must not ask for them."""
     raise InputError("inverse dynamics of coordinates that do not determine the motion")
 
 
 def trace_machine(
     chart: Chart,
+    control: ControlLaw,
     tape: Tape,
     layout: Layout,
     state_argument: int,
-    external_references: Sequence[Scalar],
+    references: list[Scalar],
+    settings: list[Scalar],
     folded_constants: tuple[Array, Array] | None = None,
 ) -> MachineFormulas:
-    """Trace the formulas of a machine.
+    """Trace the formulas of a machine with its controller.
 
     Args:
         chart: The machine in a chart.
+        control: Its controller.
         tape: The tape; its arguments 0 and 1 are geometry and constants of the dynamics.
         layout: Layout of the state.
         state_argument: Number of the argument that holds the state.
-        external_references: References of the external forces.
+        references: References of the controller, then of the external forces.
+        settings: Settings of the controller.
         folded_constants: Geometry and constants that become part of the formulas, with NaN for
             those that remain arguments; those of the machine if not given.
     """
-    dynamics, closure = chart.dynamics, chart.machine.closure
-    geometry, pattern = folded_constants or (None, dynamics.constant_pattern)
-    q, kinematics, loops = closure.compiled_closure.trace_kinematics(
+    geometry, pattern = folded_constants or (None, chart.dynamics.constant_pattern)
+    structure, columns = chart.dynamics.formula_structure, reference_count(control)
+    q, kinematics, loops = chart.machine.closure.compiled_closure.trace_kinematics(
         tape, 0, state_argument, geometry
     )
     parts = layout.view(tape.load_vector(state_argument, 0, layout.size))
-    constants = FormulaConstants(tape, 1, pattern)
-    dynamics_formulas = DynamicsFormulas(
-        kinematics, loops, constants, q, parts.v_a, dynamics.formula_structure, use_modes=True
-    )
-    v_a = (
-        parts.v_a
-        if chart.has_user_coordinates
-        else [dynamics_formulas.joint_velocities[i + 1] for i in chart.user_columns]
-    )
+    dynamics = DynamicsFormulas(
+        kinematics, loops, FormulaConstants(tape, 1, pattern), q, parts.v_a, structure,
+        use_modes=True,
+    )  # fmt: skip
+    q_a, v_a = [q[i] for i in chart.user_columns], parts.v_a
+    functions: tuple[Callable[..., list[Scalar]], ...] = (
+        dynamics.inverse_dynamics, lambda: list(dynamics.gravity_force),
+    )  # fmt: skip
+    if not chart.has_user_coordinates:
+        v_a = [dynamics.joint_velocities[i + 1] for i in chart.user_columns]
+        functions = raise_undetermined, raise_undetermined
     applied = external_forces.trace_external_forces(
-        chart.machine, dynamics_formulas, external_references, parts.contacts
+        chart.machine, dynamics, references[columns:], parts.contacts
     )
-    return MachineFormulas(
-        chart, dynamics_formulas, parts, [q[i] for i in chart.user_columns], v_a, applied
+    inputs = ControllerInputs(
+        q_a, v_a, parts.controller, settings, references[:columns], *functions
     )
+    tau, rates = control.law(inputs)
+    if isinstance(control, ValveDrive) and structure.circuit_friction_columns:
+        dynamics = dynamics.with_circuit_friction(control.circuit_friction(inputs))
+    return MachineFormulas(chart, dynamics, parts, q_a, v_a, applied, inputs, tau, rates)
 
 
 def wrap_rotations(chart: Chart, state: Sequence[Scalar]) -> list[Scalar]:
@@ -243,7 +210,7 @@ def wrap_rotations(chart: Chart, state: Sequence[Scalar]) -> list[Scalar]:
 
 
 def controller_formula_key(
-    control: TracedController,
+    control: ControlLaw,
     reference_columns: int,
     chart: Chart,
     controller_state_count: int,
@@ -281,7 +248,7 @@ def controller_formula_key(
         inverse=inverse,
         gravity=lambda: tape.load_vector(6, 0, n),
     )
-    tau, rates = control.trace(inputs)
+    tau, rates = control.law(inputs)
     if (len(tau), len(rates)) != (n, controller_state_count):
         raise InputError(
             f"the law of {type(control).__name__} gives {len(tau)} forces and {len(rates)} rates, "
@@ -300,13 +267,9 @@ def controller_formula_key(
 
 
 def machine_program(
-    machine: Machine,
-    control: TracedController,
-    compiled_closure: CompiledClosure,
-    key: tuple,
-    build: Callable[[Program], None],
+    machine: Machine, control: ControlLaw, key: tuple, build: Callable[[Program], None]
 ) -> Program:
-    """Machine code of a machine with its controller.
+    """Machine code of a machine with its controller, kept by the loops of the machine.
 
     It is cached only if controller and external forces are classes of this package: the code of a
     class of the user may depend on more than the key.
@@ -314,23 +277,26 @@ def machine_program(
     Args:
         machine: The machine.
         control: The controller.
-        compiled_closure: The compiled closure of the machine.
         key: Properties on which the code depends, with `controller_formula_key`.
         build: Function that adds formulas and routines.
 
     Raises:
         FormulaTooLongError: The formulas are too long to be compiled.
     """
-    parts: list[object] = [control, *machine.external_forces]
-    if isinstance(control, ValveDrive):
-        parts.append(control.command)
-    if all(type(part).__module__.startswith("crane.") for part in parts):
-        return compiled_closure.cached_program(key, build)
-    return Program.from_cache(None, build)
+    closure = machine.closure.compiled_closure
+    if key not in closure.programs:
+        parts: list[object] = [control, *machine.external_forces]
+        if isinstance(control, ValveDrive):
+            parts.append(control.command)
+        if all(type(part).__module__.startswith("crane.") for part in parts):
+            closure.programs[key] = closure.cached_program(key, build)
+        else:
+            closure.programs[key] = Program.from_cache(None, build)
+    return closure.programs[key]
 
 
 def controller_settings(
-    control: TracedController, tape: Tape, argument: int, fold_settings: bool
+    control: ControlLaw, tape: Tape, argument: int, fold_settings: bool
 ) -> list[Scalar]:
     """Settings of a controller, read from an argument."""
     size = len(control.settings)

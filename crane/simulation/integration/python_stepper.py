@@ -60,11 +60,10 @@ def explain_halt(
         reference: The reference trajectory, or None.
         finer_step: A step size with which the motion continues [s]; 0 if unknown.
     """
-    if finer_step:
-        hint = f"; with a step of {finer_step:g} s it goes on: shorten the step"
-        return SimulationError(f"{halt}{hint}")
-    limit_text = _passed_limit_text(machine, halt, times, q_a, reference)
-    return SimulationError(f"{halt}{limit_text or halt.default_remedy}")
+    hint = f"; with a step of {finer_step:g} s it goes on: shorten the step"
+    if not finer_step:
+        hint = _passed_limit_text(machine, halt, times, q_a, reference) or halt.default_remedy
+    return SimulationError(f"{halt}{hint}")
 
 
 def _passed_limit_text(
@@ -78,8 +77,12 @@ def _passed_limit_text(
     lower, upper = machine.lower, machine.upper
     excess = np.maximum(lower - halt.q_a, halt.q_a - upper)
     active = machine.closure.active
-    span = np.where(np.isfinite(upper - lower), upper - lower, machine.closure.units[active])
-    i = int(np.argmax(excess / span))
+    i = int(
+        np.argmax(
+            excess
+            / np.where(np.isfinite(upper - lower), upper - lower, machine.closure.units[active])
+        )
+    )
     slack = limit_tolerances(machine)[active[i]]
     if not excess[i] > slack:
         return ""
@@ -87,8 +90,7 @@ def _passed_limit_text(
     limit = lower[i] if value < lower[i] else upper[i]
     text = f"; '{joint}' is at {value:.6g} {unit}, beyond its limit {limit:.6g} {unit}"
     if len(times):
-        outside = (q_a[:, i] < lower[i] - slack) | (q_a[:, i] > upper[i] + slack)
-        inside = np.flatnonzero(~outside)
+        inside = np.flatnonzero(~((q_a[:, i] < lower[i] - slack) | (q_a[:, i] > upper[i] + slack)))
         first = int(inside[-1]) + 1 if len(inside) else 0
         passed_time = times[first] if first < len(times) else halt.time
         text += f" since t = {passed_time:.4g} s"
@@ -177,18 +179,17 @@ class PythonStepper:
         external_values = self._chart.external_forces(time, at.q, at.v_a, at.contacts)
         forces = self._chart.chart_forces(at.q, tau) + external_values.generalized_forces
         observation = self._dynamics.evaluate_closed("observation", at.q, at.v_a, forces)
-        channels: Array = np.zeros(0)
-        a: Array = np.zeros(0)
-        closure = self._chart.machine.closure
+        outputs = [tau, observation, external_values.outputs]
+        closure, control = self._chart.machine.closure, self._control
         if self._chart.machine.supports:
             gamma = closure.gamma(at.q)
             a = gamma @ self.state_layout.view(rate).v_a + closure.drift(at.q, gamma @ at.v_a)
-        if isinstance(self._control, ValveDrive):
-            control = self._control
+            outputs.append(a)
+        if isinstance(control, ValveDrive):
             v_a = self._chart.user_velocities(at.q, at.v_a)
             inputs = control.inputs_at(time, self.user_coordinates(state), v_a, at.controller)
-            channels = np.array(control.channel_values(inputs), dtype=np.float64)
-        return rate, np.concatenate([tau, observation, external_values.outputs, a, channels])
+            outputs.append(np.array(control.channel_values(inputs), dtype=np.float64))
+        return rate, np.concatenate(outputs)
 
     def advance(self, time: float, state: Array, start_rate: Array, step: float) -> Array:
         """The state after one step of the classical Runge-Kutta method.
@@ -207,14 +208,13 @@ class PythonStepper:
         for share, weight in ((0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
             if not np.abs(self.state_layout.view(rate).q / units).max() * step < 1:  # also NaN
                 size = self._dynamics.machine.closure.characteristic_length
-                description = (
-                    f" the motion explodes (over 1 rad or {size:.3g} m in a step of {step:g} s)"
-                )
-                remedy = (
+                raise IntegrationHaltError(
+                    time,
+                    self.user_coordinates(state),
+                    f" the motion explodes (over 1 rad or {size:.3g} m in a step of {step:g} s)",
                     ", and with steps an eighth as long, too: let method DOP853 choose them, or "
-                    "look at its forces and gains"
+                    "look at its forces and gains",
                 )
-                raise IntegrationHaltError(time, self.user_coordinates(state), description, remedy)
             rate, _ = self._state_rate(time + share * step, state + share * step * rate)
             rate_sum = rate_sum + weight * rate
         after = state + step / 6 * rate_sum

@@ -4,28 +4,29 @@ The method has three stages and an embedded method of order 3 (Hairer and Wanner
 Differential Equations II, IV.8, which has the coefficients).
 """
 
+from types import SimpleNamespace
+
 import numpy as np
 
-from crane.codegen import Program, RoutineValue, Scalar, Tape, select
-from crane.codegen.intermediate_representation import ArrayPointer
-from crane.codegen.matrix_factorization import lu_factorize
+from crane.codegen import ArrayPointer, Layout, Program, RoutineValue, Scalar, Tape, select
 from crane.codegen.symbolic import (
     add_vectors,
     apply_function,
     dot,
+    lu_factorize,
     maximum,
     scale_vector,
     subtract_vectors,
 )
 from crane.common.samples import Array
-from crane.control.control_law import TracedController
+from crane.control.control_law import ControlLaw
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.error_controlled_stepper import (
     ErrorControlledStepper,
     error_tolerances,
 )
 from crane.simulation.integration.radau_linear_system import EigenvalueShift, RadauLinearSystem
-from crane.simulation.integration.step_loop import StepCode, StepWriter
+from crane.simulation.integration.step_loop import StepLoop, StepWriter
 
 RADAU_TOLERANCE = 1e-9  # error of a step, relative to the size of the state
 _ROOT_OF_SIX = np.sqrt(6.0)
@@ -44,16 +45,10 @@ INVERSE_TRANSFORMATION = np.array([
 ERROR_WEIGHTS = np.array([-13.0 - 7.0 * _ROOT_OF_SIX, -13.0 + 7.0 * _ROOT_OF_SIX, -1.0]) / 3.0
 # coefficients of x, x^2, x^3 of the polynomial through the stages, by stage
 INTERPOLATION_WEIGHTS = np.array([
-    [
-        13.0 / 3.0 + 7.0 * _ROOT_OF_SIX / 3.0,
-        -23.0 / 3.0 - 22.0 * _ROOT_OF_SIX / 3.0,
-        10.0 / 3.0 + 5.0 * _ROOT_OF_SIX,
-    ],
-    [
-        13.0 / 3.0 - 7.0 * _ROOT_OF_SIX / 3.0,
-        -23.0 / 3.0 + 22.0 * _ROOT_OF_SIX / 3.0,
-        10.0 / 3.0 - 5.0 * _ROOT_OF_SIX,
-    ],
+    [13.0 / 3.0 + 7.0 * _ROOT_OF_SIX / 3.0, -23.0 / 3.0 - 22.0 * _ROOT_OF_SIX / 3.0,
+     10.0 / 3.0 + 5.0 * _ROOT_OF_SIX],
+    [13.0 / 3.0 - 7.0 * _ROOT_OF_SIX / 3.0, -23.0 / 3.0 + 22.0 * _ROOT_OF_SIX / 3.0,
+     10.0 / 3.0 - 5.0 * _ROOT_OF_SIX],
     [1.0 / 3.0, -8.0 / 3.0, 10.0 / 3.0],
 ])  # fmt: skip
 STAGES = 3
@@ -86,7 +81,7 @@ class RadauStepper(ErrorControlledStepper):
     def __init__(
         self,
         chart: Chart,
-        control: TracedController,
+        control: ControlLaw,
         controller_state_count: int,
         tolerance: float = RADAU_TOLERANCE,
     ):
@@ -111,7 +106,7 @@ class RadauStepper(ErrorControlledStepper):
             self._chart.machine.closure.active.tolist(),
         )
         for suffix, with_joints_at_rest in self._rest_variants:
-            dynamics = self._trace_controlled_machine(Tape())[0].dynamics_formulas
+            dynamics = self._trace_controlled_machine(Tape()).dynamics_formulas
             mass = [x for row in dynamics.mass_matrix for x in row]
             free = (
                 dynamics.active_motion_factors if with_joints_at_rest else [1.0] * self._mobility
@@ -120,10 +115,12 @@ class RadauStepper(ErrorControlledStepper):
         self._add_difference_formulas(program)
         for name in ("real", "complex"):
             tape = Tape()
-            blocks = self._system.load_blocks(tape, 0)
-            matrix = self._system.matrix(blocks, EigenvalueShift(name, tape.load(1, 0)))
-            factors = [x for row in lu_factorize(matrix) for x in row]
-            program.add_formula(f"{name}_factors", 2, factors)
+            matrix = self._system.matrix(
+                self._system.load_blocks(tape, 0), EigenvalueShift(name, tape.load(1, 0))
+            )
+            program.add_formula(
+                f"{name}_factors", 2, [x for row in lu_factorize(matrix) for x in row]
+            )
         self._add_newton(program)
         self._add_error_estimate(program)
         self._add_finish(program)
@@ -143,8 +140,9 @@ class RadauStepper(ErrorControlledStepper):
         size, n, layout = self.state_layout.size, self._mobility, self.state_layout
         start = size + 1  # of the displacements in `tolerances`
         tape = Tape()
-        displaced = add_vectors(tape.load_vector(0, 0, size), tape.load_vector(1, 0, size))
-        program.add_formula("displaced", 2, displaced)
+        program.add_formula(
+            "displaced", 2, add_vectors(tape.load_vector(0, 0, size), tape.load_vector(1, 0, size))
+        )
         tape = Tape()
         first_state = layout.start_index("controller")
         columns = [layout.start_index("v_a") + j for j in range(n)]
@@ -161,8 +159,9 @@ class RadauStepper(ErrorControlledStepper):
         for j in range(n):
             ratio = tape.load(2, start + n + j) / tape.load(2, start + j)
             rate = tape.load_vector(0, 0, layout.parts["q"])
-            displaced_rate = tape.load_vector(1, j * size, layout.parts["q"])
-            directions += scale_vector(ratio, subtract_vectors(displaced_rate, rate))
+            directions += scale_vector(
+                ratio, subtract_vectors(tape.load_vector(1, j * size, layout.parts["q"]), rate)
+            )
             directions += [0.0] * (size - len(rate))
         program.add_formula("coordinate_directions", 3, directions)
         program.add_formula("jacobian", 5, self._system.blocks_from_differences(Tape()))
@@ -223,8 +222,9 @@ class RadauStepper(ErrorControlledStepper):
         sums = [dot(ERROR_WEIGHTS.tolist(), column) for column in zip(*Z, strict=True)]
         right_side = add_vectors(rate, scale_vector(1.0 / h, sums))
         blocks, shift = self._system.load_blocks(tape, 0), EigenvalueShift("real", h)
-        factors = self._system.load_factors(tape, 1, shift)
-        (error,) = self._system.solve(blocks, factors, shift, [right_side])
+        (error,) = self._system.solve(
+            blocks, self._system.load_factors(tape, 1, shift), shift, [right_side]
+        )
         program.add_formula("estimate", 5, error)
 
     def _add_finish(self, program: Program) -> None:
@@ -235,18 +235,23 @@ class RadauStepper(ErrorControlledStepper):
         error, rate = tape.load_vector(3, 0, size), tape.load_vector(4, 0, size)
         after = add_vectors(state, Z[2])
         scales = self._inverse_error_scales(tape, 6, state, after)
-        total = _sum_of_squares(error, scales)
-        norm = apply_function("sqrt", total * (1.0 / len(scales)))
+        norm = apply_function("sqrt", _sum_of_squares(error, scales) * (1.0 / len(scales)))
         # error of the dense output: the polynomial through the stages against the cubic that has
         # the rate at the start and the end of the stages
-        slope_weights = INTERPOLATION_WEIGHTS[:, 0].tolist()
-        gaps = [dot([row[i] for row in Z], slope_weights) - h * rate[i] for i in range(nq)]
+        gaps = [
+            dot([row[i] for row in Z], INTERPOLATION_WEIGHTS[:, 0].tolist()) - h * rate[i]
+            for i in range(nq)
+        ]
         scaled_gaps = [gap * scale for gap, scale in zip(gaps, scales, strict=False)]
         interpolation_error = _sum_of_squares(scaled_gaps, [_INTERPOLATION_ERROR_FACTOR] * nq)
         norm = maximum(norm, apply_function("sqrt", interpolation_error * (1.0 / nq)))
-        largest_move = self._largest_move(tape, Z[2][:nq])
-        outputs = self._finish_outputs(after, norm, largest_move, 4.0, _MAX_STEP_RATIO)
-        program.add_formula("finish", 7, outputs)
+        program.add_formula(
+            "finish",
+            7,
+            self._finish_outputs(
+                after, norm, self._largest_move(tape, Z[2][:nq]), 4.0, _MAX_STEP_RATIO
+            ),
+        )
 
     def _add_dense_output(self, program: Program) -> None:
         """dense(Z): x (Q0 + Q1 x + Q2 x^2) in the form x (c0 + (1 - x) (c1 + x c2))."""
@@ -262,11 +267,10 @@ class RadauStepper(ErrorControlledStepper):
         )
         program.add_formula("dense", 1, [x for row in coefficients for x in row])
 
-    def _write_step(self, program: Program, step: StepCode) -> tuple[StepWriter, StepWriter]:
+    def _write_step(self, program: Program, step: StepLoop) -> tuple[StepWriter, StepWriter]:
         """See `ErrorControlledStepper`."""
-        writer = _RadauStepCode(
-            program, step, self.state_layout.size, self._mobility, self._controller_state_count
-        )
+        sizes = self.state_layout.size, self._mobility, self._controller_state_count
+        writer = _RadauStepCode(program, step, *sizes)
         return writer.write_attempt, writer.write_interpolation
 
 
@@ -275,7 +279,7 @@ class _RadauStepCode:
 
     Args:
         program: The program with its formulas.
-        step: See `StepCode`.
+        step: The loop over steps.
         size: Length of the state.
         mobility: Number of active coordinates.
         controller_state_count: Number of states of the controller.
@@ -284,60 +288,55 @@ class _RadauStepCode:
     def __init__(
         self,
         program: Program,
-        step: StepCode,
+        step: StepLoop,
         size: int,
         mobility: int,
         controller_state_count: int,
     ):
         r = self._r = step.routine
-        self._step, self._mobility = step, mobility
+        self._step, self._mobility, self._size = step, mobility, size
         m = self._direction_count = mobility + controller_state_count
-        self._size = size
         # rates have further outputs, which the next rate overwrites
         further = program.formula_outputs("rate").size - size
-        self._velocity_directions = r.local_array("velocity_directions", m * size)
-        self._coordinate_directions = r.local_array(
-            "coordinate_directions", max(1, mobility * size)
-        )
-        self._velocity_rates = r.local_array("velocity_rates", m * size + further)
-        self._coordinate_rates = r.local_array("coordinate_rates", m * size + further)
-        self._mass = r.local_array("mass", mobility * mobility + mobility)
-        self._stage = r.local_array("stage", size)
-        self._jacobian = r.local_array("jacobian", program.formula_outputs("jacobian"))
-        self._real_factors = r.local_array("real", m * m)
-        self._complex_factors = r.local_array("pair", 4 * m * m)
-        self._stage_rates = r.local_array("rates", STAGES * size + further)
-        self._error_rate = r.local_array("slope", size + further)
-        self._iterate = r.local_array("iterate", program.formula_outputs("newton"))
-        self._previous_stages = r.local_array("previous_stages", STAGES * size)
-        self._ratio = r.local_array("ratio", 1)
-        self._error_estimate = r.local_array("error_estimate", size)
+        sizes: dict[str, Layout | int] = {
+            "velocity_directions": m * size, "coordinate_directions": max(1, mobility * size),
+            "velocity_rates": m * size + further, "coordinate_rates": m * size + further,
+            "mass": mobility * mobility + mobility, "stage": size,
+            "jacobian": program.formula_outputs("jacobian"), "real_factors": m * m,
+            "complex_factors": 4 * m * m, "rates": STAGES * size + further,
+            "error_rate": size + further, "iterate": program.formula_outputs("newton"),
+            "previous_stages": STAGES * size, "ratio": 1, "error_estimate": size,
+        }  # fmt: skip
+        self._arrays = SimpleNamespace(**{x: r.local_array(x, n) for x, n in sizes.items()})
         self._jacobian_time = r.new_variable(-np.inf)
         self._convergence_rate = r.new_variable(1.0)
         self._previous_length = r.new_variable(0.0)
-        r.call("velocity_directions", r.tol, self._velocity_directions)
+        r.call("velocity_directions", r.tol, self._arrays.velocity_directions)
         with r.loop(r.new_variable(STAGES * size)) as i:
-            r.store(self._previous_stages, i, 0.0)
+            r.store(self._arrays.previous_stages, i, 0.0)
 
     def write_attempt(self, t: RoutineValue, length: RoutineValue) -> None:
         """Write an attempt of a step from a time on, up to `finish`."""
-        r, step, jacobian = self._r, self._step, self._jacobian
+        r, step, arrays, result = self._r, self._step, self._arrays, self._step.step_result
         with r.if_then(
             (t > self._jacobian_time) & (self._convergence_rate > _MAX_CONVERGENCE_RATE)
         ):
             self._update_jacobian(t)
-        r.call("real_factors", jacobian, step.length, self._real_factors)
-        r.call("complex_factors", jacobian, step.length, self._complex_factors)
-        ratio = select(self._previous_length > 0.0, length / self._previous_length, 0.0)
-        r.store(self._ratio, 0, ratio)
-        r.call("predict", r.state, self._previous_stages, self._ratio, self._iterate)
+        r.call("real_factors", arrays.jacobian, step.length, arrays.real_factors)
+        r.call("complex_factors", arrays.jacobian, step.length, arrays.complex_factors)
+        r.store(
+            arrays.ratio,
+            0,
+            select(self._previous_length > 0.0, length / self._previous_length, 0.0),
+        )
+        r.call("predict", r.state, arrays.previous_stages, arrays.ratio, arrays.iterate)
         converged = self._iterate_newton(t, length)
-        Z, result = self._iterate.element_pointer("Z"), step.step_result
+        Z = arrays.iterate.element_pointer("Z")
         self._estimate_error(step.start_rate, Z)
         with r.if_then(result["error"] > 1.0):
-            r.call("displaced", r.state, self._error_estimate, self._stage)
-            step.call("rate", t, self._stage, self._error_rate)
-            self._estimate_error(self._error_rate, Z)
+            r.call("displaced", r.state, arrays.error_estimate, arrays.stage)
+            step.call("rate", t, arrays.stage, arrays.error_rate)
+            self._estimate_error(arrays.error_rate, Z)
         with r.if_then(converged < 1):
             r.store(result.element_pointer("error"), 0, 2.0)
             r.store(result.element_pointer("change"), 0, 0.25)
@@ -345,56 +344,61 @@ class _RadauStepCode:
             is_old = self._jacobian_time < t
             r.assign(self._jacobian_time, select(is_old, -np.inf, self._jacobian_time))
         with r.if_else():
-            r.copy(self._previous_stages, Z, STAGES * self._size)
+            r.copy(arrays.previous_stages, Z, STAGES * self._size)
             r.assign(self._previous_length, select(result["error"] <= 1.0, length, 0.0))
 
     def write_interpolation(self, t: RoutineValue, length: RoutineValue) -> None:
         """Write the dense output behind a step."""
-        self._r.call("dense", self._iterate.element_pointer("Z"), self._step.dense_output)
+        self._r.call("dense", self._arrays.iterate.element_pointer("Z"), self._step.dense_output)
 
     def _update_jacobian(self, t: RoutineValue) -> None:
-        r, step = self._r, self._step
-        step.call("mass", t, r.state, self._mass)
-        self._write_rates(
-            t, self._direction_count, self._velocity_directions, self._velocity_rates
+        r, step, a = self._r, self._step, self._arrays
+        step.call("mass", t, r.state, a.mass)
+        self._write_rates(t, self._direction_count, a.velocity_directions, a.velocity_rates)
+        r.call(
+            "coordinate_directions", step.start_rate, a.velocity_rates, r.tol,
+            a.coordinate_directions,
+        )  # fmt: skip
+        self._write_rates(t, self._mobility, a.coordinate_directions, a.coordinate_rates)
+        r.call(
+            "jacobian",
+            *(step.start_rate, a.velocity_rates, a.coordinate_rates),
+            a.mass,
+            r.tol,
+            a.jacobian,
         )
-        r.call(
-            "coordinate_directions", step.start_rate, self._velocity_rates, r.tol,
-            self._coordinate_directions,
-        )  # fmt: skip
-        self._write_rates(t, self._mobility, self._coordinate_directions, self._coordinate_rates)
-        r.call(
-            "jacobian", step.start_rate, self._velocity_rates, self._coordinate_rates, self._mass,
-            r.tol, self._jacobian,
-        )  # fmt: skip
         r.assign(self._jacobian_time, t)
 
     def _write_rates(
         self, t: RoutineValue, count: int, directions: ArrayPointer, rates: ArrayPointer
     ) -> None:
         """Rates at states that are displaced along some directions."""
-        r, size = self._r, self._size
+        r, stage, size = self._r, self._arrays.stage, self._size
         with r.loop(r.new_variable(count)) as i:
-            r.call("displaced", r.state, directions.row_pointer(i, size), self._stage)
-            self._step.call("rate", t, self._stage, rates.row_pointer(i, size))
+            r.call("displaced", r.state, directions.row_pointer(i, size), stage)
+            self._step.call("rate", t, stage, rates.row_pointer(i, size))
 
     def _iterate_newton(self, t: RoutineValue, length: RoutineValue) -> RoutineValue:
         """Iterations of Newton's method; returns 1 if it converges."""
-        r, step, iterate = self._r, self._step, self._iterate
+        r, step, a = self._r, self._step, self._arrays
         tries, converged, norm = r.new_variable(0), r.new_variable(0), r.new_variable(0.0)
         rate = self._convergence_rate
         with r.loop_forever():
             for i in range(STAGES):
-                stage = iterate.element_pointer("stages").element_pointer(i * self._size)
-                stage_rate = self._stage_rates.element_pointer(i * self._size)
-                step.call("rate", t + length * float(NODES[i]), stage, stage_rate)
+                stage = a.iterate.element_pointer("stages").element_pointer(i * self._size)
+                step.call(
+                    "rate",
+                    t + length * float(NODES[i]),
+                    stage,
+                    a.rates.element_pointer(i * self._size),
+                )
             r.call(
-                "newton", r.state, self._jacobian, self._real_factors, self._complex_factors,
-                self._stage_rates, iterate.element_pointer("W"), step.length, r.tol, iterate,
+                "newton", r.state, a.jacobian, a.real_factors, a.complex_factors, a.rates,
+                a.iterate.element_pointer("W"), step.length, r.tol, a.iterate,
             )  # fmt: skip
             r.assign(tries, tries + 1)
             previous_norm = r.new_variable(norm)
-            r.assign(norm, iterate["norm"])
+            r.assign(norm, a.iterate["norm"])
             with r.if_then(tries > 1):
                 r.assign(rate, norm / previous_norm)
                 with r.if_then(rate * norm < (rate * -1.0 + 1.0) * _NEWTON_TOLERANCE):
@@ -410,12 +414,11 @@ class _RadauStepCode:
 
     def _estimate_error(self, rate: ArrayPointer, Z: ArrayPointer) -> None:
         """Estimate of the error with a rate at the start of the step, and `finish`."""
-        r, step = self._r, self._step
-        estimate = self._error_estimate
-        r.call("estimate", self._jacobian, self._real_factors, rate, Z, step.length, estimate)
+        r, step, a = self._r, self._step, self._arrays
+        r.call("estimate", a.jacobian, a.real_factors, rate, Z, step.length, a.error_estimate)
         r.call(
-            "finish", r.geometry, r.state, Z, estimate, step.start_rate, step.length, r.tol,
-            step.step_result,
+            "finish", r.geometry, r.state, Z, a.error_estimate, step.start_rate, step.length,
+            r.tol, step.step_result,
         )  # fmt: skip
 
 
@@ -439,5 +442,4 @@ def _sum_of_squares(values: list[Scalar], scales: list[Scalar]) -> Scalar:
 
 def _combine_rows(weights: Array, rows: list[list[Scalar]]) -> list[list[Scalar]]:
     """Linear combinations of rows by rows of weights."""
-    columns = list(zip(*rows, strict=True))
-    return [[dot(row, column) for column in columns] for row in weights.tolist()]
+    return [[dot(row, column) for column in zip(*rows, strict=True)] for row in weights.tolist()]

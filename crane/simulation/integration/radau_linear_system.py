@@ -1,10 +1,11 @@
 """Linear systems of the Newton iteration of Radau IIA, as formulas in block form."""
 
 from crane.codegen import Layout, Scalar, Tape
-from crane.codegen.matrix_factorization import Matrix, lu_solve
 from crane.codegen.symbolic import (
+    Matrix,
     add_vectors,
     dot,
+    lu_solve,
     matvec,
     scale_vector,
     subtract_vectors,
@@ -200,8 +201,7 @@ class RadauLinearSystem:
             if k:
                 reduced += add_vectors(list(view.controller), matvec(blocks["o_q"], part))
             reduced += add_vectors(matvec(blocks["mass"], view.v_a), matvec(blocks["v_q"], part))
-        solution = lu_solve(factors, reduced)
-        parts = [solution[i * m : (i + 1) * m] for i in range(len(views))]
+        parts = [lu_solve(factors, reduced)[i * m : (i + 1) * m] for i in range(len(views))]
         v_a = [
             [factor * x for factor, x in zip(blocks["free"][0], part[k:], strict=True)]
             for part in parts

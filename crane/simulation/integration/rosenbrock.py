@@ -4,21 +4,19 @@ import numpy as np
 
 from crane.codegen import Program, RoutineValue, Scalar, SymbolicExpression, Tape, max_abs, maximum
 from crane.codegen.differentiation import differentiate
-from crane.codegen.matrix_factorization import (
+from crane.codegen.symbolic import (
     Matrix,
+    add_vectors,
+    apply_function,
     load_matrix,
     lu_factorize,
     lu_solve,
-    symbolic_entries,
-)
-from crane.codegen.symbolic import (
-    add_vectors,
-    apply_function,
     matvec,
     scale_vector,
     subtract_vectors,
+    symbolic_entries,
 )
-from crane.control.control_law import TracedController
+from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
 from crane.dynamics.external_forces import state_count
 from crane.simulation.integration.charts import Chart
@@ -29,7 +27,7 @@ from crane.simulation.integration.error_controlled_stepper import (
     characteristic_energy,
     weighted_sum,
 )
-from crane.simulation.integration.step_loop import StepCode, StepWriter
+from crane.simulation.integration.step_loop import StepLoop, StepWriter
 
 # ROS34PW2 of Rang and Angermann (2005): order 3 with any Jacobian, L-stable, stiffly accurate,
 # with an embedded method of order 2.
@@ -99,7 +97,7 @@ class RosenbrockStepper(ErrorControlledStepper):
     def __init__(
         self,
         chart: Chart,
-        control: TracedController,
+        control: ControlLaw,
         controller_state_count: int,
         tolerance: float = ROSENBROCK_TOLERANCE,
     ):
@@ -134,8 +132,11 @@ class RosenbrockStepper(ErrorControlledStepper):
         for i in range(1, STAGES):
             tape = Tape()
             state = tape.load_vector(0, 0, size)
-            stage = add_vectors(state, weighted_sum(tape, 1, size, _STAGE_COEFFICIENTS[i]))
-            program.add_formula(f"combine{i}", 2, stage)
+            program.add_formula(
+                f"combine{i}",
+                2,
+                add_vectors(state, weighted_sum(tape, 1, size, _STAGE_COEFFICIENTS[i])),
+            )
         self._add_finish(program)
         # dense output: the cubic through both ends and their slopes
         tape = Tape()
@@ -161,8 +162,9 @@ class RosenbrockStepper(ErrorControlledStepper):
         tolerance = tape.load(3, energies)
 
         def share(i: int, inverse_accuracy: int, relative: Scalar) -> Scalar:
-            absolute = 1.0 / tape.load(3, inverse_accuracy)
-            return errors[i] / (absolute + relative * apply_function("abs", after[i]))
+            return errors[i] / (
+                (1.0 / tape.load(3, inverse_accuracy)) + relative * apply_function("abs", after[i])
+            )
 
         shares = [share(i, i, tolerance) for i in range(checked_count)]
         if not self._steps_end_at_outputs:
@@ -173,8 +175,9 @@ class RosenbrockStepper(ErrorControlledStepper):
         # the errors of other integrals only have to be finite
         error = maximum(max_abs(shares), max_abs(scale_vector(1e-30, errors[checked_count:])))
         largest_move = self._largest_move(tape, subtract_vectors(after[:q], state[:q]))
-        outputs = self._finish_outputs(after, error, largest_move, 3.0, _MAX_STEP_RATIO)
-        program.add_formula("finish", 4, outputs)
+        program.add_formula(
+            "finish", 4, self._finish_outputs(after, error, largest_move, 3.0, _MAX_STEP_RATIO)
+        )
 
     def _add_stage_solvers(self, program: Program, suffix: str, with_joints_at_rest: bool) -> None:
         """Add prepare(..., h), which factorizes 1 - h gamma J, and the solvers of the stages.
@@ -183,23 +186,22 @@ class RosenbrockStepper(ErrorControlledStepper):
         Gamma x = Gamma b.
         """
         tape = Tape()
-        machine, _, tau, controller_rate = self._trace_controlled_machine(tape)
+        machine = self._trace_controlled_machine(tape)
         dynamics, n = machine.dynamics_formulas, len(machine.state_parts.v_a)
         mass, k = dynamics.mass_matrix, self._stiff_state_count
         step_gamma = GAMMA * tape.load(5, 0)
-        rates = list(controller_rate[:k])
         parts = machine.state_parts
         variables = [
             x for x in (*parts.controller[:k], *parts.v_a) if isinstance(x, SymbolicExpression)
         ]
-        jacobian = differentiate([*rates, *machine.forces_without_gravity(tau)], variables)
+        jacobian = differentiate(
+            [*machine.controller_rate[:k], *machine.forces_without_gravity()], variables
+        )
         # the balances of oil and strokes stay exact where J has derivatives of neither
         by_coordinates: Matrix = [[0.0] * n for _ in range(k + n)]
         coordinate_directions: Matrix = [[0.0] * n for _ in machine.state_parts.q]
         if not self._steps_end_at_outputs:
-            by_coordinates = [
-                scale_vector(step_gamma, row) for row in machine.stiffness(rates, tau)
-            ]
+            by_coordinates = [scale_vector(step_gamma, row) for row in machine.stiffness(k)]
             coordinate_directions = [
                 scale_vector(step_gamma, row) for row in dynamics.rate_jacobian
             ]
@@ -215,8 +217,11 @@ class RosenbrockStepper(ErrorControlledStepper):
             "directions": coordinate_directions,
             "free": [dynamics.active_motion_factors if with_joints_at_rest else [1.0] * n],
         }
-        outputs = {name: symbolic_entries(table) for name, table in tables.items()}
-        program.add_formula(f"prepare{suffix}", 6, outputs)
+        program.add_formula(
+            f"prepare{suffix}",
+            6,
+            {name: symbolic_entries(table) for name, table in tables.items()},
+        )
         for i in range(STAGES):
             self._add_stage_solver(program, i, suffix, tables)
 
@@ -260,11 +265,17 @@ class RosenbrockStepper(ErrorControlledStepper):
         free = loaded["free"][0]
         v_a = [factor * x for factor, x in zip(free, solution[k : k + len(free)], strict=True)]
         q = add_vectors(part.q, matvec(loaded["directions"], v_a))
-        controller = [*solution[:k], *part.controller[k:]]
-        outputs = [*q, *v_a, *part.contacts, *controller, *part.work, *part.dissipated]
+        outputs = [
+            *q,
+            *v_a,
+            *part.contacts,
+            *[*solution[:k], *part.controller[k:]],
+            *part.work,
+            *part.dissipated,
+        ]
         program.add_formula(f"solve{stage}{suffix}", 4, outputs)
 
-    def _write_step(self, program: Program, step: StepCode) -> tuple[StepWriter, StepWriter]:
+    def _write_step(self, program: Program, step: StepLoop) -> tuple[StepWriter, StepWriter]:
         """See `ErrorControlledStepper`."""
         r, size = step.routine, self.state_layout.size
         u, stage = r.local_array("u", STAGES * size), r.local_array("stage", size)
@@ -282,13 +293,18 @@ class RosenbrockStepper(ErrorControlledStepper):
                     rate = stage_rate
                     r.call(f"combine{i}", r.state, u, stage)
                     step.call("rate", t + length * float(ALPHA[i].sum()), stage, rate)
-                solution = u.element_pointer(i * size)
-                self.call_formula(r, f"solve{i}", rate, u, factors, step.length, solution)
+                self.call_formula(
+                    r, f"solve{i}", rate, u, factors, step.length, u.element_pointer(i * size)
+                )
             r.call("finish", r.geometry, r.state, u, r.tol, step.step_result)
 
         def interpolate(t: RoutineValue, length: RoutineValue) -> None:
-            ends = step.start_rate, step.length, step.step_result, step.end_rate
-            r.call("dense", r.state, *ends, step.dense_output)
+            r.call(
+                "dense",
+                r.state,
+                *(step.start_rate, step.length, step.step_result, step.end_rate),
+                step.dense_output,
+            )
 
         return attempt, interpolate
 

@@ -44,39 +44,26 @@ class ScipyIntegrator(StickSlipIntegrator):
         self._tolerance = tolerance
         super().__init__(chart, control, controller_state_count, None)
         self._chart, self._closure, self._method = chart, chart.machine.closure, method
-        self._end_time = 0.0
 
-    def run(
-        self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None
-    ) -> int:
-        """See `FixedStepIntegrator.run`.
+    def _advance(
+        self,
+        first: float,
+        times: Array,
+        state: Array,
+        step: float,
+        rows: Array,
+        progress: StepProgress,
+    ) -> bool:
+        """See `StickSlipIntegrator._advance`; integrates to the last instant if there is no event.
 
         Raises:
             IntegrationHaltError: The method fails, or the loops do not close.
         """
-        first = times[0] if len(times) else self._end_time
-        self.done = self.next_instant = 0
-        self._prepare_modes(first + self.offset, state)
-        self._end_time = first + step * len(times)
-        instants = np.append(times, self._end_time)
-        while self.next_instant < len(times) or self.offset < 0:
-            start_time = instants[self.next_instant] + self.offset
-            if not self._integrate_until(start_time, instants, state, rows, progress):
-                break
-            self.offset = self._rounded_offset(self.offset, step)
-        return self.next_instant
-
-    def _integrate_until(
-        self, start_time: float, instants: Array, state: Array, rows: Array, progress: StepProgress
-    ) -> bool:
-        """Integrate to the last instant, or to a stick-slip transition.
-
-        Returns:
-            False where another chart is needed.
-        """
         from scipy import integrate
 
-        closure, end = self._closure, instants[-1]
+        closure, end = self._closure, first + step * len(times)
+        instants = np.append(times, end)
+        start_time = instants[self.next_instant] + self.offset
         units, characteristic_time, view = (
             closure.units,
             closure.characteristic_time,
@@ -103,10 +90,11 @@ class ScipyIntegrator(StickSlipIntegrator):
             with np.errstate(all="ignore"):  # the method fails by itself where a trial diverges
                 message = solver.step()
             if message is not None:
-                what = f" {self._method} gives up: {message.rstrip('.').lower()}"
-                user_coordinates = self.python_stepper.user_coordinates(solver.y)
                 raise IntegrationHaltError(
-                    float(solver.t), user_coordinates, what, ", try another method"
+                    float(solver.t),
+                    self.python_stepper.user_coordinates(solver.y),
+                    f" {self._method} gives up: {message.rstrip('.').lower()}",
+                    ", try another method",
                 )
             self._check_passive_velocities(solver.t, solver.y)
             dense_output, start = solver.dense_output(), float(solver.t_old)
@@ -135,15 +123,8 @@ class ScipyIntegrator(StickSlipIntegrator):
                 self.next_instant = self.done
                 self.offset = until - instants[self.next_instant]
                 return True
-            before = after
-            if (
-                min(
-                    self.python_stepper.chart_limits[0]
-                    - self._chart.largest_gamma_entry(view(solver.y).q),
-                    1.0,
-                )
-                < 0
-            ):
+            before, q = after, view(solver.y).q
+            if self._chart.largest_gamma_entry(q) > self.python_stepper.chart_limits[0]:
                 return False
         return True
 
@@ -159,16 +140,14 @@ class ScipyIntegrator(StickSlipIntegrator):
             rates = closure.gamma(at.q)[closure.passive] @ at.v_a / closure.units[closure.passive]
             speed = closure.characteristic_time * float(np.abs(rates).max(initial=0.0))
         if not speed < _MAX_PASSIVE_VELOCITY:
-            characteristic_time = closure.characteristic_time
-            velocity_limit = _MAX_PASSIVE_VELOCITY / characteristic_time
-            fastest = (
-                f"{velocity_limit:.3g} rad/s or "
-                f"{velocity_limit * closure.characteristic_length:.3g} m/s"
-            )
-            what = f" the motion explodes (a passive joint exceeds {fastest})"
-            user_coordinates = self.python_stepper.user_coordinates(state)
+            limit = _MAX_PASSIVE_VELOCITY / closure.characteristic_time
+            length = closure.characteristic_length
             raise IntegrationHaltError(
-                time, user_coordinates, what, ": look at its forces and gains"
+                time,
+                self.python_stepper.user_coordinates(state),
+                f" the motion explodes (a passive joint exceeds {limit:.3g} rad/s or "
+                f"{limit * length:.3g} m/s)",
+                ": look at its forces and gains",
             )
 
     def _record(

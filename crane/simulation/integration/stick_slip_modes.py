@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from crane.closure.closure import Closure
-from crane.closure.constraint_structure import Indices
+from crane.closure.coordinates import Indices
 from crane.common.samples import Array
 from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.joint_forces import REST_VELOCITY
@@ -77,8 +77,9 @@ class StickSlipModes:
     def __init__(self, machine: Machine, columns: tuple[int, ...]):
         self.columns = list(columns)
         self._joints = [machine.joints[column] for column in columns]
-        units = machine.closure.units[self.columns]
-        self._inverse_velocities = machine.closure.characteristic_time / units
+        self._inverse_velocities = (
+            machine.closure.characteristic_time / machine.closure.units[self.columns]
+        )
         self.slip_signs = np.zeros(len(columns))
         self.is_held = np.zeros(len(columns), dtype=bool)
         self.is_moving, self.has_modes, self.is_undetermined = True, False, False

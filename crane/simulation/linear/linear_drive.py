@@ -18,7 +18,7 @@ from crane.dynamics.joint_forces import JointForces
 from crane.hydraulics.circuit_states import BALANCE_UNITS
 from crane.machine.machine import Machine
 from crane.recordings.recording import FORCE_UNITS
-from crane.simulation.integration.machine_formulas import controller_settings
+from crane.simulation.integration.machine_formulas import controller_settings, raise_undetermined
 
 _MIN_OPENING = 1e-6  # share of the spool stroke beyond the dead band
 
@@ -31,6 +31,7 @@ class LinearizedDrive:
         input_units: Names and units of its inputs.
         output_units: Names and units of further outputs.
         initial_states: (k,) states where the machine stands still.
+        vapour_pressure: Pressure of a circuit at which its pressure states are 0 [Pa].
         initial_inputs: (m,) inputs where the machine stands still.
     """
 
@@ -51,7 +52,7 @@ class LinearizedDrive:
         }
         self.output_units: dict[str, str] = {}
         self.initial_states, self.initial_inputs = np.zeros(0), np.zeros(len(self.input_units))
-        self.scales, self._vapour_pressure, self._engine_droop = np.zeros(0), 0.0, 0.0
+        self.scales, self.vapour_pressure, self._engine_droop = np.zeros(0), 0.0, 0.0
         self._valve_drive: ValveDrive | None = None
         self._input_matrix = np.eye(n)[:, machine.is_driven]
         if valves:
@@ -65,7 +66,7 @@ class LinearizedDrive:
             )
             engine = circuit.hydraulics.engine
             self._engine_droop = engine.speed_droop / engine.speed if engine is not None else 0.0
-            self._vapour_pressure = circuit.hydraulics.oil.vapour_pressure
+            self.vapour_pressure = circuit.hydraulics.oil.vapour_pressure
             self._joint_of_state = {
                 name: joint
                 for joint, first, last in zip(
@@ -88,8 +89,11 @@ class LinearizedDrive:
     def moving_mask(self, v_a: Array, include_shared: bool) -> Array:
         """(k + m,) whether states and signals belong to moving joints, or to none if shared."""
         assert self._valve_drive is not None
-        joints = self._valve_drive.circuit.joints
-        moving = {x for x, i in zip(joints, self._active_indices, strict=True) if v_a[i]}
+        moving = {
+            x
+            for x, i in zip(self._valve_drive.circuit.joints, self._active_indices, strict=True)
+            if v_a[i]
+        }
         initial_states = [
             self._joint_of_state[name] in moving
             if name in self._joint_of_state
@@ -132,7 +136,7 @@ class LinearizedDrive:
             bounds.append((least - value, most - value))
 
         for name, pump in self._valve_drive.circuit.pumps.items():
-            top = pump.pressure - self._vapour_pressure
+            top = pump.pressure - self.vapour_pressure
             if pump.control == "pressure":
                 free(f"pressure_{name}", top - 0.5 * pump.droop, top - pump.droop, top)
             elif pump.control == "load-sensing":  # above the guessed loads
@@ -143,37 +147,21 @@ class LinearizedDrive:
                 free(f"pressure_{name}", 0.4 * top, 0.0, np.inf)
             if f"share_{name}" in names:
                 free(f"share_{name}", 0.5, 0.0, 1.0)
-        for name in hydraulics.lines:
-            free(
-                f"pressure_{name}",
-                self.initial_states[names.index(f"pressure_{name}")],
-                0.0,
-                np.inf,
-            )
-        for name in hydraulics.accumulators:
-            free(
-                f"pressure_{name}",
-                self.initial_states[names.index(f"pressure_{name}")],
-                0.0,
-                np.inf,
-            )
+        for name in (*hydraulics.lines, *hydraulics.accumulators):
+            free(f"pressure_{name}", z[names.index(f"pressure_{name}")], 0.0, np.inf)
             if f"oil_{name}" in names:
-                at = names.index(f"oil_{name}")
-                free(f"oil_{name}", self.initial_states[at], -np.inf, np.inf)
+                free(f"oil_{name}", z[names.index(f"oil_{name}")], -np.inf, np.inf)
         if "engine" in names:
             free("engine", 1.0 + 0.5 * self._engine_droop, 1.0, 1.0 + self._engine_droop)
         for i, (joint, valve) in enumerate(hydraulics.valves.items()):
             if not (side := float(np.sign(v_a[self._active_indices[i]]))):
                 continue
-            for at, name in enumerate(names):
-                if name in (f"pressure_{joint}_a", f"pressure_{joint}_b"):
-                    z[at] = max(z[at], 0.3 * supply.pressure)
-                    directions.append(np.eye(len(z))[at])
-                    bounds.append((-z[at], np.inf))
-                    if valve.supply in line_pressure_indices and name.endswith(
-                        "a" if side > 0 else "b"
-                    ):
-                        directions[-1][line_pressure_indices[valve.supply]] = 1.0
+            for name in (f"pressure_{joint}_a", f"pressure_{joint}_b"):
+                free(name, max(z[names.index(name)], 0.3 * supply.pressure), 0.0, np.inf)
+                if valve.supply in line_pressure_indices and name.endswith(
+                    "a" if side > 0 else "b"
+                ):
+                    directions[-1][line_pressure_indices[valve.supply]] = 1.0
             dead_band, open_position = (
                 valve.dead_band,
                 valve.dead_band + share * (1.0 - valve.dead_band),
@@ -192,13 +180,6 @@ class LinearizedDrive:
             bounds.append((dead_band + _MIN_OPENING - open_position, 1.0 - open_position))
         lower, upper = np.array(bounds).T
         return z, np.array(directions).T, lower, upper
-
-    @property
-    def pressure_offsets(self) -> Array:
-        """(k,) offsets that make pressure states absolute."""
-        return np.array(
-            [self._vapour_pressure * name.startswith("pressure_") for name in self.state_units]
-        )
 
     def _build_program(self, machine: Machine) -> Program:
         control, n, k, m = (
@@ -225,10 +206,10 @@ class LinearizedDrive:
             [*states, *integrals],
             settings,
             initial_inputs,
-            _unavailable_dynamics,
-            _unavailable_dynamics,
+            raise_undetermined,
+            raise_undetermined,
         )
-        tau, rates = control.trace(inputs)
+        tau, rates = control.law(inputs)
         output_units = [*control.channel_values(inputs), *(tau[i] for i in self._active_indices)]
         if friction := control.circuit_friction(inputs):
             tau = subtract_vectors(tau, self._friction_forces(machine, friction, v_a))
@@ -262,8 +243,9 @@ class LinearizedDrive:
         forces = JointForces(machine)
         for column, force in zip(forces.circuit_friction_columns, circuit_friction, strict=True):
             i = machine.active.index(machine.joints[column])
-            sticks = column in forces.sticking
-            out[i] = force * friction_sign(forces.table[column].tolist(), v_a[i], sticks, False)
+            out[i] = force * friction_sign(
+                forces.table[column].tolist(), v_a[i], column in forces.sticking, False
+            )
         return out
 
     def evaluate(
@@ -281,7 +263,3 @@ class LinearizedDrive:
         self._program.call("formula", np.concatenate([q_a, v_a, states, inputs]), settings, out)
         values, jacobian = out[layout["values"]], out[layout["slopes"]]
         return values, jacobian.reshape(len(values), -1)
-
-
-def _unavailable_dynamics(a_a: Sequence[Scalar] = (), friction: bool = False) -> list[Scalar]:
-    raise AssertionError("signals that are given do not ask for forces")

@@ -118,8 +118,13 @@ class LinearModel(Result):
             largest = moved[at] / units[at]
             if abs(largest) > 1e-12 * np.abs(vector).max():
                 moved = moved / largest
-            damping = (0.0 - pole.real) / size if size else 0.0
-            mode = Mode(complex(pole), size / (2 * np.pi), float(damping), moved, vector)
+            mode = Mode(
+                complex(pole),
+                size / (2 * np.pi),
+                float((0.0 - pole.real) / size if size else 0.0),
+                moved,
+                vector,
+            )
             found.append(mode)
         return tuple(sorted(found, key=lambda mode: (mode.frequency, mode.pole.imag)))
 
@@ -128,8 +133,9 @@ class LinearModel(Result):
         frequencies = np.asarray(frequencies, dtype=np.float64)
         eye, found = np.eye(len(self.A)), []
         for frequency in frequencies:
-            resolvent = np.linalg.solve(2j * np.pi * frequency * eye - self.A, self.B)
-            found.append(self.C @ resolvent + self.D)
+            found.append(
+                self.C @ np.linalg.solve(2j * np.pi * frequency * eye - self.A, self.B) + self.D
+            )
         return np.array(found)
 
     def simulate(self, times: ArrayLike, start: ArrayLike, inputs: ArrayLike) -> Array:
@@ -146,8 +152,10 @@ class LinearModel(Result):
         start, u = as_sample(start, k, "start", self.states), as_sample(inputs, m, "inputs")
         whole = np.zeros((k + m, k + m))
         whole[:k, :k], whole[:k, k:] = self.A, self.B
-        first = np.concatenate([start, u])
-        rows = [expm(whole * time) @ first for time in np.asarray(times, dtype=np.float64)]
+        rows = [
+            expm(whole * time) @ np.concatenate([start, u])
+            for time in np.asarray(times, dtype=np.float64)
+        ]
         return np.array([self.C @ row[:k] + self.D @ u for row in rows])
 
     def dominant_state(self, mode: Mode) -> str:
@@ -241,8 +249,9 @@ class LinearModel(Result):
         """
         control = import_optional_library("control", "to_control")
         names = {"states": self.states, "inputs": self.inputs, "outputs": self.outputs}
-        lists = {key: list(value) for key, value in names.items()}
-        return control.StateSpace(self.A, self.B, self.C, self.D, **lists)
+        return control.StateSpace(
+            self.A, self.B, self.C, self.D, **{key: list(value) for key, value in names.items()}
+        )
 
     def save(self, path: str | Path) -> Path:
         """Write matrices, names and operating point as .mat (MATLAB, Octave) or .npz.

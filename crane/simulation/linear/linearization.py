@@ -154,10 +154,13 @@ def linearize(
     gamma = machine.closure.gamma(q)
     states = {joint: machine.unit(joint) for joint in machine.active}
     states |= {f"{joint}_velocity": machine.unit(joint) + "/s" for joint in machine.active}
-    output_rows = _OutputRows(
-        machine, linearized_drive, q, gamma, (q_a, v_a), (values, drive_jacobian)
+    c, d, y, units = _select_outputs(
+        machine, linearized_drive, q, gamma, (q_a, v_a), (values, drive_jacobian), outputs
     )
-    c, d, y, units = output_rows.select_outputs(outputs)
+    pressure_offsets = [
+        linearized_drive.vapour_pressure * name.startswith("pressure_")
+        for name in linearized_drive.state_units
+    ]
     acceleration = dynamics.forward(q_a, v_a, tau, friction=True)
     return LinearModel(
         A=a,
@@ -168,7 +171,7 @@ def linearize(
         inputs=tuple(linearized_drive.input_units),
         outputs=tuple(units),
         units=states | linearized_drive.state_units | linearized_drive.input_units | units,
-        x=np.concatenate([q_a, v_a, drive_states + linearized_drive.pressure_offsets]),
+        x=np.concatenate([q_a, v_a, drive_states + pressure_offsets]),
         u=u,
         y=y,
         rate=np.concatenate([v_a, acceleration, values[n : n + k]]),
@@ -237,8 +240,16 @@ def linear_models(
     return found
 
 
-class _OutputRows:
-    """Rows of C and D by name.
+def _select_outputs(
+    machine: Machine,
+    drive: LinearizedDrive,
+    q: Array,
+    gamma: Array,
+    motion: tuple[Array, Array],
+    drive_values: tuple[Array, Array],
+    names: Sequence[str] | None,
+) -> tuple[Array, Array, Array, dict[str, str]]:
+    """C, D, y and units of outputs.
 
     Args:
         machine: The machine.
@@ -247,68 +258,43 @@ class _OutputRows:
         gamma: (nq, n) dq/dq_A.
         motion: q_A and v_A.
         drive_values: Values and derivatives of the drive, see `LinearizedDrive.evaluate`.
+        names: Names of outputs, see `linearize`.
+
+    Raises:
+        InputError: An unknown name.
     """
-
-    def __init__(
-        self,
-        machine: Machine,
-        drive: LinearizedDrive,
-        q: Array,
-        gamma: Array,
-        motion: tuple[Array, Array],
-        drive_values: tuple[Array, Array],
-    ):
-        n, k, m = len(machine.active), len(drive.state_units), len(drive.input_units)
-        self._size = 2 * n + k
-        self._rows: dict[str, tuple[Array, float, str]] = {}
-        width = self._size + m
-        for column, joint in enumerate(machine.joints):
-            row = np.zeros(width)
-            row[:n] = gamma[column]
-            self._rows[joint] = row, float(q[column]), machine.unit(joint)
-        for i, joint in enumerate(machine.active):
-            name, unit = f"{joint}_velocity", machine.unit(joint) + "/s"
-            self._rows[name] = np.eye(width)[n + i], float(motion[1][i]), unit
-        self.default_names = list(machine.active)
-        if machine.tip is not None:
-            kinematics = Kinematics(machine)
-            jacobian, place = (
-                kinematics.jacobian(motion[0]),
-                kinematics.position_at_configuration(q),
-            )
-            for axis, along, value in zip("xyz", jacobian, place, strict=True):
-                row = np.zeros(width)
-                row[:n] = along
-                self._rows[f"tip_{axis}"] = row, float(value), "m"
-                self.default_names.append(f"tip_{axis}")
-        values, slopes = drive_values
-        if drive.state_units:
-            seen = zip(drive.output_units.items(), values[n + k :], slopes[n + k :], strict=True)
-            for (name, unit), value, row in seen:
-                self._rows[name] = row, float(value), unit
-            self.default_names += [
-                name for name in drive.state_units if name.startswith("pressure_")
-            ]
-        else:
-            for i, (name, unit) in enumerate(drive.input_units.items()):
-                self._rows[name] = np.eye(width)[self._size + i], 0.0, unit
-
-    def select_outputs(
-        self, names: Sequence[str] | None
-    ) -> tuple[Array, Array, Array, dict[str, str]]:
-        """C, D, y and units of outputs.
-
-        Raises:
-            InputError: An unknown name.
-        """
-        names = self.default_names if names is None else list(names)
-        for name in names:
-            if name not in self._rows:
-                raise InputError(f"output '{name}' is unknown, {suggest_names(self._rows, name)}")
-        rows = np.array([self._rows[name][0] for name in names]).reshape(len(names), -1)
-        y = np.array([self._rows[name][1] for name in names])
-        units = {name: self._rows[name][2] for name in names}
-        return rows[:, : self._size], rows[:, self._size :], y, units
+    n, k, m = len(machine.active), len(drive.state_units), len(drive.input_units)
+    size, eye = 2 * n + k, np.eye(2 * n + k + m)
+    # row of C and D, value, and unit
+    outputs = {
+        joint: (gamma[column] @ eye[:n], q[column], machine.unit(joint))
+        for column, joint in enumerate(machine.joints)
+    }
+    for i, joint in enumerate(machine.active):
+        outputs[f"{joint}_velocity"] = (eye[n + i], motion[1][i], machine.unit(joint) + "/s")
+    default_names = list(machine.active)
+    if machine.tip is not None:
+        kinematics = Kinematics(machine)
+        rows = kinematics.jacobian(motion[0]) @ eye[:n]
+        place = kinematics.position_at_configuration(q)
+        tip = {f"tip_{x}": (*pair, "m") for x, *pair in zip("xyz", rows, place, strict=True)}
+        outputs |= tip
+        default_names += tip
+    values, slopes = drive_values
+    if drive.state_units:
+        seen = zip(drive.output_units.items(), values[n + k :], slopes[n + k :], strict=True)
+        outputs |= {name: (row, value, unit) for (name, unit), value, row in seen}
+        default_names += [name for name in drive.state_units if name.startswith("pressure_")]
+    else:
+        inputs = zip(drive.input_units.items(), eye[size:], strict=True)
+        outputs |= {name: (row, 0.0, unit) for (name, unit), row in inputs}
+    names = default_names if names is None else list(names)
+    for name in names:
+        if name not in outputs:
+            raise InputError(f"output '{name}' is unknown, {suggest_names(outputs, name)}")
+    matrix = np.array([outputs[name][0] for name in names]).reshape(len(names), -1)
+    y = np.array([outputs[name][1] for name in names], dtype=np.float64)
+    return matrix[:, :size], matrix[:, size:], y, {name: outputs[name][2] for name in names}
 
 
 def _values_by_joint(

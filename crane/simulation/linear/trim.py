@@ -105,7 +105,7 @@ class _TrimEquations:
         external_forces: Array,
         include_shared: bool = True,
     ):
-        self._dynamics, self.drive, self._q_a, self.v_a = dynamics, drive, q_a, v_a
+        self._dynamics, self.drive, self.q_a, self.v_a = dynamics, drive, q_a, v_a
         self._external_forces = external_forces
         closure = dynamics.machine.closure
         n, k = len(q_a), len(drive.state_units)
@@ -131,16 +131,11 @@ class _TrimEquations:
         ]
         self.start = np.concatenate([drive.initial_states, drive.initial_inputs])
 
-    def state_rates(self, z: Array) -> Array:
-        """Rates (k,) of the states."""
-        n, k = len(self._q_a), len(self.drive.state_units)
-        return self.drive.evaluate(self._q_a, self.v_a, z[:k], z[k:])[0][n : n + k]
-
     def residual(self, z: Array) -> tuple[Array, Array]:
         """Accelerations and rates in their units, and their derivatives by z."""
-        drive, n, k = self.drive, len(self._q_a), len(self.drive.state_units)
-        values, drive_jacobian = drive.evaluate(self._q_a, self.v_a, z[:k], z[k:])
-        state = self._q_a, self.v_a, values[:n] + self._external_forces
+        drive, n, k = self.drive, len(self.q_a), len(self.drive.state_units)
+        values, drive_jacobian = drive.evaluate(self.q_a, self.v_a, z[:k], z[k:])
+        state = self.q_a, self.v_a, values[:n] + self._external_forces
         a_a = self._dynamics.forward(*state, friction=True)
         found = self._dynamics.derivatives("forward", *state, friction=True, by=["tau_a"])
         variable_derivatives = drive_jacobian[:, 2 * n :]
@@ -165,25 +160,22 @@ class _TrimEquations:
             residual, jacobian = self.residual(z)
             if np.abs(residual).max() < _RESIDUAL_TOLERANCE:
                 return z
-            rows = (jacobian * self._variable_scales)[:, free]
-            step = np.linalg.lstsq(rows, residual, rcond=1e-10)[0]
+            step = np.linalg.lstsq(
+                (jacobian * self._variable_scales)[:, free], residual, rcond=1e-10
+            )[0]
             if not np.isfinite(step).all():
                 return None
             direction = np.zeros(len(z))
             direction[free] = step * self._variable_scales[free]
-            share = 1.0
+            share, size = 1.0, np.linalg.norm(residual)
             while (
                 damped
                 and share > _MIN_STEP_SHARE
-                and not self._reduces_residual(z - share * direction, residual)
+                and not np.linalg.norm(self.residual(z - share * direction)[0]) < size
             ):
                 share *= 0.5
             z -= share * direction
         return None
-
-    def _reduces_residual(self, z: Array, residual: Array) -> bool:
-        """Whether the residual is smaller at another z."""
-        return bool(np.linalg.norm(self.residual(z)[0]) < np.linalg.norm(residual))
 
     def search_from_opening(self, share: float) -> Array:
         """The best z from valves that are open by a share of their stroke, and stay open."""
@@ -198,8 +190,9 @@ class _TrimEquations:
             return self.residual(z + directions @ x)[1] @ directions
 
         scales = 1.0 / (np.abs(directions) / self._variable_scales[:, None]).max(axis=0)
-        start = np.zeros(len(lower))
-        solution = least_squares(residual, start, derivatives, (lower, upper), x_scale=scales)
+        solution = least_squares(
+            residual, np.zeros(len(lower)), derivatives, (lower, upper), x_scale=scales
+        )
         return z + directions @ solution.x
 
 
@@ -219,7 +212,9 @@ def _trim_valves(trim: _TrimEquations) -> tuple[Array, Array] | None:
     )
     if trimmed_values is None:
         return None
-    rates = np.abs(trim.state_rates(trimmed_values))
+    states, inputs = trimmed_values[:k], trimmed_values[k:]
+    values, _ = drive.evaluate(trim.q_a, trim.v_a, states, inputs)
+    rates = np.abs(values[len(trim.q_a) : len(trim.q_a) + k])
     worst = int(np.argmax(np.where(rates > 1e-3 * drive.scales, rates / drive.scales, 0.0)))
     if rates[worst] > _PRESSURE_SCALE * _RESIDUAL_TOLERANCE:
         name, unit = list(drive.state_units.items())[worst]
@@ -229,4 +224,4 @@ def _trim_valves(trim: _TrimEquations) -> tuple[Array, Array] | None:
             CraneWarning,
             stacklevel=4,
         )
-    return trimmed_values[:k], trimmed_values[k:]
+    return states, inputs

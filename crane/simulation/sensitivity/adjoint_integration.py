@@ -20,10 +20,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from crane.closure.constraint_structure import Indices
+from crane.closure.coordinates import Indices
 from crane.common.samples import Array
 from crane.simulation.sensitivity.rate_derivatives import ForwardDerivatives, ReverseDerivatives
-from crane.simulation.sensitivity.rate_formulas import report_long_formulas
 from crane.simulation.sensitivity.simulated_motion import (
     MAX_REFINEMENTS,
     MotionNodes,
@@ -36,7 +35,7 @@ from crane.simulation.sensitivity.variational_integration import (
     FOURTH_DIFFERENCE_WEIGHTS,
     MIN_RELATIVE_CHANGE,
     STEP_ACCURACY,
-    TransposedPairMaps,
+    TransposedMap,
     interpolation_errors,
     transposed_pair_maps,
 )
@@ -76,11 +75,8 @@ class AdjointIntegrator:
             outputs,
         )
         no_changes = SimulationConstants(*(np.zeros(part.shape[-1]) for part in nominal_constants))
-        with report_long_formulas(motion.chart.machine):
-            self._forward_derivatives, self._reverse_derivatives = (
-                ForwardDerivatives(*of, no_changes),
-                ReverseDerivatives(*of, changes),
-            )
+        self._forward_derivatives = ForwardDerivatives(*of, no_changes)
+        self._reverse_derivatives = ReverseDerivatives(*of, changes)
         self._variable_indices = [np.flatnonzero(part) for part in changes[:4]]
         self._change_sizes = np.concatenate([np.abs(part[part != 0]) for part in changes[:4]])
         self._zero_directions = SimulationConstants(
@@ -123,8 +119,11 @@ class AdjointIntegrator:
         out = SimulationConstants(
             *(np.zeros((len(start), part.shape[-1])) for part in self._nominal_constants)
         )
-        ends = np.cumsum([len(which) for which in self._variable_indices])[:-1]
-        every = np.split(self._gradient, ends, axis=1)
+        every = np.split(
+            self._gradient,
+            np.cumsum([len(which) for which in self._variable_indices])[:-1],
+            axis=1,
+        )
         for part, which, found in zip(out[:4], self._variable_indices, every, strict=True):
             part[:, which] = found
         return out._replace(initial_state=start)
@@ -158,13 +157,11 @@ class AdjointIntegrator:
         step_adjoints[-1] = adjoint + output_contributions[-1]
         if paired < count:
             self._refine_step(nodes, step_adjoints, output_contributions, count - 1, depth)
-        is_smooth = np.ones(len(transposed_maps.first.transposed_propagation), dtype=bool)
-        self._propagate_backward(
-            nodes, transposed_maps, step_adjoints, output_contributions, is_smooth, depth
-        )
-        contributions = self._gradient_contributions(
-            nodes, transposed_maps, step_adjoints, output_contributions, output_weights, is_smooth
-        )
+        is_smooth = np.ones(len(transposed_maps[0].transposed_propagation), dtype=bool)
+        segment = (
+            nodes, transposed_maps, step_adjoints, output_contributions, output_weights,
+        )  # fmt: skip
+        contributions = self._propagate_backward(*segment, is_smooth, depth)
         self._update_scales(step_adjoints[::2], contributions)
         if depth:
             error_maps = interpolation_errors(by_state[: 2 * paired + 1])
@@ -172,42 +169,52 @@ class AdjointIntegrator:
                 self._needs_refinement(nodes, error_maps, step_adjoints[2 : paired + 1 : 2])
             )
         if not is_smooth.all():
-            self._propagate_backward(
-                nodes, transposed_maps, step_adjoints, output_contributions, is_smooth, depth
-            )
-            contributions = self._gradient_contributions(
-                nodes,
-                transposed_maps,
-                step_adjoints,
-                output_contributions,
-                output_weights,
-                is_smooth,
-            )
+            contributions = self._propagate_backward(*segment, is_smooth, depth)
         self._gradient += contributions.sum(axis=0)
         return step_adjoints[0]
 
     def _propagate_backward(
         self,
         nodes: MotionNodes,
-        transposed_maps: TransposedPairMaps,
+        transposed_maps: tuple[TransposedMap, TransposedMap],
         step_adjoints: Array,
         output_contributions: Array,
+        output_weights: Array,
         is_smooth: Array,
         depth: int,
-    ) -> None:
-        """Lambda (n + 1, K, m) backwards over pairs of steps, divided where not smooth."""
+    ) -> Array:
+        """Lambda (n + 1, K, m) backwards over pairs of steps, divided where not smooth.
+
+        Returns:
+            Contributions (., K, l) of smooth pairs and of outputs to the gradient, at the nodes.
+        """
+        first, both = transposed_maps
         for i in range(len(is_smooth))[::-1]:
             begin, middle, end = 2 * i, 2 * i + 1, 2 * i + 2
             if is_smooth[i]:
                 step_adjoints[begin] = (
-                    step_adjoints[end] @ transposed_maps.both.transposed_propagation[i].T
-                    + output_contributions[middle]
-                    @ transposed_maps.first.transposed_propagation[i].T
+                    step_adjoints[end] @ both.transposed_propagation[i].T
+                    + output_contributions[middle] @ first.transposed_propagation[i].T
                     + output_contributions[begin]
                 )
             else:
                 self._refine_step(nodes, step_adjoints, output_contributions, middle, depth)
                 self._refine_step(nodes, step_adjoints, output_contributions, begin, depth)
+        weights = np.zeros((len(nodes.times), output_weights.shape[1], self._weighted_count))
+        m, pairs = self._forward_derivatives.state_size, 2 * np.arange(len(is_smooth))[is_smooth]
+        for of, behind in (
+            (both, step_adjoints[pairs + 2]),
+            (first, output_contributions[pairs + 1]),
+        ):
+            mu = np.einsum("njab,nkb->njka", of.stage_weights[is_smooth], behind)
+            for j in range(mu.shape[1]):
+                weights[2 * pairs + j, :, :m] += mu[:, j]
+        weights[::2, :, m:-1] = output_weights
+        contributions = np.zeros((*weights.shape[:2], len(self._change_sizes)))
+        some = np.flatnonzero(weights.any(axis=(1, 2)))
+        if len(some):
+            contributions[some] = self._gradients_at_nodes(nodes, some, weights[some])
+        return contributions
 
     def _refine_step(
         self,
@@ -223,32 +230,6 @@ class AdjointIntegrator:
             self._integrate_segment(finer, step_adjoints[step + 1], None, depth - 1)
             + output_contributions[step]
         )
-
-    def _gradient_contributions(
-        self,
-        nodes: MotionNodes,
-        transposed_maps: TransposedPairMaps,
-        step_adjoints: Array,
-        output_contributions: Array,
-        output_weights: Array,
-        is_smooth: Array,
-    ) -> Array:
-        """Contributions (., K, l) of smooth pairs and of outputs to the gradient, at the nodes."""
-        weights = np.zeros((len(nodes.times), output_weights.shape[1], self._weighted_count))
-        m, pairs = self._forward_derivatives.state_size, 2 * np.arange(len(is_smooth))[is_smooth]
-        for of, end in ((transposed_maps.both, pairs + 2), (transposed_maps.first, pairs + 1)):
-            behind = (
-                step_adjoints[end] if of is transposed_maps.both else output_contributions[end]
-            )
-            mu = np.einsum("njab,nkb->njka", of.stage_weights[is_smooth], behind)
-            for j in range(mu.shape[1]):
-                weights[2 * pairs + j, :, :m] += mu[:, j]
-        weights[::2, :, m:-1] = output_weights
-        contributions = np.zeros((*weights.shape[:2], len(self._change_sizes)))
-        some = np.flatnonzero(weights.any(axis=(1, 2)))
-        if len(some):
-            contributions[some] = self._gradients_at_nodes(nodes, some, weights[some])
-        return contributions
 
     @property
     def _weighted_count(self) -> int:
@@ -271,8 +252,11 @@ class AdjointIntegrator:
         np.maximum(of_lambda, np.abs(step_adjoints).max(axis=0), out=of_lambda)
         least = MIN_RELATIVE_CHANGE * (of_lambda * largest).max(axis=1, keepdims=True)
         np.maximum(of_lambda, least / largest, out=of_lambda)
-        gathered = self._gradient + np.cumsum(contributions[::-1], axis=0)
-        np.maximum(of_total, np.abs(gathered).max(axis=0), out=of_total)
+        np.maximum(
+            of_total,
+            np.abs(self._gradient + np.cumsum(contributions[::-1], axis=0)).max(axis=0),
+            out=of_total,
+        )
         np.maximum(of_total, least / self._change_sizes, out=of_total)
 
     def _needs_refinement(
@@ -298,8 +282,10 @@ class AdjointIntegrator:
         for curve, scale in zip(
             (adjoints @ interpolation_errors, by_number), self._largest_values, strict=True
         ):
-            error = np.abs(curve) * nodes.step_sizes[: 2 * count : 2, None, None]
-            rough |= (error > self._accuracy * scale).any(axis=(1, 2))
+            rough |= (
+                (np.abs(curve) * nodes.step_sizes[: 2 * count : 2, None, None])
+                > self._accuracy * scale
+            ).any(axis=(1, 2))
         return rough
 
     def _apply_jump(self, jump: TransitionJump, adjoint: Array) -> Array:

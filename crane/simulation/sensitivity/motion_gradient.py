@@ -71,8 +71,9 @@ class Gradient(OneLineRepr):
     def to_text(self, max_rows: int = 20) -> str:
         """A table in Markdown: the parameters with the largest effects of a change by 1 % on J."""
         slopes, total = np.atleast_2d(self.derivatives), np.atleast_1d(self.functional_value)
-        effects = np.abs(slopes * 0.01 * self.values)
-        order = np.argsort(-effects.max(axis=0), kind="stable")[:max_rows].tolist()
+        order = np.argsort(-np.abs(slopes * 0.01 * self.values).max(axis=0), kind="stable")[
+            :max_rows
+        ].tolist()
         heads = (
             ["J"] if self.functional_value.ndim == 0 else [f"J{i + 1}" for i in range(len(total))]
         )
@@ -153,14 +154,14 @@ def gradient(
         del directions_by_name[name]
     if not directions_by_name:
         raise InputError("no number is named that changes anything, give `by`")
-    sizes = {name: directions.typical_change(name) for name in directions_by_name}
-    changes = _largest_changes(directions_by_name, sizes)
+    changes = _largest_changes(
+        directions_by_name, {name: directions.typical_change(name) for name in directions_by_name}
+    )
     integrator = AdjointIntegrator(
         track, problem.outputs, directions.nominal_constants(track.time), changes
     )
-    parts = track.layout.view(track.rows[::2])
-    recording = problem.record_motion(track.time[::2], parts)
-    observed = _output_values(track.chart.machine, recording, parts, problem.outputs)
+    recording = problem.record_motion(track)
+    observed = _output_values(track.chart.machine, recording, track.parts, problem.outputs)
     total, weights = _functional_and_weights(functional, recording.time, observed)
     gradients = integrator.integrate_backward(weights.reshape(-1, *observed.shape))
     # no parameter changes the references of the controller
@@ -233,8 +234,13 @@ def _output_values(
     for name in outputs:
         joint = name.removesuffix(VELOCITY_SUFFIX)
         if name not in columns and joint in machine.joints:
-            rows = machine.closure.gamma(parts.q)[:, machine.joints.index(joint)]
-            found.append(np.einsum("ni,ni->n", rows, parts.v_a))
+            found.append(
+                np.einsum(
+                    "ni,ni->n",
+                    machine.closure.gamma(parts.q)[:, machine.joints.index(joint)],
+                    parts.v_a,
+                )
+            )
         else:
             found.append(read_simulation(machine, recording, [name])[:, 0])
     return np.column_stack(found)

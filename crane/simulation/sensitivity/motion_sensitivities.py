@@ -9,13 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.codegen import LayoutView
 from crane.common.errors import CraneWarning, InputError, suggest_names
 from crane.common.progress import progress_reporter
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.units import display_unit
-from crane.control.control_law import Controller, TracedController
+from crane.control.control_law import ControlLaw, Controller
 from crane.control.valve_commands import ValveCommand
 from crane.control.valve_drive import ValveDrive
 from crane.description.sensors import (
@@ -33,7 +32,7 @@ from crane.recordings.recording import Recording
 from crane.recordings.timeseries import Table
 from crane.simulation.recorded_run import record_run
 from crane.simulation.sensitivity.rate_formulas import observed_frames
-from crane.simulation.sensitivity.simulated_motion import SimulationProblem
+from crane.simulation.sensitivity.simulated_motion import SimulatedMotion, SimulationProblem
 from crane.simulation.sensitivity.simulation_constants import (
     START_PREFIX,
     ParameterDirections,
@@ -80,27 +79,28 @@ class SensitivityProblem(NamedTuple):
         control = resolve_controller(controller, machine)
         count = count_steps(control, duration, step)
         start = initial_motion(machine, initial, control)
-        is_sampled = isinstance(control, ValveDrive) and control.period
-        if is_sampled or not isinstance(control, TracedController):
+        if (isinstance(control, ValveDrive) and control.period) or not isinstance(
+            control, ControlLaw
+        ):
             raise InputError(
                 "a controller in Python has no formulas, write it as a crane.control.ControlLaw"
             )
         dynamics = Dynamics(machine)
-        names = tuple(_default_outputs(machine) if outputs is None else outputs)
+        if outputs is None:
+            joints = machine.hydraulics.joints if machine.hydraulics is not None else ()
+            outputs = [
+                *machine.active,
+                *[f"pressure_{joint}_{side}" for joint in joints for side in "ab"],
+            ]
+        names = tuple(outputs)
         links = [link for link, _ in observed_frames(machine, names)]
         motion = SimulationProblem(dynamics, control, start, count, step, method, tolerance)
         return cls(motion, names, ParameterDirections(dynamics, control, start, links))
 
-    def record_motion(self, time: Array, parts: LayoutView) -> Recording:
-        """The recording of the motion, from its rows; see `integrate`."""
-        return record_run(
-            self.simulation.dynamics.machine, self.simulation.control, time, parts, ""
-        )
-
-
-def _default_outputs(machine: Machine) -> list[str]:
-    joints = machine.hydraulics.joints if machine.hydraulics is not None else ()
-    return [*machine.active, *(f"pressure_{joint}_{side}" for joint in joints for side in "ab")]
+    def record_motion(self, motion: SimulatedMotion) -> Recording:
+        """The recording of the motion."""
+        machine, control = self.simulation.dynamics.machine, self.simulation.control
+        return record_run(machine, control, motion.time[::2], motion.parts, "")
 
 
 ZERO_TOLERANCE = 1e-9  # of an output, in the unit that it is read in
@@ -257,15 +257,15 @@ def sensitivities(
         parts = zip(*(every[name] for name in parameters), strict=True)
         return directions.nominal_constants(times), SimulationConstants(*map(np.array, parts))
 
-    solution = integrate_sensitivities(
+    motion, derivatives = integrate_sensitivities(
         problem.simulation, problem.outputs, setup, sizes, progress=progress
     )
-    for note in solution.notes:
+    for note in motion.notes:
         warnings.warn(note, CraneWarning, stacklevel=2)
     return Sensitivities(
-        problem.record_motion(solution.time, solution.parts),
+        problem.record_motion(motion),
         problem.outputs,
         tuple(parameters),
         values,
-        solution.derivatives,
+        derivatives,
     )

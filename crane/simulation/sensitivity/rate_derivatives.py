@@ -15,6 +15,7 @@ import numpy as np
 from crane.codegen import Program, Scalar, SymbolicExpression
 from crane.codegen.differentiation import directional_derivative, weighted_gradient
 from crane.common.samples import Array
+from crane.simulation.integration.machine_formulas import AT_REST_SUFFIX
 from crane.simulation.sensitivity.rate_formulas import (
     DifferentiatedFormulas,
     RateProgram,
@@ -46,35 +47,16 @@ class ForwardDerivatives(RateProgram):
             dr/ds and dr/dc (N, m, m + p), and the same of outputs and margin (N, k + 1, m + p).
         """
         m, p, count = self.state_size, len(directions.geometry), len(states)
-        inputs = np.zeros((m + p, m))
-        inputs[:m] = np.eye(m)
-        padded = [
-            np.ascontiguousarray(np.vstack([np.zeros((m, part.shape[1])), part]))
-            for part in (
-                directions.geometry,
-                directions.dynamics_constants,
-                directions.settings,
-                directions.frames,
-            )
-        ]
+        padded = [np.vstack([np.zeros((m, part.shape[1])), part]) for part in directions[:4]]
         references = np.zeros((count, m + p, self._reference_columns))
         references[:, m:] = np.swapaxes(directions.references, 0, 1)
-        width = self._program.formula_outputs("tangent").size
-        out = np.empty((count, m + p, width))
-        self._call(
-            "along",
-            has_joints_at_rest,
+        out = np.empty((count, m + p, self._program.formula_outputs("tangent").size))
+        arrays = (*constants[:5], states, *padded, references, np.eye(m + p, m))
+        self._program.call(
+            "along" + AT_REST_SUFFIX * has_joints_at_rest,
             count,
             m + p,
-            constants.geometry,
-            constants.dynamics_constants,
-            constants.settings,
-            constants.frames,
-            np.ascontiguousarray(constants.references),
-            np.ascontiguousarray(states),
-            *padded,
-            references,
-            inputs,
+            *map(np.ascontiguousarray, arrays),
             out,
         )
         out = np.swapaxes(out, 1, 2)
@@ -84,75 +66,45 @@ class ForwardDerivatives(RateProgram):
         self, program: Program, suffix: str, formulas: DifferentiatedFormulas
     ) -> None:
         """tangent(geometry, numbers, settings, frames, references, state, their changes, ds)."""
-        n, variable, tape, dynamics = (
-            self._mobility,
-            self._variable_constants,
-            formulas.tape,
+        n, variable, tape = self._mobility, self._variable_constants, formulas.tape
+        dynamics, loops = (
             formulas.machine.dynamics_formulas,
+            formulas.machine.dynamics_formulas.loops,
         )
         # the margin of transitions depends on time by the references
-        varying_references = variable.references + bool(self._chart.stick_slip.columns)
-        is_variable = (
-            variable.geometry,
-            variable.dynamics_constants,
-            variable.settings,
-            variable.frames,
-            varying_references,
-        )
+        is_variable = [*variable[:4], variable.references + bool(self._chart.stick_slip.columns)]
         seeds: dict[int, Scalar] = {}
 
-        def seed(array: int, mask: Array) -> None:
-            for i in np.flatnonzero(mask).tolist():
+        def seed(array: int) -> None:
+            for i in np.flatnonzero(is_variable[array]).tolist():
                 seeds[tape.load(array, i).index] = tape.load(6 + array, i)
 
-        seed(0, is_variable[0])
+        seed(0)
         changed = [tape.load_vector(11, part * n, n) for part in range(2)]
-        gap_changes = directional_derivative([row.phi for row in dynamics.loops.rows], seeds)
-        joints = dynamics.loops.active_joints
-        active_rows = {joint: [change] for joint, change in zip(joints, changed[0], strict=True)}
-        moving, _ = dynamics.loops.solve_passive(active_rows, [[-1.0 * x] for x in gap_changes])
+        gap_changes = directional_derivative([row.phi for row in loops.rows], seeds)
+        active_rows = {
+            x: [change] for x, change in zip(loops.active_joints, changed[0], strict=True)
+        }
+        moving, _ = loops.solve_passive(active_rows, [[-1.0 * x] for x in gap_changes])
         seeds |= {operation_index(dynamics.q[i - 1]): change for i, (change,) in moving.items()}
-        seeds |= dict(zip(map(operation_index, dynamics.v_a), changed[1], strict=True))
-        state_changes, parts = (
-            tape.load_vector(11, 2 * n, self._stiff_state_count),
-            formulas.machine.state_parts,
-        )
-        seeds |= dict(
-            zip(
-                map(operation_index, parts.controller[: self._stiff_state_count]),
-                state_changes,
-                strict=True,
-            )
-        )
-        for array, mask in enumerate(is_variable[1:], start=1):
-            seed(array, mask)
+        controller = formulas.machine.state_parts.controller[: self._stiff_state_count]
+        changed.append(tape.load_vector(11, 2 * n, self._stiff_state_count))
+        for values, changes in zip((dynamics.v_a, controller), changed[1:], strict=True):
+            seeds |= dict(zip(map(operation_index, values), changes, strict=True))
+        for array in range(1, 5):
+            seed(array)
         derivatives = directional_derivative(formulas.all_values, seeds)
         for k, (_, factor) in enumerate(formulas.outputs, start=len(formulas.rate)):
             derivatives[k] = factor * derivatives[k]
         program.add_formula("tangent" + suffix, 12, derivatives)
-        sizes = [len(mask) for mask in is_variable[:4]]
-        width, m, columns = len(derivatives), self.state_size, self._reference_columns
-        names = (
-            "geometry", "constants", "settings", "frames", "references", "states",
-            "geometry_changes", "constant_changes", "setting_changes", "frame_changes",
-            "reference_changes", "inputs", "out",
-        )  # fmt: skip
-        counts = ("count", "directions")
-        with program.add_routine("along" + suffix, counts=counts, arrays=names) as r:
-            with r.loop(r.count) as i, r.loop(r.directions) as j:
-                at_both = i * r.directions + j
-                r.call(
-                    "tangent" + suffix, r.geometry, r.constants, r.settings, r.frames,
-                    r.references.row_pointer(i, columns),
-                    r.states.row_pointer(i, self._state_layout.size),
-                    r.geometry_changes.row_pointer(j, sizes[0]),
-                    r.constant_changes.row_pointer(j, sizes[1]),
-                    r.setting_changes.row_pointer(j, sizes[2]),
-                    r.frame_changes.row_pointer(j, sizes[3]),
-                    r.reference_changes.row_pointer(at_both, columns), r.inputs.row_pointer(j, m),
-                    r.out.row_pointer(at_both, width),
-                )  # fmt: skip
-            r.return_value(r.count)
+        names = ("geometry_changes", "constant_changes", "setting_changes", "frame_changes")
+        sizes = (("repetition", len(part)) for part in is_variable)
+        widths = dict(zip(names, sizes, strict=False)) | {
+            "reference_changes": ("both", self._reference_columns),
+            "inputs": ("repetition", self.state_size),
+            "out": ("both", len(derivatives)),
+        }
+        self._add_routine(program, "along" + suffix, "tangent" + suffix, widths)
 
 
 class ReverseDerivatives(RateProgram):
@@ -178,18 +130,11 @@ class ReverseDerivatives(RateProgram):
         """
         count, sum_count, _ = weights.shape
         out = np.empty((count, sum_count, self._program.formula_outputs("cotangent").size))
-        self._call(
-            "against",
-            has_joints_at_rest,
+        self._program.call(
+            "against" + AT_REST_SUFFIX * has_joints_at_rest,
             count,
             sum_count,
-            constants.geometry,
-            constants.dynamics_constants,
-            constants.settings,
-            constants.frames,
-            np.ascontiguousarray(constants.references),
-            np.ascontiguousarray(states),
-            np.ascontiguousarray(weights),
+            *map(np.ascontiguousarray, (*constants[:5], states, weights)),
             out,
         )
         return out
@@ -198,20 +143,10 @@ class ReverseDerivatives(RateProgram):
         self, program: Program, suffix: str, formulas: DifferentiatedFormulas
     ) -> None:
         """cotangent(geometry, numbers, settings, frames, references, state, weights)."""
-        tape, dynamics, variable = (
-            formulas.tape,
-            formulas.machine.dynamics_formulas,
-            self._variable_constants,
-        )
-        is_variable = (
-            variable.geometry,
-            variable.dynamics_constants,
-            variable.settings,
-            variable.frames,
-        )
+        tape, dynamics = formulas.tape, formulas.machine.dynamics_formulas
         numbers = [
             tape.load(array, i)
-            for array, mask in enumerate(is_variable)
+            for array, mask in enumerate(self._variable_constants[:4])
             for i in np.flatnonzero(mask).tolist()
         ]
         weights = tape.load_vector(6, 0, len(formulas.all_values))
@@ -227,30 +162,14 @@ class ReverseDerivatives(RateProgram):
         if loops.rows:
             # q_P depends linearly on the gaps of the loops; their values cancel
             gaps = [tape.load(7, r) for r in range(len(loops.rows))]
-            active_rows: dict[int, list[Scalar]] = {joint: [0.0] for joint in loops.active_joints}
-            moving, _ = loops.solve_passive(active_rows, [[-1.0 * x] for x in gaps])
-            passive_directions = [moving[i][0] for i in loops.passive_joints]
-            z = weighted_gradient(passive_directions, found[len(numbers) :], gaps)
+            moving, _ = loops.solve_passive(
+                {joint: [0.0] for joint in loops.active_joints}, [[-1.0 * x] for x in gaps]
+            )
+            z = weighted_gradient(
+                [moving[i][0] for i in loops.passive_joints], found[len(numbers) :], gaps
+            )
             by_loops = weighted_gradient([row.phi for row in loops.rows], z, numbers)
             out = [one + other for one, other in zip(out, by_loops, strict=True)]
         program.add_formula("cotangent" + suffix, 7, out)
-        names = (
-            "geometry", "constants", "settings", "frames", "references", "states", "weights",
-            "out",
-        )  # fmt: skip
-        counts, width = ("count", "several"), len(out)
-        with program.add_routine("against" + suffix, counts=counts, arrays=names) as r:
-            with r.loop(r.count) as i, r.loop(r.several) as j:
-                at_both = i * r.several + j
-                r.call(
-                    "cotangent" + suffix,
-                    r.geometry,
-                    r.constants,
-                    r.settings,
-                    r.frames,
-                    r.references.row_pointer(i, self._reference_columns),
-                    r.states.row_pointer(i, self._state_layout.size),
-                    r.weights.row_pointer(at_both, len(weights)),
-                    r.out.row_pointer(at_both, width),
-                )
-            r.return_value(r.count)
+        widths = {"weights": ("both", len(weights)), "out": ("both", len(out))}
+        self._add_routine(program, "against" + suffix, "cotangent" + suffix, widths)

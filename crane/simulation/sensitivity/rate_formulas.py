@@ -1,13 +1,11 @@
 """State rate of a simulated machine as formulas of its state and of all its constants."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from crane.closure.kinematics_formulas import FormulaConstants, folding_pattern
-from crane.closure.spatial_vectors import Vector
+from crane.closure.kinematics_formulas import FormulaConstants, Vector, folding_pattern
 from crane.codegen import FormulaTooLongError, Program, Scalar, SymbolicExpression, Tape
 from crane.codegen.differentiation import directional_derivative
 from crane.codegen.symbolic import (
@@ -20,7 +18,7 @@ from crane.codegen.symbolic import (
 )
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.control.control_law import TracedController
+from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
 from crane.description.sensors import FORCE_SUFFIX, INCLINATION_PREFIX, VELOCITY_SUFFIX
 from crane.dynamics.external_forces import reference_counts
@@ -81,14 +79,13 @@ class RateProgram:
         outputs: Names of the outputs.
 
     Raises:
-        FormulaTooLongError: The formulas are too long to be compiled.
-        InputError: An output is unknown.
+        InputError: An output is unknown, or the formulas are too long.
     """
 
     def __init__(
         self,
         chart: Chart,
-        control: TracedController,
+        control: ControlLaw,
         controller_state_count: int,
         stiff_state_count: int,
         outputs: Sequence[str],
@@ -97,31 +94,24 @@ class RateProgram:
         self._chart, self._control, self.outputs = chart, control, tuple(outputs)
         self._stiff_state_count, self._variable_constants = stiff_state_count, variable_constants
         machine = chart.machine
-        self._compiled_closure, self._mobility = (
-            machine.closure.compiled_closure,
-            len(machine.active),
-        )
-        self._state_layout, self.state_size = (
-            state_layout(machine, controller_state_count),
-            2 * self._mobility + stiff_state_count,
-        )
+        self._mobility = len(machine.active)
+        self._state_layout = state_layout(machine, controller_state_count)
+        self.state_size = 2 * self._mobility + stiff_state_count
         self._controller_columns = reference_count(control)
         self._reference_columns = self._controller_columns + sum(
             reference_counts(machine.external_forces)
         )
         self._frames = observed_frames(machine, outputs)
-        self._folded_constants = (
-            np.where(
-                variable_constants.geometry != 0, np.nan, self._compiled_closure.geometry.constants
-            ),
-            np.where(
-                variable_constants.dynamics_constants != 0, np.nan, chart.dynamics.constant_pattern
-            ),
-        )
         # zeros among the settings are features that a circuit does not have
-        self._folded_settings = np.where(
-            variable_constants.settings != 0, np.nan, control.settings
+        constants = (
+            machine.closure.compiled_closure.geometry.constants, chart.dynamics.constant_pattern,
+            control.settings,
+        )  # fmt: skip
+        geometry, dynamics_constants, self._folded_settings = (
+            np.where(is_variable != 0, np.nan, part)
+            for is_variable, part in zip(variable_constants, constants, strict=False)
         )
+        self._folded_constants = geometry, dynamics_constants
         form = controller_formula_key(
             control, self._controller_columns, chart, controller_state_count, True
         )
@@ -134,22 +124,14 @@ class RateProgram:
             self.outputs,
             *self._frames,
             *map(folding_pattern, (*self._folded_constants, self._folded_settings)),
-            *(
-                np.asarray(part != 0).tobytes()
-                for part in (
-                    variable_constants.geometry,
-                    variable_constants.dynamics_constants,
-                    variable_constants.settings,
-                    variable_constants.references,
-                    variable_constants.frames,
-                )
-            ),
+            *(np.asarray(part != 0).tobytes() for part in variable_constants[:5]),
         )
-        if key not in self._compiled_closure.programs:
-            self._compiled_closure.programs[key] = machine_program(
-                machine, control, self._compiled_closure, key, self._build
-            )
-        self._program = self._compiled_closure.programs[key]
+        try:
+            self._program = machine_program(machine, control, key, self._build)
+        except FormulaTooLongError:
+            raise InputError(
+                f"the formulas of '{machine.name}' are too long to differentiate: lock joints"
+            ) from None
 
     def evaluate_rate(
         self, constants: SimulationConstants, state: Array, has_joints_at_rest: bool
@@ -165,18 +147,40 @@ class RateProgram:
         out = np.empty(self.state_size)
         self._program.call(
             "rate" + AT_REST_SUFFIX * has_joints_at_rest,
-            constants.geometry,
-            constants.dynamics_constants,
-            constants.settings,
-            constants.frames,
-            constants.references,
+            *constants[:5],
             state,
             out,
         )
         return out
 
-    def _call(self, routine: str, has_joints_at_rest: bool, *arguments: "int | Array") -> None:
-        self._program.call(routine + AT_REST_SUFFIX * has_joints_at_rest, *arguments)
+    def _add_routine(
+        self, program: Program, name: str, formula: str, widths: Mapping[str, tuple[str, int]]
+    ) -> None:
+        """Add a routine that calls a formula several times for each of some states.
+
+        Args:
+            program: The program.
+            name: Name of the routine.
+            formula: Name of the formula; its first arguments are constants, references, state.
+            widths: Length of the rows of each further array, and what has a row: the "repetition",
+                or "both" that and the state.
+        """
+        constants = ("geometry", "constants", "settings", "frames")
+        widths = {
+            "references": ("state", self._reference_columns),
+            "states": ("state", self._state_layout.size),
+        } | dict(widths)
+        with program.add_routine(
+            name, counts=("count", "repetitions"), arrays=((*constants, *widths))
+        ) as r:
+            with r.loop(r.count) as i, r.loop(r.repetitions) as j:
+                rows = {"state": i, "repetition": j, "both": i * r.repetitions + j}
+                r.call(
+                    formula,
+                    *(getattr(r, x) for x in constants),
+                    *(getattr(r, x).row_pointer(rows[y], n) for x, (y, n) in widths.items()),
+                )
+            r.return_value(r.count)
 
     def _add_derivatives(
         self, program: Program, suffix: str, formulas: DifferentiatedFormulas
@@ -194,32 +198,30 @@ class RateProgram:
     def _trace_formulas(self, with_joints_at_rest: bool) -> DifferentiatedFormulas:
         tape = Tape()
         references = tape.load_vector(4, 0, self._reference_columns)
-        force_references = references[self._controller_columns :]
+        constants = FormulaConstants(tape, 2, self._folded_settings)
         machine = trace_machine(
-            self._chart, tape, self._state_layout, 5, force_references, self._folded_constants
+            self._chart,
+            self._control,
+            tape,
+            self._state_layout,
+            5,
+            references,
+            constants.vector(0, len(self._folded_settings)),
+            self._folded_constants,
         )
-        settings = FormulaConstants(tape, 2, self._folded_settings).vector(
-            0, len(self._folded_settings)
-        )
-        inputs = machine.controller_inputs(settings, references[: self._controller_columns])
-        tau, controller_rate = self._control.trace(inputs)
         channels = (
-            self._control.channel_values(inputs) if isinstance(self._control, ValveDrive) else []
+            self._control.channel_values(machine.inputs)
+            if isinstance(self._control, ValveDrive)
+            else []
         )
-        machine = machine.with_circuit_friction(self._control, inputs)
-        accelerations, dynamics_formulas = (
-            machine.accelerations(tau, with_joints_at_rest),
-            machine.dynamics_formulas,
-        )
-        active = self._chart.machine.closure.active
+        accelerations = machine.accelerations(with_joints_at_rest)
+        coordinate_rates = machine.dynamics_formulas.coordinate_derivatives
         rate = [
-            *(dynamics_formulas.coordinate_derivatives[i] for i in active),
+            *(coordinate_rates[i] for i in self._chart.machine.closure.active),
             *accelerations.a_a,
-            *controller_rate[: self._stiff_state_count],
+            *machine.controller_rate[: self._stiff_state_count],
         ]
-        observed = [
-            self._trace_output(name, machine, tape, tau, channels) for name in self.outputs
-        ]
+        observed = [self._trace_output(name, machine, tape, channels) for name in self.outputs]
         return DifferentiatedFormulas(
             tape, machine, rate, observed, accelerations.transition_margin
         )
@@ -229,7 +231,6 @@ class RateProgram:
         name: str,
         machine: MachineFormulas,
         tape: Tape,
-        tau: Sequence[Scalar],
         channel_formulas: Sequence[Scalar],
     ) -> tuple[Scalar, Scalar]:
         """An output and a factor of its derivative; for names see `sensitivities`."""
@@ -246,40 +247,25 @@ class RateProgram:
             return dynamics.joint_velocities[columns[joint] + 1], 1.0
         joint = name.removesuffix(FORCE_SUFFIX)
         if joint in user_machine.active:
-            return tau[user_machine.active.index(joint)], 1.0
+            return machine.tau[user_machine.active.index(joint)], 1.0
         if isinstance(control, ValveDrive):
             channels = [channel for channel, _ in control.channels]
             if name in channels:
                 return channel_formulas[channels.index(name)], 1.0
         if name in ("kinetic", "potential"):
             return getattr(dynamics, name), 1.0
-        links = [link for link, _ in self._frames]
-        if (
-            not name.startswith((INCLINATION_PREFIX, "tip_"))
-            or observed_frame(user_machine, name) not in links
-        ):
+        links, link = [link for link, _ in self._frames], observed_frame(user_machine, name)
+        if not name.startswith((INCLINATION_PREFIX, "tip_")) or link not in links:
             raise InputError(
                 f"'{name}' is no output of '{user_machine.name}': take joints, forces, channels"
             )
-        place = links.index(observed_frame(user_machine, name))
-        body = self._frames[place][1]
-        numbers = tape.load_vector(3, FRAME_SIZE * place, FRAME_SIZE)
-        return _frame_output(name, machine, body, numbers)
-
-
-@contextmanager
-def report_long_formulas(machine: Machine) -> Iterator[None]:
-    """Report formulas that are too long.
-
-    Raises:
-        InputError: The formulas are too long.
-    """
-    try:
-        yield
-    except FormulaTooLongError:
-        raise InputError(
-            f"the formulas of '{machine.name}' are too long to differentiate: lock joints"
-        ) from None
+        place = links.index(link)
+        return _frame_output(
+            name,
+            machine,
+            self._frames[place][1],
+            tape.load_vector(3, FRAME_SIZE * place, FRAME_SIZE),
+        )
 
 
 def _frame_output(
@@ -296,8 +282,10 @@ def _frame_output(
         return matvec(back, subtract_vectors(place, kinematics.origin[0]))[
             "xyz".index(name[-1])
         ], 1.0
-    axis = matvec(kinematics.rotation[body], frame_constants[3:])
-    height = dot(axis, [row[2] for row in kinematics.rotation[0]])
+    height = dot(
+        matvec(kinematics.rotation[body], frame_constants[3:]),
+        [row[2] for row in kinematics.rotation[0]],
+    )
     flat = apply_function("sqrt", 1.0 - height * height)
     if not name.endswith(VELOCITY_SUFFIX):
         return height, 1.0 / flat
@@ -313,12 +301,8 @@ def _frame_output(
 
 def observed_frame(machine: Machine, name: str) -> str:
     """The link of an output that is a position or inclination."""
-    inclined = name.startswith(INCLINATION_PREFIX)
-    return (
-        name.removeprefix(INCLINATION_PREFIX).removesuffix(VELOCITY_SUFFIX)
-        if inclined
-        else str(machine.tip)
-    )
+    link = name.removeprefix(INCLINATION_PREFIX)
+    return str(machine.tip) if link == name else link.removesuffix(VELOCITY_SUFFIX)
 
 
 def observed_frames(machine: Machine, outputs: Sequence[str]) -> list[tuple[str, int]]:
@@ -332,9 +316,9 @@ def observed_frames(machine: Machine, outputs: Sequence[str]) -> list[tuple[str,
     for name in outputs:
         if name in tips or name.startswith(INCLINATION_PREFIX):
             link = observed_frame(machine, name)
-            frame = machine.model.frames[machine.frame(link)]
-            joint = int(frame.parentJoint)
-            found[link] = machine.coordinates.body_of_joint[joint]
+            found[link] = machine.coordinates.body_of_joint[
+                int(machine.model.frames[machine.frame(link)].parentJoint)
+            ]
     return list(found.items())
 
 

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crane.closure.constraint_structure import Indices
+from crane.closure.coordinates import Indices
 from crane.common.errors import InputError, SimulationError
 from crane.common.samples import Array
-from crane.control.control_law import TracedController
+from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
 from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.external_forces import state_count
@@ -39,7 +39,7 @@ class SimulationProblem(NamedTuple):
     """
 
     dynamics: Dynamics
-    control: TracedController
+    control: ControlLaw
     initial: tuple[Array, Array]
     step_count: int
     step: float
@@ -134,7 +134,7 @@ class SimulatedMotion:
         stiff_state_count: Number of the first ones, on which the rates depend.
         time: (2 N + 1,) instants and the middles between them [s].
         rows: (2 N + 1, .) rows at these times, see `integrate`.
-        layout: Layout of a row.
+        parts: Parts of the rows at the instants.
         notes: Notes for the user about the motion.
         largest_states: (m,) largest values of the minimal state, at least in coordinate units; 1
             for states that are always 0.
@@ -158,8 +158,9 @@ class SimulatedMotion:
             Chart.from_dynamics(dynamics),
             control,
         )
-        compiled = dynamics.backend == "compiled" and machine.has_traceable_forces
-        if not compiled or not isinstance(control, TracedController):
+        if not (dynamics.backend == "compiled" and machine.has_traceable_forces) or not isinstance(
+            control, ControlLaw
+        ):
             raise InputError(
                 f"'{machine.name}' with its controller has no formulas to differentiate: lock "
                 "joints, or write the controller as a Law, and loads as ExternalForce"
@@ -183,15 +184,22 @@ class SimulatedMotion:
             step,
             False,
         )
-        _check_dead_centres(self.chart, time, parts.q)
+        stride = max(1, len(time) // _MAX_CHECKED_SAMPLES)
+        for at, configuration in zip(time[::stride], parts.q[::stride], strict=True):
+            if self.chart.largest_gamma_entry(configuration) > self.chart.chart_limits[0]:
+                raise SimulationError(
+                    f"at t = {at:.4g} s the active coordinates come near a dead centre, where "
+                    "nothing depends on them smoothly: drive other joints, or end before"
+                )
         self.stiff_state_count = (
             control.circuit.stiff_state_count
             if isinstance(control, ValveDrive)
             else self.controller_state_count
         )
-        self.layout = row_layout(machine, control, self.controller_state_count)
-        self.rows = np.hstack([getattr(parts, name) for name in self.layout.parts])
-        self._states = self.rows[:, : self.layout.start_index("tau")]
+        layout = row_layout(machine, control, self.controller_state_count)
+        self.rows = np.hstack([getattr(parts, name) for name in layout.parts])
+        self.parts = layout.view(self.rows[::2])
+        self._states = self.rows[:, : layout.start_index("tau")]
         make = integrator_factory(
             dynamics, control, self.controller_state_count, motion.method, motion.tolerance
         )
@@ -217,11 +225,13 @@ class SimulatedMotion:
         while first < count:
             last = min(first + _STEPS_PER_SEGMENT, count)
             if transition_index < len(transitions):
-                at = int(
-                    (transitions[transition_index].time - self.time[0]) / self._step
-                    + _TIME_TOLERANCE
+                last = min(
+                    last,
+                    int(
+                        (transitions[transition_index].time - self.time[0]) / self._step
+                        + _TIME_TOLERANCE
+                    ),
                 )
-                last = min(last, at)
             if last > first:
                 segments_found.append(RecordedSegment(transition_index, first, last))
                 first = last
@@ -305,8 +315,7 @@ class SimulatedMotion:
 
     def _interpolation_positions(self, times: Array) -> tuple[Indices, Array]:
         before = np.clip(np.searchsorted(self.time, times) - 1, 0, len(self.time) - 2)
-        share = (times - self.time[before]) / (self.time[before + 1] - self.time[before])
-        return before, share
+        return before, (times - self.time[before]) / (self.time[before + 1] - self.time[before])
 
     def constants_at(
         self, constants: SimulationConstants, nodes: MotionNodes
@@ -360,14 +369,3 @@ class SimulatedMotion:
             nodes.states[1].copy(),
             self.has_joints_at_rest,
         )
-
-
-def _check_dead_centres(chart: Chart, time: Array, q: Array) -> None:
-    """Check that configurations (N, nq) are not near dead centres."""
-    stride = max(1, len(q) // _MAX_CHECKED_SAMPLES)
-    for at, configuration in zip(time[::stride], q[::stride], strict=True):
-        if chart.largest_gamma_entry(configuration) > chart.chart_limits[0]:
-            raise SimulationError(
-                f"at t = {at:.4g} s the active coordinates come near a dead centre, where nothing "
-                "depends on them smoothly: drive other joints, or end before"
-            )

@@ -9,11 +9,11 @@ import numpy as np
 from crane.closure.kinematics_formulas import tree_geometry
 from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array
-from crane.control.control_law import TracedController
+from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
 from crane.description.sensors import VELOCITY_SUFFIX
-from crane.dynamics.constant_derivatives import UNIT_OF_ZERO_PARAMETER, ConstantDerivatives
 from crane.dynamics.dynamics import Dynamics
+from crane.dynamics.quantity_evaluator import UNIT_OF_ZERO_PARAMETER, ConstantDerivatives
 from crane.machine.machine import Machine
 from crane.simulation.integration.machine_formulas import reference_samples
 
@@ -52,7 +52,7 @@ class SimulationConstants(NamedTuple):
 
 def simulation_constants_of(
     dynamics: Dynamics,
-    control: TracedController,
+    control: ControlLaw,
     initial: tuple[Array, Array],
     frames: Sequence[str],
     times: Array,
@@ -127,7 +127,7 @@ class ParameterDirections:
     def __init__(
         self,
         dynamics: Dynamics,
-        control: TracedController,
+        control: ControlLaw,
         start: tuple[Array, Array],
         frames: Sequence[str],
     ):

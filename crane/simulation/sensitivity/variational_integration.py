@@ -23,10 +23,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crane.codegen import LayoutView
 from crane.common.samples import Array
 from crane.simulation.sensitivity.rate_derivatives import ForwardDerivatives
-from crane.simulation.sensitivity.rate_formulas import report_long_formulas
 from crane.simulation.sensitivity.simulated_motion import (
     MAX_REFINEMENTS,
     MotionNodes,
@@ -40,18 +38,6 @@ from crane.simulation.sensitivity.simulation_constants import SimulationConstant
 STAGE_WEIGHTS = np.array([[1.0, -2.0, 1.0], [1.0, 2.5, -0.5], [1.0, 4.0, 1.0]]) / 6.0
 
 
-class StepPairMaps(NamedTuple):
-    """Maps of S by n pairs of steps: Phi and Psi (n, m, m + p).
-
-    Attributes:
-        first: Maps of the first step.
-        both: Maps of both steps, extrapolated.
-    """
-
-    first: Array
-    both: Array
-
-
 FOURTH_DIFFERENCE_WEIGHTS = (
     np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 15.0
 )  # see `interpolation_errors`
@@ -62,9 +48,11 @@ def interpolation_errors(values: Array) -> Array:
 
     Fourth differences over 15 of values (4 n + 1, .) at the nodes.
     """
-    count = len(values) - 4
     return sum(
-        (share * values[i : count + i : 4] for i, share in enumerate(FOURTH_DIFFERENCE_WEIGHTS)),
+        (
+            share * values[i : (len(values) - 4) + i : 4]
+            for i, share in enumerate(FOURTH_DIFFERENCE_WEIGHTS)
+        ),
         np.zeros(()),
     )
 
@@ -76,20 +64,16 @@ class TransposedMap(NamedTuple):
     stage_weights: Array
 
 
-class TransposedPairMaps(NamedTuple):
-    """The transpose of `StepPairMaps`, at three nodes of the first step and at five of both."""
-
-    first: TransposedMap
-    both: TransposedMap
-
-
-def step_pair_maps(values: Array, lengths: Array, sizes: Array) -> StepPairMaps:
-    """Maps of pairs of steps.
+def step_pair_maps(values: Array, lengths: Array, sizes: Array) -> tuple[Array, Array]:
+    """Maps Phi and Psi (n, m, m + p) of S by n pairs of steps.
 
     Args:
         values: A and B (4 n + 1, m, m + p) at the nodes.
         lengths: (2 n,) of the steps, those of a pair equal [s].
         sizes: See `step_maps`.
+
+    Returns:
+        Maps of the first step, and of both steps, extrapolated.
     """
     m, count = values.shape[1], len(lengths)
     all_step_maps = np.concatenate(step_maps(*_stage_values(values, lengths), sizes), axis=2)
@@ -100,11 +84,16 @@ def step_pair_maps(values: Array, lengths: Array, sizes: Array) -> StepPairMaps:
     )
     refined = second[..., :m] @ first
     refined[..., m:] += second[..., m:]
-    return StepPairMaps(first, refined + (refined - coarse) / 15.0)
+    return first, refined + (refined - coarse) / 15.0
 
 
-def transposed_pair_maps(by_state: Array, lengths: Array, sizes: Array) -> TransposedPairMaps:
-    """Transposed maps of pairs of steps; see `step_pair_maps`, with A (4 n + 1, m, m)."""
+def transposed_pair_maps(
+    by_state: Array, lengths: Array, sizes: Array
+) -> tuple[TransposedMap, TransposedMap]:
+    """Transposed maps of pairs of steps, at three nodes of the first and at five of both.
+
+    See `step_pair_maps`, with A (4 n + 1, m, m).
+    """
     count = len(lengths)
     back, stages = transposed_step_maps(*_stage_values(by_state, lengths), sizes)
     first, second = (TransposedMap(back[i:count:2], stages[i:count:2]) for i in range(2))
@@ -121,7 +110,7 @@ def transposed_pair_maps(by_state: Array, lengths: Array, sizes: Array) -> Trans
     refined_propagation = (
         16.0 * first.transposed_propagation @ second.transposed_propagation - back[count:]
     ) / 15.0
-    return TransposedPairMaps(first, TransposedMap(refined_propagation, refined_stages))
+    return first, TransposedMap(refined_propagation, refined_stages)
 
 
 def _stage_values(values: Array, lengths: Array) -> tuple[Array, Array]:
@@ -182,22 +171,6 @@ STEP_ACCURACY = 1e-8  # relative error of a step
 MIN_RELATIVE_CHANGE = 1e-6  # least relative change of states by a whole parameter that counts
 
 
-class SensitivitySolution(NamedTuple):
-    """A motion and its sensitivities.
-
-    Attributes:
-        time: (N + 1,) instants [s].
-        parts: Parts of the rows (N + 1, .), see `crane.simulation.simulation_run.integrate`.
-        derivatives: (N + 1, k, p) derivatives of k outputs in p directions.
-        notes: Notes for the user about the motion.
-    """
-
-    time: Array
-    parts: LayoutView
-    derivatives: Array
-    notes: list[str]
-
-
 def integrate_sensitivities(
     motion: SimulationProblem,
     outputs: Sequence[str],
@@ -205,7 +178,7 @@ def integrate_sensitivities(
     typical_changes: Array,
     accuracy: float = STEP_ACCURACY,
     progress: Callable[[float], None] | None = None,
-) -> SensitivitySolution:
+) -> tuple[SimulatedMotion, Array]:
     """Simulate a machine, with derivatives of its outputs along directions.
 
     Args:
@@ -217,62 +190,49 @@ def integrate_sensitivities(
         accuracy: Relative error of a step.
         progress: See `simulate`.
 
+    Returns:
+        The motion, and derivatives (N + 1, k, p) of k outputs in p directions at its instants.
+
     Raises:
         InputError: The machine has no formulas or a floating base, or an output is unknown.
         SimulationError: The motion comes to a dead centre; else as `simulate`.
     """
     track = SimulatedMotion(motion, progress)
-    base, directions = make_constants(track.time)
-    with report_long_formulas(track.chart.machine):
-        tangent = ForwardDerivatives(
-            track.chart,
-            track.control,
-            track.controller_state_count,
-            track.stiff_state_count,
-            outputs,
-            _variable_constants(directions),
-        )
-    scale = MIN_RELATIVE_CHANGE * np.outer(track.largest_states, 1.0 / typical_changes)
-    slopes = _VariationalIntegrator(track, tangent, base, directions, scale, accuracy).integrate()
-    return SensitivitySolution(
-        track.time[::2], track.layout.view(track.rows[::2]), slopes, track.notes
+    integrator = _VariationalIntegrator(
+        track, outputs, *make_constants(track.time), typical_changes, accuracy
     )
-
-
-def _variable_constants(directions: SimulationConstants) -> SimulationConstants:
-    """Constants that change along any of p directions, as 1 or 0."""
-    flat = (np.any(part != 0, axis=tuple(range(part.ndim - 1))) for part in directions)
-    return SimulationConstants(*(part.astype(np.float64) for part in flat))
+    return track, integrator.integrate()
 
 
 class _VariationalIntegrator:
     """Integrator of the variational equations along a recorded motion, segment by segment.
 
     Pairs of steps over which A or B are not smooth, as where a valve opens or a compensator
-    closes, are divided and simulated again.
-
-    Args:
-        motion: The motion.
-        forward_derivatives: Derivatives of the rate.
-        nominal_constants: Constants of the simulation.
-        directions: p directions of them.
-        scale: (m, p) least scales of S.
-        accuracy: See `integrate_sensitivities`.
+    closes, are divided and simulated again. For the arguments see `integrate_sensitivities`.
     """
 
     def __init__(
         self,
         motion: SimulatedMotion,
-        forward_derivatives: ForwardDerivatives,
+        outputs: Sequence[str],
         nominal_constants: SimulationConstants,
         directions: SimulationConstants,
-        scale: Array,
+        typical_changes: Array,
         accuracy: float,
     ):
-        self._motion, self._forward_derivatives = motion, forward_derivatives
+        self._motion, self._accuracy = motion, accuracy
         self._nominal_constants, self._directions = nominal_constants, directions
+        is_variable = (np.any(part != 0, axis=tuple(range(part.ndim - 1))) for part in directions)
+        self._forward_derivatives = ForwardDerivatives(
+            motion.chart,
+            motion.control,
+            motion.controller_state_count,
+            motion.stiff_state_count,
+            outputs,
+            SimulationConstants(*(part.astype(np.float64) for part in is_variable)),
+        )
+        scale = MIN_RELATIVE_CHANGE * np.outer(motion.largest_states, 1.0 / typical_changes)
         self._min_scale = np.maximum(np.abs(directions.initial_state.T), scale)
-        self._accuracy = accuracy
 
     def integrate(self) -> Array:
         """Derivatives (N + 1, k, p) of the outputs."""
@@ -321,14 +281,14 @@ class _VariationalIntegrator:
             self._directional_derivatives(nodes),
         )
         count, paired = len(nodes.step_sizes), len(nodes.step_sizes) // 2 * 2
-        step_maps = step_pair_maps(
+        first_maps, pair_maps = step_pair_maps(
             state_jacobian[: 2 * paired + 1],
             nodes.step_sizes[:paired],
             self._motion.largest_states,
         )
         ends = np.empty((paired // 2 + 1, *sensitivity.shape))
         ends[0] = sensitivity
-        for i, pair in enumerate(step_maps.both):
+        for i, pair in enumerate(pair_maps):
             ends[i + 1] = pair[:, :m] @ ends[i] + pair[:, m:]
         self._min_scale = np.maximum(self._min_scale, np.abs(ends).max(axis=0))
         interpolation_error = interpolation_errors(state_jacobian[: 2 * paired + 1])
@@ -336,15 +296,14 @@ class _VariationalIntegrator:
         error *= nodes.step_sizes[:paired:2, None, None]
         needs_refinement = np.any(error > self._accuracy * self._min_scale, axis=(1, 2))
         step_sensitivities = [sensitivity]
-        for first, pair, finer in zip(
-            step_maps.first, step_maps.both, needs_refinement, strict=True
-        ):
+        for first, pair, finer in zip(first_maps, pair_maps, needs_refinement, strict=True):
             if finer and depth:
                 self._refine_step(nodes, step_sensitivities, depth)
                 self._refine_step(nodes, step_sensitivities, depth)
             else:
-                begin = step_sensitivities[-1]
-                step_sensitivities += [one[:, :m] @ begin + one[:, m:] for one in (first, pair)]
+                step_sensitivities += [
+                    one[:, :m] @ step_sensitivities[-1] + one[:, m:] for one in (first, pair)
+                ]
         if paired < count:
             self._refine_step(nodes, step_sensitivities, depth)
         return np.array(step_sensitivities), output_jacobian

@@ -1,21 +1,29 @@
 """Design optimization: parameters of a machine that are best for measures of it."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.stats import qmc
 
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.common.progress import progress_reporter
+from crane.common.result import Result
 from crane.common.samples import Array, as_count, as_seed
 from crane.formats.machine_loading import MachineVariants
 from crane.machine.machine import Machine
+from crane.ratings.lifting_capacity import Capacity, capacity
 from crane.ratings.rating_rules import Rule, find_rule
+from crane.recordings.timeseries import Table, write_table
 from crane.studies.measures import stroke_measures, task_measures
-from crane.studies.optimization.design_problem import DesignJob, DesignProblem, solve_design_job
-from crane.studies.optimization.design_result import Design, DesignSolution
+from crane.studies.optimization.design_problem import (
+    DesignJob,
+    DesignProblem,
+    DesignSolution,
+    solve_design_job,
+)
 from crane.studies.optimization.measure_expressions import (
     MeasureExpression,
     MeasureFunction,
@@ -30,6 +38,114 @@ from crane.studies.optimization.variant_measures import (
     load_positions,
 )
 from crane.studies.parallel_jobs import check_process_count, compute_jobs, machine_from_files
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Design(Result):
+    """Result of a design optimization.
+
+    Attributes:
+        machine: The machine before the optimization.
+        parameter_names: Parameters that vary.
+        lower: (k,) lower bounds.
+        upper: (k,) upper bounds.
+        objectives: Objectives, "minimise ..." or "maximise ...".
+        requirements: Requirements as given.
+        initial: The machine's own parameters, as a solution.
+        solutions: Solutions of all starts, best first; with several objectives those of the
+            Pareto front, by the first objective.
+        options: Options of the measures.
+    """
+
+    machine: Machine
+    parameter_names: tuple[str, ...]
+    lower: Array
+    upper: Array
+    objectives: tuple[str, ...]
+    requirements: tuple[str, ...]
+    initial: DesignSolution
+    solutions: tuple[DesignSolution, ...]
+    options: MeasureOptions
+
+    def _one_line(self) -> str:
+        values = ", ".join(f"{x:.6g}" for x in self.solutions[0].objectives)
+        return f"Design of {self.machine.name} for {'; '.join(self.objectives)}: {values}"
+
+    def parameter_changes(self, k: int = 0) -> dict[str, float]:
+        """Return the parameters of a solution by name, as `crane.load` takes them."""
+        return {
+            **self.machine.parameter_changes,
+            **dict(zip(self.parameter_names, self.solutions[k].values.tolist(), strict=True)),
+        }
+
+    def variant(self, k: int = 0) -> Machine:
+        """Return the machine of a solution."""
+        return MachineVariants(self.machine).machine(self.parameter_changes(k))
+
+    def capacity_charts(self, k: int = 0) -> tuple[Capacity, Capacity] | None:
+        """Return load charts before and with a solution; None if no objective is a load."""
+        if not any("load(" in text for text in (*self.objectives, *self.requirements)):
+            return None
+        initial_chart, optimized_chart = (
+            capacity(machine, self.options.frame, rule=self.options.rule)
+            for machine in (self.machine, self.variant(k))
+        )
+        return initial_chart, optimized_chart
+
+    def to_markdown(self) -> str:
+        """Return parameters and objectives before and after, and a table of all solutions."""
+        best = self.solutions[0]
+        labels = [f"`{name}`" for name in self.parameter_names]
+        slack_labels = [f"slack of {x}" for x in self.requirements]
+        compared = (
+            *zip(labels, self.initial.values, best.values, strict=True),
+            *zip(self.objectives, self.initial.objectives, best.objectives, strict=True),
+            *zip(slack_labels, self.initial.slacks, best.slacks, strict=True),
+        )
+        lines = [
+            f"# Design of {self.machine.name}\n",
+            *(f"- {objective}" for objective in self.objectives),
+            *(f"- require {text}" for text in self.requirements),
+            "",
+            "| | before | after |",
+            "| --- | ---: | ---: |",
+            *(f"| {title} | {before:.6g} | {after:.6g} |" for title, before, after in compared),
+        ]
+        ends = zip(self.parameter_names, best.values, self.lower, self.upper, strict=True)
+        at_bounds = [name for name, x, a, b in ends if min(x - a, b - x) < 1e-6 * (b - a)]
+        if at_bounds:
+            lines.append(f"\nAt a bound of their range: {', '.join(at_bounds)}.")
+        order = "Pareto front" if len(self.objectives) > 1 else "best first, by start"
+        columns = [*self.objectives, *labels]
+        lines += [
+            "",
+            f"{len(self.solutions)} solutions, {order}:",
+            "",
+            f"| {' | '.join([*columns, 'requirements', 'termination'])} |",
+            f"| {' | '.join(['---:'] * len(columns) + ['---'] * 2)} |",
+        ]
+        for x in self.solutions:
+            cells = [f"{value:.6g}" for value in (*x.objectives, *x.values)]
+            cells += ["hold" if x.is_feasible else "fail", x.message]
+            lines.append(f"| {' | '.join(cells)} |")
+        return "\n".join([*lines, ""])
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write one row per solution: parameters, objectives, slacks, feasibility.
+
+        Raises:
+            OutputError: The file cannot be written.
+        """
+        units = {name: "1" for name in self.parameter_names}
+        units |= {f"goal_{i}": "1" for i in range(len(self.objectives))}
+        units |= {f"slack_{i}": "1" for i in range(len(self.requirements))} | {"fits": "1"}
+        rows = [
+            [*x.values, *x.objectives, *x.slacks, float(x.is_feasible)] for x in self.solutions
+        ]
+        notes = {"machine": self.machine.load_expression}
+        notes |= {f"goal_{i}": text for i, text in enumerate(self.objectives)}
+        notes |= {f"slack_{i}": text for i, text in enumerate(self.requirements)}
+        write_table(path, Table(units, np.array(rows), notes))
 
 
 def design(
@@ -93,10 +209,7 @@ def design(
     names, lower, upper = ranges = _parameter_ranges(base_machine, vary)
     chosen_tasks = tuple(base_machine.tasks if tasks is None else tasks)
     for task in chosen_tasks:
-        if task not in base_machine.tasks:
-            raise InputError(
-                f"task '{task}' is unknown, {suggest_names(base_machine.tasks, task)}"
-            )
+        check_name(task, base_machine.tasks, f"task '{task}' is unknown")
     options = MeasureOptions(frame, find_rule(rule), chosen_tasks, load_user_measures(measures))
     base_job = _base_job(base_machine, name, ranges, objectives, require, options, measures)
     initial_values = np.array([MachineVariants(base_machine).values[x] for x in names])
@@ -107,10 +220,10 @@ def design(
     total = starts * len(objectives) + (points if is_multi_objective else 0)
 
     def solve_jobs(jobs: Sequence[DesignJob], finished: int) -> list[DesignSolution]:
-        results = compute_jobs(solve_design_job, jobs, processes, scheduler)
-        return _collect_results(
-            results, lambda done: progress and progress((finished + done) / total)
-        )
+        return compute_jobs(
+            solve_design_job, jobs, processes, scheduler,
+            lambda done: progress and progress((finished + done) / total),
+        )  # fmt: skip
 
     solutions = solve_jobs(
         [
@@ -140,8 +253,8 @@ def design(
         upper,
         tuple(f"{sense} {text}" for sense, text in objectives),
         tuple(x.strip() for x in require),
-        _restore_signs(initial_solution, signs),
-        tuple(_restore_signs(x, signs) for x in solutions),
+        replace(initial_solution, objectives=signs * initial_solution.objectives),
+        tuple(replace(x, objectives=signs * x.objectives) for x in solutions),
         options,
     )
 
@@ -168,10 +281,7 @@ def _base_job(
         tuple(x if sense == "minimise" else f"-({x})" for sense, x in objectives),
         tuple(x.text for x, _ in requirements),
         tuple(equal for _, equal in requirements),
-        options.frame,
-        options.rule,
-        options.tasks,
-        transferable_measures(measures),
+        replace(options, user_measures=transferable_measures(measures)),
         np.zeros(len(ranges[0])),
     )
 
@@ -193,30 +303,27 @@ def _check_feasible(solutions: Sequence[DesignSolution], require: Sequence[str])
 def _check_names(
     machine: Machine, expressions: Sequence[MeasureExpression], options: MeasureOptions
 ) -> None:
-    """Check that all names of expressions are measures or parameters."""
     known_measures = available_measures(machine, options.user_measures)
     values = MachineVariants(machine).values
 
-    def check_name(name: str) -> float:
-        if name not in known_measures and name not in values:
-            raise InputError(f"measure '{name}' is unknown, {suggest_names(known_measures, name)}")
+    def check(name: str) -> float:
+        if name not in values:
+            check_name(name, known_measures, f"measure '{name}' is unknown")
         return 1.0
 
     load_positions(expressions)
     for expression in expressions:
-        expression(check_name, lambda name, arguments: 1.0)
+        expression(check, lambda name, arguments: 1.0)
 
 
 def _parameter_ranges(
     machine: Machine, vary: Mapping[str, tuple[float, float]]
 ) -> tuple[tuple[str, ...], Array, Array]:
-    """Return the names, the lower and the upper bounds."""
     if not vary:
         raise InputError("nothing varies, name parameters and their ranges")
     values = MachineVariants(machine).values
     for name, interval in vary.items():
-        if name not in values:
-            raise InputError(f"parameter '{name}' is unknown, {suggest_names(values, name)}")
+        check_name(name, values, f"parameter '{name}' is unknown")
         try:
             bounds = np.array(interval, dtype=float).ravel()
         except (TypeError, ValueError):
@@ -225,15 +332,6 @@ def _parameter_ranges(
             raise InputError(f"'{name}' has no range, give its lower and upper end")
     lower, upper = np.array([np.ravel(ends) for ends in vary.values()], dtype=float).T
     return tuple(vary), lower, upper
-
-
-def _collect_results(results: Iterable[tuple[int, Any]], report: Any) -> list[DesignSolution]:
-    """Return results in the order of their jobs; report how many are finished."""
-    solutions: dict[int, DesignSolution] = {}
-    for index, solution in results:
-        solutions[index] = solution
-        report(len(solutions))
-    return [solutions[i] for i in sorted(solutions)]
 
 
 def _pareto_front_jobs(
@@ -269,7 +367,6 @@ def _pareto_front_jobs(
 
 
 def _simplex_weights(objective_count: int, point_count: int) -> Array:
-    """Return weights (points, objectives) over their simplex."""
     if objective_count == 2:
         first_weights = np.linspace(0.0, 1.0, point_count + 2)[1:-1]
         return np.column_stack([first_weights, 1.0 - first_weights])
@@ -292,10 +389,3 @@ def _nondominated(solutions: Sequence[DesignSolution]) -> list[DesignSolution]:
         if not is_dominated:
             kept_indices.append(i)
     return [solutions[i] for i in kept_indices]
-
-
-def _restore_signs(x: DesignSolution, signs: Array) -> DesignSolution:
-    """Return a solution with the signs of the original objectives."""
-    return DesignSolution(
-        x.initial_values, x.values, signs * x.objectives, x.slacks, x.is_feasible, x.message
-    )

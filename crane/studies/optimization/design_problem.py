@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 from zlib import crc32
 
@@ -9,10 +10,9 @@ import numpy as np
 from scipy.optimize import minimize
 
 from crane.common.errors import CraneError, CraneWarning, InputError
+from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.formats.machine_loading import MachineVariants, load
-from crane.ratings.rating_rules import Rule
-from crane.studies.optimization.design_result import DesignSolution
 from crane.studies.optimization.measure_expressions import (
     DualNumber,
     MeasureExpression,
@@ -31,6 +31,27 @@ _MAX_START_DRAWS = 50  # draws of a start, until a machine can be assembled
 _INFEASIBLE_COST = 1e3  # cost of a variant that cannot be assembled, in scales of the objective
 
 
+@dataclass(frozen=True, eq=False)
+class DesignSolution(OneLineRepr):
+    """Solution of one search.
+
+    Attributes:
+        initial_values: (k,) parameters at the start.
+        values: (k,) parameters at the end.
+        objectives: (m,) values of the objectives, with the signs of their expressions.
+        slacks: (r,) slack of each requirement, -|A - B| for "A == B"; it fails below 0.
+        is_feasible: Whether all requirements hold.
+        message: Termination message.
+    """
+
+    initial_values: Array
+    values: Array
+    objectives: Array
+    slacks: Array
+    is_feasible: bool
+    message: str
+
+
 class DesignJob(NamedTuple):
     """Everything that one search depends on, independent of the process.
 
@@ -44,10 +65,7 @@ class DesignJob(NamedTuple):
         objectives: Expressions to minimize.
         requirements: Expressions that must not be negative.
         is_equality: Whether each of them has to be 0.
-        frame: See `MeasureOptions`.
-        rule: See `MeasureOptions`.
-        tasks: See `MeasureOptions`.
-        user_measures: Path of a file of user measures, or functions by name.
+        options: Options of the measures.
         initial_values: (k,) start.
         weights: (m,) weights of several objectives.
         ideal_objectives: (m,) smallest values of several objectives.
@@ -63,10 +81,7 @@ class DesignJob(NamedTuple):
     objectives: tuple[str, ...]
     requirements: tuple[str, ...]
     is_equality: tuple[bool, ...]
-    frame: str | None
-    rule: str | Rule
-    tasks: tuple[str, ...]
-    user_measures: Any
+    options: MeasureOptions
     initial_values: Array
     weights: Array | None = None
     ideal_objectives: Array | None = None
@@ -83,9 +98,8 @@ class DesignProblem:
         self.job, self._variants = job, MachineVariants(machine)
         self.objectives = [MeasureExpression(text) for text in job.objectives]
         self.requirements = [MeasureExpression(text) for text in job.requirements]
-        self._options = MeasureOptions(
-            job.frame, job.rule, job.tasks, load_user_measures(job.user_measures)
-        )
+        functions = load_user_measures(job.options.user_measures)
+        self._options = replace(job.options, user_measures=functions)
         self._load_positions = load_positions([*self.objectives, *self.requirements])
         self._last_evaluation: VariantEvaluation | None = None
         self._last_outcome: tuple[bytes, list[DualNumber] | CraneError] = b"", []
@@ -135,12 +149,17 @@ class DesignProblem:
                 np.full(len(self.requirements), -np.inf), False, str(error),
             )  # fmt: skip
         slacks = np.array([x.value for x in duals[count:]])
-        is_equality = np.array(self.job.is_equality, dtype=bool)
-        slacks = np.where(is_equality, -np.abs(slacks), slacks)
+        slacks = np.where(np.array(self.job.is_equality, dtype=bool), -np.abs(slacks), slacks)
         tolerances = _REQUIREMENT_TOLERANCE * np.array(self.scales(duals[count:], 0.0))
         objectives = np.array([x.value for x in duals[:count]])
-        is_feasible = bool((slacks >= -tolerances).all())
-        return DesignSolution(initial_values, values, objectives, slacks, is_feasible, message)
+        return DesignSolution(
+            initial_values,
+            values,
+            objectives,
+            slacks,
+            bool((slacks >= -tolerances).all()),
+            message,
+        )
 
     def with_all_objectives(self, solution: DesignSolution) -> DesignSolution:
         """Return a solution with the values of all objectives."""

@@ -4,8 +4,10 @@ import ast
 import importlib.util
 import inspect
 import math
+import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,60 +30,35 @@ class DualNumber:
     value: float
     derivatives: Array
 
-    def __add__(self, other: "DualNumber | float") -> "DualNumber":
-        second = self._as_dual(other)
-        return DualNumber(self.value + second.value, self.derivatives + second.derivatives)
-
-    __radd__ = __add__
+    def __add__(self, other: "DualNumber") -> "DualNumber":
+        return DualNumber(self.value + other.value, self.derivatives + other.derivatives)
 
     def __neg__(self) -> "DualNumber":
         return DualNumber(-self.value, -self.derivatives)
 
-    def __pos__(self) -> "DualNumber":
-        return self
+    def __sub__(self, other: "DualNumber") -> "DualNumber":
+        return self + -other
 
-    def __sub__(self, other: "DualNumber | float") -> "DualNumber":
-        return self + -self._as_dual(other)
+    def __mul__(self, other: "DualNumber") -> "DualNumber":
+        return DualNumber(
+            self.value * other.value,
+            self.value * other.derivatives + other.value * self.derivatives,
+        )
 
-    def __rsub__(self, other: "DualNumber | float") -> "DualNumber":
-        return self._as_dual(other) - self
+    def __truediv__(self, other: "DualNumber") -> "DualNumber":
+        value = self.value / other.value
+        return DualNumber(value, (self.derivatives - value * other.derivatives) / other.value)
 
-    def __mul__(self, other: "DualNumber | float") -> "DualNumber":
-        second = self._as_dual(other)
-        derivatives = self.value * second.derivatives + second.value * self.derivatives
-        return DualNumber(self.value * second.value, derivatives)
-
-    __rmul__ = __mul__
-
-    def __truediv__(self, other: "DualNumber | float") -> "DualNumber":
-        second = self._as_dual(other)
-        value = self.value / second.value
-        return DualNumber(value, (self.derivatives - value * second.derivatives) / second.value)
-
-    def __rtruediv__(self, other: "DualNumber | float") -> "DualNumber":
-        return self._as_dual(other) / self
-
-    def __pow__(self, power: "DualNumber | float") -> "DualNumber":
-        if isinstance(power, DualNumber):
-            if power.derivatives.any():
-                return exp(power * log(self))
-            power = power.value
-        value = self.value**power
-        outer_derivative = power * self.value ** (power - 1.0) if power else 0.0
-        return DualNumber(value, outer_derivative * self.derivatives)
-
-    def __rpow__(self, base: float) -> "DualNumber":
-        return self._as_dual(base) ** self
+    def __pow__(self, power: "DualNumber") -> "DualNumber":
+        if power.derivatives.any():
+            return exp(power * log(self))
+        value, exponent = self.value**power.value, power.value
+        if not exponent or not self.derivatives.any():
+            return DualNumber(value, np.zeros_like(self.derivatives))
+        return _apply_chain_rule(self, value, exponent * self.value ** (exponent - 1.0))
 
     def __abs__(self) -> "DualNumber":
         return -self if self.value < 0 else self
-
-    def _as_dual(self, other: "DualNumber | float") -> "DualNumber":
-        return (
-            other
-            if isinstance(other, DualNumber)
-            else DualNumber(other, np.zeros_like(self.derivatives))
-        )
 
 
 def _apply_chain_rule(x: DualNumber, value: float, outer_derivative: float) -> DualNumber:
@@ -120,22 +97,14 @@ def cos(x: DualNumber) -> DualNumber:
 
 def degrees(x: DualNumber) -> DualNumber:
     """Return an angle [rad] in degrees."""
-    return x * (180.0 / math.pi)
-
-
-def minimum(*x: DualNumber) -> DualNumber:
-    """Return the smallest value."""
-    return min(x, key=lambda one: one.value)
-
-
-def maximum(*x: DualNumber) -> DualNumber:
-    """Return the largest value."""
-    return max(x, key=lambda one: one.value)
+    factor = 180.0 / math.pi
+    return _apply_chain_rule(x, x.value * factor, factor)
 
 
 DUAL_FUNCTIONS: dict[str, Callable[..., DualNumber]] = {
-    "sqrt": sqrt, "exp": exp, "log": log, "sin": sin, "cos": cos, "degrees": degrees,
-    "min": minimum, "max": maximum, "abs": abs,
+    "sqrt": sqrt, "exp": exp, "log": log, "sin": sin, "cos": cos, "degrees": degrees, "abs": abs,
+    "min": partial(min, key=operator.attrgetter("value")),
+    "max": partial(max, key=operator.attrgetter("value")),
 }  # fmt: skip
 
 
@@ -145,11 +114,11 @@ def constant(value: float, count: int) -> DualNumber:
 
 
 _OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
-    ast.Add: lambda a, b: a + b,
-    ast.Sub: lambda a, b: a - b,
-    ast.Mult: lambda a, b: a * b,
-    ast.Div: lambda a, b: a / b,
-    ast.Pow: lambda a, b: a**b,
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
 }
 _MAX_CONSTANT = 1e100
 _MAX_LENGTH, _MAX_NODES = 2000, 500  # characters, parts
@@ -186,9 +155,6 @@ class MeasureExpression:
             raise InputError(f"an expression has more than {_MAX_NODES} parts, make it shorter")
         self._check_node(self._tree)
 
-    def __repr__(self) -> str:
-        return f"Expression '{self.text}'"
-
     def __call__(
         self,
         evaluate_name: Callable[[str], Any],
@@ -205,40 +171,30 @@ class MeasureExpression:
         Raises:
             InputError: The result is not a number, such as the root of a negative number.
         """
+
+        def evaluate(node: ast.AST) -> Any:
+            match node:
+                case ast.Constant(value=str(word)):
+                    return word
+                case ast.Constant(value=int(number) | float(number)):
+                    return constant(float(number))
+                case ast.UnaryOp(op=op, operand=operand):
+                    value = evaluate(operand)
+                    return -value if isinstance(op, ast.USub) else value
+                case ast.BinOp(left=left, op=op, right=right):
+                    return _OPERATORS[type(op)](evaluate(left), evaluate(right))
+                case ast.Call(func=func, args=args):
+                    return evaluate_call(_dotted_name(func), tuple(map(evaluate, args)))
+            return evaluate_name(_dotted_name(node))
+
         try:
-            result = self._evaluate_node(self._tree, evaluate_name, evaluate_call, constant)
+            result = evaluate(self._tree)
         except (ArithmeticError, ValueError, TypeError) as error:
             raise InputError(f"'{self.text}' has no value: {error}") from None
         value = getattr(result, "value", result)
         if isinstance(value, complex | str):
             raise InputError(f"'{self.text}' has no value: it is {value!r}, no number")
         return result
-
-    def _evaluate_node(
-        self, node: ast.AST, evaluate_name: Any, evaluate_call: Any, constant: Any
-    ) -> Any:
-        match node:
-            case ast.Constant(value=str(word)):
-                return word
-            case ast.Constant(value=int(number) | float(number)):
-                return constant(float(number))
-            case ast.Name() | ast.Attribute():
-                return evaluate_name(_dotted_name(node))
-            case ast.UnaryOp(op=op, operand=operand):
-                value = self._evaluate_node(operand, evaluate_name, evaluate_call, constant)
-                return -value if isinstance(op, ast.USub) else value
-            case ast.BinOp(left=left, op=op, right=right):
-                operands = [
-                    self._evaluate_node(side, evaluate_name, evaluate_call, constant)
-                    for side in (left, right)
-                ]
-                return _OPERATORS[type(op)](*operands)
-            case ast.Call(func=func, args=args):
-                arguments = tuple(
-                    self._evaluate_node(x, evaluate_name, evaluate_call, constant) for x in args
-                )
-                return evaluate_call(_dotted_name(func), arguments)
-        raise AssertionError(node)
 
     def _check_node(self, node: ast.AST) -> None:
         def create_error(what: str) -> InputError:

@@ -1,14 +1,14 @@
 """Measures of a variant of a machine, and their derivatives by the parameters that vary."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
 
-from crane.common.errors import CraneError, InputError, suggest_names
+from crane.common.errors import CraneError, InputError, check_name
 from crane.common.samples import Array
 from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.statics import StaticsEvaluator
@@ -51,13 +51,14 @@ class MeasureOptions:
         frame: Link at which loads hang; the tip if None.
         rule: Rating rule of `load` and `net_torque`.
         tasks: Tasks of peak_JOINT and similar measures.
-        user_measures: Functions of the user by name.
+        user_measures: Functions of the user by name, or until they are loaded the Python file that
+            defines them.
     """
 
     frame: str | None = None
     rule: str | Rule = "none"
     tasks: tuple[str, ...] = ()
-    user_measures: Mapping[str, MeasureFunction] = field(default_factory=dict)
+    user_measures: Any = field(default_factory=dict)
 
 
 class VariantEvaluation:
@@ -91,39 +92,17 @@ class VariantEvaluation:
         self._values = values
         self._ranges, self._options, self._load_positions = ranges, options, list(load_positions)
         self.machine = variants.machine(dict(zip(parameter_names, values.tolist(), strict=True)))
-        self._measure_cache: dict[tuple[Any, ...], float] = {}
         self._loads: dict[tuple[bool, tuple[float, ...]], DualNumber] = {}
-        self._neighbours: dict[tuple[int, float], VariantEvaluation] = {}
-        self._extremes: dict[tuple[Any, ...], tuple[float, Array]] = {}
+        self._measure, self._extreme = cache(self._compute_measure), cache(self._find_extreme)
+        self._perturbed = cache(self._create_neighbour)
 
     def evaluate(self, expression: MeasureExpression) -> float:
         """Return the value of an expression."""
-        return float(expression(self._evaluate_name, self._evaluate_call))
+        return _evaluate(expression, lambda *call: constant(self._measure(*call), 0), 0).value
 
     def evaluate_dual(self, expression: MeasureExpression) -> DualNumber:
         """Return the value of an expression with its derivatives."""
-        count = len(self._parameter_names)
-
-        def dual_of_name(name: str) -> DualNumber:
-            return self._dual_measure(name, ())
-
-        def dual_of_call(name: str, arguments: tuple[Any, ...]) -> DualNumber:
-            if name in DUAL_FUNCTIONS:
-                return DUAL_FUNCTIONS[name](*arguments)
-            plain_arguments = [x.value if isinstance(x, DualNumber) else x for x in arguments]
-            return self._dual_measure(name, tuple(plain_arguments))
-
-        result = expression(dual_of_name, dual_of_call, lambda x: constant(x, count))
-        return result if isinstance(result, DualNumber) else constant(float(result), count)
-
-    def _evaluate_name(self, name: str) -> float:
-        return self._measure(name, ())
-
-    def _evaluate_call(self, name: str, arguments: tuple[Any, ...]) -> float:
-        if name in DUAL_FUNCTIONS:
-            dual_arguments = [constant(x, 0) for x in arguments]
-            return DUAL_FUNCTIONS[name](*dual_arguments).value
-        return self._measure(name, arguments)
+        return _evaluate(expression, self._dual_measure, len(self._parameter_names))
 
     def _dual_measure(self, name: str, arguments: tuple[Any, ...]) -> DualNumber:
         if name == "load":
@@ -165,26 +144,13 @@ class VariantEvaluation:
             out[i] = (upper_value - lower_value) / ((upper_sign - lower_sign) * step)
         return out
 
-    def _perturbed(self, parameter_index: int, step: float) -> "VariantEvaluation":
-        key = parameter_index, step
-        if key not in self._neighbours:
-            values = self._values.copy()
-            values[parameter_index] += step
-            self._neighbours[key] = VariantEvaluation(
-                self._variants,
-                self._parameter_names,
-                values,
-                self._ranges,
-                self._options,
-                self._load_positions,
-            )
-        return self._neighbours[key]
-
-    def _measure(self, name: str, arguments: tuple[Any, ...]) -> float:
-        key = name, *arguments
-        if key not in self._measure_cache:
-            self._measure_cache[key] = float(self._compute_measure(name, arguments))
-        return self._measure_cache[key]
+    def _create_neighbour(self, parameter_index: int, step: float) -> "VariantEvaluation":
+        values = self._values.copy()
+        values[parameter_index] += step
+        return VariantEvaluation(
+            self._variants, self._parameter_names, values, self._ranges, self._options,
+            self._load_positions,
+        )  # fmt: skip
 
     def _compute_measure(self, name: str, arguments: tuple[Any, ...]) -> float:
         machine = self.machine
@@ -215,14 +181,13 @@ class VariantEvaluation:
         return self._parameter_value(name)
 
     def _parameter_value(self, name: str) -> float:
-        if name in self._parameter_names:
-            return float(self._values[self._parameter_names.index(name)])
-        if name in self._variants.values:
-            return float(self._variants.values[name])
-        raise InputError(
-            f"measure '{name}' is unknown, "
-            f"{suggest_names(available_measures(self.machine, self._options.user_measures), name)}"
+        values = self._variants.values | dict(
+            zip(self._parameter_names, self._values, strict=True)
         )
+        if name not in values:
+            known = available_measures(self.machine, self._options.user_measures)
+            check_name(name, known, f"measure '{name}' is unknown")
+        return float(values[name])
 
     @cached_property
     def _statics(self) -> StaticsEvaluator:
@@ -290,13 +255,6 @@ class VariantEvaluation:
                     load_derivatives = self._differences("load", position)
             self._loads[with_derivatives, position] = DualNumber(float(loads[s]), load_derivatives)
 
-    def _extreme(self, name: str, arguments: tuple[Any, ...]) -> tuple[float, Array]:
-        """Return the extreme reach, height or distance of the tip, and its configuration."""
-        key = name, *arguments
-        if key not in self._extremes:
-            self._extremes[key] = self._find_extreme(name, arguments)
-        return self._extremes[key]
-
     def _extreme_objective(
         self, name: str, arguments: tuple[Any, ...], tip: Array
     ) -> tuple[Array, Array]:
@@ -315,7 +273,10 @@ class VariantEvaluation:
         return -length, -horizontal / np.maximum(length, 1e-300)[:, None]
 
     def _find_extreme(self, name: str, arguments: tuple[Any, ...]) -> tuple[float, Array]:
-        """Search from the best configurations over all strokes, with exact derivatives."""
+        """Return the extreme reach, height or distance of the tip, and its configuration.
+
+        It is searched from the best configurations over all strokes, with exact derivatives.
+        """
         search, closure = self._configuration_search, self.machine.closure
         strokes = search.moving
         columns = closure.active[strokes]
@@ -366,6 +327,24 @@ class VariantEvaluation:
         return np.asarray(sign * gradient[0] @ tip_derivatives)
 
 
+def _evaluate(
+    expression: MeasureExpression,
+    measure: Callable[[str, tuple[Any, ...]], DualNumber],
+    derivative_count: int,
+) -> DualNumber:
+    """Return an expression of measures, each a function of its name and arguments."""
+
+    def call(name: str, arguments: tuple[Any, ...]) -> DualNumber:
+        if name in DUAL_FUNCTIONS:
+            return DUAL_FUNCTIONS[name](*arguments)
+        return measure(name, tuple(getattr(x, "value", x) for x in arguments))
+
+    result: DualNumber = expression(
+        lambda name: measure(name, ()), call, lambda x: constant(x, derivative_count)
+    )
+    return result
+
+
 def available_measures(
     machine: Machine, user_measures: Mapping[str, MeasureFunction]
 ) -> dict[str, str]:
@@ -410,12 +389,7 @@ def load_positions(expressions: Sequence[MeasureExpression]) -> list[tuple[float
 
 
 def _check_call(name: str, arguments: tuple[Any, ...]) -> None:
-    """Check that a function exists and takes these arguments."""
-    if name not in DUAL_FUNCTIONS and name not in _ARGUMENT_COUNTS:
-        raise InputError(
-            f"function '{name}' is unknown, "
-            f"{suggest_names([*_ARGUMENT_COUNTS, *DUAL_FUNCTIONS], name)}"
-        )
+    check_name(name, [*_ARGUMENT_COUNTS, *DUAL_FUNCTIONS], f"function '{name}' is unknown")
     text_arguments = [x for x in arguments if isinstance(x, str)]
     if text_arguments and name != "number":
         raise InputError(f"'{name}' takes numbers, not '{text_arguments[0]}'")

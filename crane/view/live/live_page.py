@@ -51,8 +51,12 @@ def readout_html(
     for i, joint in enumerate(machine.active):
         unit = FORCE_UNITS[machine.unit(joint)]
         forces = [readout.gravity[i], *([] if recorded_forces is None else [recorded_forces[i]])]
-        is_free = joint in machine.free
-        rows.append([joint, *("free" if is_free else format_quantity(x, unit) for x in forces)])
+        rows.append(
+            [
+                joint,
+                *("free" if (joint in machine.free) else format_quantity(x, unit) for x in forces),
+            ]
+        )
     parts = [_html_table(headings, rows)]
     if readout.tip is not None:
         x, y, z = (f"{round(1e3 * value, 1) + 0.0:.1f}" for value in readout.tip)
@@ -142,9 +146,12 @@ class LivePage:
                 machine.active, session.lower, session.upper, session.posture.q_a, strict=True
             ):
                 unit, scale = DISPLAY_UNITS[machine.unit(joint)]
-                label = f"{joint} [{unit}]"
                 self._add_slider(
-                    f"joint {joint}", label, scale * lower, scale * upper, scale * value
+                    f"joint {joint}",
+                    f"{joint} [{unit}]",
+                    scale * lower,
+                    scale * upper,
+                    scale * value,
                 )
             self._add_button(_HOME_KEY, "Home")
         if machine.tip is not None:
@@ -180,8 +187,7 @@ class LivePage:
         """Process requests; of several requests of one widget only the last."""
         for key, value in dict(pending_requests).items():
             try:
-                readout = self._process_request(key, value)
-                self._update_widgets(readout)
+                self._update_widgets(self._process_request(key, value))
             except Exception as error:  # one window's mistake does not end it for the others
                 message = str(error) if isinstance(error, CraneError) else f"not done: {error!r}"
                 self._warning_html.content = warning_html(message)
@@ -202,9 +208,8 @@ class LivePage:
             slider = self._sliders[key]
             value = float(np.clip(value, slider.min, slider.max))
         if key == _LOAD_KEY:
-            readout = session.set_payload(value)
             self._scene.show_payload()
-            return readout
+            return session.set_payload(value)
         if key == _TIME_KEY:
             return self._seek(value)
         if key == _PLAY_KEY:

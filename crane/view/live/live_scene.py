@@ -15,8 +15,7 @@ from crane.formats.visuals.urdf_shapes import (
     Visual,
 )
 from crane.view.live.live_session import Session, round_up_to_nice
-from crane.view.page.machine_visuals import read_visuals
-from crane.view.page.scene import ground_height
+from crane.view.page.scene import ground_height, read_visuals
 
 _CAMERA_DIRECTION = np.array(
     [0.55, -1.0, 0.45]
@@ -53,8 +52,7 @@ class LiveScene:
 
     def update_poses(self) -> None:
         """Update the poses of all links from the session."""
-        poses = self._session.link_poses(self._links)
-        for frame, pose in zip(self._frames, poses, strict=True):
+        for frame, pose in zip(self._frames, self._session.link_poses(self._links), strict=True):
             x, y, z, w = pin.Quaternion(pose[:3, :3]).coeffs()
             frame.position = pose[:3, 3]
             frame.wxyz = np.array([w, x, y, z])

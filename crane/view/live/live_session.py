@@ -148,8 +148,9 @@ class Session:
         )
         self.lower = np.where(np.isfinite(machine.lower), machine.lower, home - default_ranges)
         self.upper = np.where(np.isfinite(machine.upper), machine.upper, home + default_ranges)
-        mass = sum(inertia.mass for inertia in list(machine.model.inertias)[1:])
-        self.max_payload = round_up_to_nice(mass / 2)
+        self.max_payload = round_up_to_nice(
+            sum(inertia.mass for inertia in list(machine.model.inertias)[1:]) / 2
+        )
         self.posture = self._compute_readout(machine.home)
 
     def move(self, joint: str, value: float) -> Readout:
@@ -208,8 +209,9 @@ class Session:
         The machine does not move if the loops cannot be closed there.
         """
         try:
-            q = self.machine.closure.solve(q_a, initial_guess=self.posture.configuration)
-            self.posture = self._compute_readout(q)
+            self.posture = self._compute_readout(
+                self.machine.closure.solve(q_a, initial_guess=self.posture.configuration)
+            )
         except ClosureError as error:
             self.posture = replace(self.posture, refusal=str(error))
         return self.posture
@@ -227,8 +229,9 @@ class Session:
         """
         if self.machine.tip is None:
             raise InputError(f"machine '{self.machine.name}' has no tip to hang a load on")
-        loaded = self.machine.with_payload(Payload(self.machine.tip, mass))
-        self._dynamics = Dynamics(loaded, backend="pinocchio")
+        self._dynamics = Dynamics(
+            self.machine.with_payload(Payload(self.machine.tip, mass)), backend="pinocchio"
+        )
         self.payload_mass = float(mass)
         self.posture = replace(
             self._compute_readout(self.posture.configuration), refusal=self.posture.refusal
@@ -243,8 +246,9 @@ class Session:
             self.posture.configuration
         )
         pin.framesForwardKinematics(model, data, pinocchio_configuration)
-        frames = [self.machine.frame(link) for link in links]
-        return np.array([data.oMf[i].homogeneous for i in frames]).reshape(-1, 4, 4)
+        return np.array(
+            [data.oMf[i].homogeneous for i in [self.machine.frame(link) for link in links]]
+        ).reshape(-1, 4, 4)
 
     def tip_positions(self, q: Array) -> Array:
         """Return tip positions (N, 3) [m] at closed configurations (N, nq); (0, 3) if no tip."""
@@ -322,9 +326,14 @@ class Session:
         left_singular_vectors, singular_values, _ = np.linalg.svd(
             equations.evaluate_scaled(q)[1][rows][:, closure.passive]
         )
-        shares = np.bincount(equations.loop_of_row[rows], left_singular_vectors[:, -1] ** 2)
         condition = singular_values[0] / singular_values[-1] if singular_values[-1] > 0 else np.inf
-        return float(condition), equations.names[int(shares.argmax())]
+        return float(condition), equations.names[
+            int(
+                np.bincount(
+                    equations.loop_of_row[rows], left_singular_vectors[:, -1] ** 2
+                ).argmax()
+            )
+        ]
 
 
 def round_up_to_nice(value: float) -> float:

@@ -15,7 +15,7 @@ from crane.ratings.capacity_report import capacity_facts, slew_labels
 from crane.ratings.drive_force_limits import drive_force_limits
 from crane.ratings.lifting_capacity import Capacity
 from crane.view.page.html_document import check_page_suffix, write_page
-from crane.view.plots.capacity_figure import (
+from crane.view.plots.rating_figures import (
     capacity_heading,
     drawing_extent,
     factor_colours,
@@ -48,13 +48,15 @@ def write_capacity_page(chart: Capacity, path: str | Path) -> Path:
         (assets / f"capacity.{kind}").read_text(encoding="utf-8") for kind in ("css", "js", "html")
     )
     data = json.dumps(capacity_page_data(chart), separators=(",", ":"), allow_nan=False)
-    text = Template(template).substitute(
-        title=escape(capacity_heading(chart)),
-        style=style,
-        script=script,
-        data=data.replace("</", "<\\/"),
+    return write_page(
+        path,
+        Template(template).substitute(
+            title=escape(capacity_heading(chart)),
+            style=style,
+            script=script,
+            data=data.replace("</", "<\\/"),
+        ),
     )
-    return write_page(path, text)
 
 
 def capacity_page_data(chart: Capacity) -> dict[str, Any]:
@@ -66,18 +68,7 @@ def capacity_page_data(chart: Capacity) -> dict[str, Any]:
         drive.joint: drive.chamber_pressures
         for drive in drive_force_limits(machine, chart.raising_joints)
     }
-    drives = [
-        {
-            "joint": joint,
-            "unit": _reading_unit(machine.unit(joint))[0],
-            "limits": [_rounded_or_none(1e-5 * x) for x in limits.get(joint, ())],
-        }
-        for joint in machine.active
-    ]
     shapes: dict[str, int] = {}
-    standing_outlines = [
-        _round_points(home_outline.stationary_hull, unit) for home_outline in home_outlines(chart)
-    ]
     return {
         "facts": capacity_facts(chart),
         "names": chart.section.coordinate_names,
@@ -88,8 +79,18 @@ def capacity_page_data(chart: Capacity) -> dict[str, Any]:
         "step": [_cell_stride(chart) * _smallest_spacing(x) for x in (chart.radii, chart.heights)],
         "causes": [str(cause) for cause in chart.limiting_factors],
         "tints": factor_colours(chart),
-        "drives": drives,
-        "standing": standing_outlines,
+        "drives": [
+            {
+                "joint": joint,
+                "unit": _reading_unit(machine.unit(joint))[0],
+                "limits": [_rounded_or_none(1e-5 * x) for x in limits.get(joint, ())],
+            }
+            for joint in machine.active
+        ],
+        "standing": [
+            _round_points(home_outline.stationary_hull, unit)
+            for home_outline in home_outlines(chart)
+        ],
         "cells": [_cell_rows(chart, k, pressures, unit, shapes) for k in range(len(chart.slews))],
         "contours": [_contour_rows(chart, k, unit) for k in range(len(chart.slews))],
         "shapes": [json.loads(shape) for shape in shapes],
@@ -116,12 +117,6 @@ def _cell_rows(
         shape_index = shapes.setdefault(
             json.dumps(_outline_shape(configuration_outline, unit)), len(shapes)
         )
-        pressure_rows = [
-            [_rounded_or_none(1e-5 * x) for x in pressures[joint][k, i, j]]
-            if joint in pressures
-            else []
-            for joint in machine.active
-        ]
         out.append(
             [
                 _rounded_or_none(chart.radii[j]),
@@ -130,7 +125,12 @@ def _cell_rows(
                 int(chart.limiting_factor_index[k, i, j]),
                 [_rounded_or_none(x, _LOAD_DIGITS) for x in chart.values_by_factor[k, i, j]],
                 [_round_to_tenths(x) for x in scales * configuration[active]],
-                pressure_rows,
+                [
+                    [_rounded_or_none(1e-5 * x) for x in pressures[joint][k, i, j]]
+                    if joint in pressures
+                    else []
+                    for joint in machine.active
+                ],
                 shape_index,
             ]
         )

@@ -9,8 +9,8 @@ from crane.description.force_elements import ForceElement, GasSpring
 from crane.dynamics.frame_jacobians import FrameDistances
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
-from crane.view.page.machine_visuals import largest_body_extent
 from crane.view.page.page_motion import frame_data, pack_base64
+from crane.view.page.scene import largest_body_extent
 
 _FULL_ARROW_PERCENTILE = (
     99.5  # percentile of the forces that has a full arrow: a single spike does not count
@@ -41,9 +41,10 @@ def actuator_markers(
     markers = []
     for joint, force in forces.items():
         index, shown_force = model.getJointId(joint) - 1, force[rows]
-        is_prismatic = machine.unit(joint) == "m"
         pin_frames = (
-            [frame for frame in loop_frames if frame["joint"] == index] if is_prismatic else []
+            [frame for frame in loop_frames if frame["joint"] == index]
+            if (machine.unit(joint) == "m")
+            else []
         )
         share = (
             np.where(np.abs(shown_force) > zero_threshold, shown_force, 0.0) / full_arrow[joint]
@@ -74,9 +75,9 @@ def full_arrow_forces(machine: Machine, peaks: dict[str, float]) -> dict[str, fl
     if all(0 < limit < np.inf for limit in limits):
         reference_forces = dict(zip(peaks, map(float, limits), strict=True))
     else:
-        body_length = largest_body_extent(machine)
         reference_forces = {
-            joint: 1.0 if machine.unit(joint) == "m" else body_length for joint in peaks
+            joint: 1.0 if machine.unit(joint) == "m" else largest_body_extent(machine)
+            for joint in peaks
         }
     largest_ratio = (
         max((peak / reference_forces[joint] for joint, peak in peaks.items()), default=0.0) or 1.0
@@ -98,15 +99,24 @@ def load_markers(machine: Machine, recording: Recording, rows: np.ndarray) -> li
     for column in channels:
         name = column.removeprefix("load_").removesuffix("_force_x")
         if column == f"load_{name}_force_x" and name in frames:
-            axes = (channels.get(f"load_{name}_force_{axis}") for axis in "xyz")
-            forces[name] = [np.zeros(len(recording.time)) if x is None else x for x in axes]
+            forces[name] = [
+                np.zeros(len(recording.time)) if x is None else x
+                for x in (channels.get(f"load_{name}_force_{axis}") for axis in "xyz")
+            ]
     for name in machine.supports:
         if f"support_{name}" in channels and name not in forces:
             forces[name] = [np.zeros(len(recording.time))] * 2 + [channels[f"support_{name}"]]
     if not forces:
         return []
-    sizes = [np.linalg.norm(force, axis=0) for force in forces.values()]
-    full_arrow = float(np.percentile(np.maximum.reduce(sizes), _FULL_ARROW_PERCENTILE)) or 1.0
+    full_arrow = (
+        float(
+            np.percentile(
+                np.maximum.reduce([np.linalg.norm(force, axis=0) for force in forces.values()]),
+                _FULL_ARROW_PERCENTILE,
+            )
+        )
+        or 1.0
+    )
     return [
         {
             "name": name, "place": frame_data(machine, frames[name]), "full": full_arrow,

@@ -104,9 +104,15 @@ class ThinningGrid:
                 "time": pack_base64(self.time, "f8"),
                 "rows": pack_base64(self.frame_rows, "u4"),
             }
-        span_ends = np.append(self.span_starts[1:], len(self.time)) - 1
         return {
-            "time": pack_base64((self.time[self.span_starts] + self.time[span_ends]) / 2, "f8"),
+            "time": pack_base64(
+                (
+                    self.time[self.span_starts]
+                    + self.time[(np.append(self.span_starts[1:], len(self.time)) - 1)]
+                )
+                / 2,
+                "f8",
+            ),
             "rows": "",
         }
 
@@ -207,9 +213,8 @@ def page_columns(machine: Machine, recording: Recording) -> Iterator[PageColumn]
     for i, joint in enumerate(recording.joints):
         unit = recording.units[joint]
         is_angle, is_passive = unit == "rad", joint not in machine.active
-        column = machine.column(joint)
         lower, upper = (
-            float(limits[column])
+            float(limits[machine.column(joint)])
             for limits in (machine.coordinates.lower, machine.coordinates.upper)
         )
         group_titles = (
@@ -232,13 +237,12 @@ def page_columns(machine: Machine, recording: Recording) -> Iterator[PageColumn]
             reference(joint),
             (lower, upper),
         )
-        velocity_unit = VELOCITY_UNITS[unit]
         reference_velocity = reference(f"velocity_{joint}")
         yield PageColumn(
             joint + VELOCITY_SUFFIX,
             group_titles[1],
             joint,
-            velocity_unit,
+            VELOCITY_UNITS[unit],
             recording.v[:, i],
             reference_velocity,
         )

@@ -74,8 +74,13 @@ def joint_tree(machine: Machine) -> dict[str, Any]:
                 "lever": model.inertias[i].lever.tolist(),
             }
         )
-    links = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
-    return {"joints": joints, "links": {link: frame_data(machine, link) for link in links}}
+    return {
+        "joints": joints,
+        "links": {
+            link: frame_data(machine, link)
+            for link in [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
+        },
+    }
 
 
 def frame_data(machine: Machine, link: str) -> dict[str, Any]:
@@ -140,8 +145,9 @@ def nearest_frame_rows(time: Array, fps: float) -> np.ndarray:
         time: (N,) increasing times [s].
         fps: Frames per second.
     """
-    frame_times = np.arange(time[0], time[-1], 1 / fps)
-    nearest_rows = np.searchsorted((time[1:] + time[:-1]) / 2, frame_times)
+    nearest_rows = np.searchsorted(
+        (time[1:] + time[:-1]) / 2, np.arange(time[0], time[-1], 1 / fps)
+    )
     return np.unique(np.append(nearest_rows, len(time) - 1))
 
 
@@ -193,8 +199,7 @@ def recorded_configurations(machine: Machine, recording: Recording, rows: np.nda
             column = columns[joint] if joint in columns else recording.channels[joint][rows]
             q[:, machine.column(joint)] = column
     else:
-        q_a = np.column_stack([columns[joint] for joint in machine.active])
-        q = machine.closure.solve(q_a)
+        q = machine.closure.solve(np.column_stack([columns[joint] for joint in machine.active]))
     for joint in machine.joints:
         if not np.isfinite(q[:, machine.column(joint)]).all():
             raise InputError(f"joint '{joint}' is not finite, check the recording")

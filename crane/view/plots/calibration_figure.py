@@ -1,6 +1,5 @@
 """Figures of simulated and measured channels: calibrations, residuals, comparisons."""
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -16,27 +15,27 @@ from crane.identification.calibration.calibration_result import (
 )
 from crane.recordings.recording_summary import result_title
 from crane.simulation.recording_replay import Comparison
-from crane.view.plots.figure_text import envelope, escape_label
-from crane.view.plots.recording_figure import (
+from crane.view.plots.figure_style import (
     DASHED_STYLE,
-    FIGURE_STYLE,
     INK_COLOUR,
     RECORDED_COLOUR,
     add_heading,
+    envelope,
+    escape_label,
+    figure_style,
 )
 
 HELD_OUT_COLOUR = "#f1efe8"
 _MAX_PANELS = 18  # panels
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def calibration_figure(calibration: Calibration) -> Figure:
     """Return a panel per channel; held-out instants have a darker background."""
     sensors = calibration.channels[:_MAX_PANELS]
     columns = 2 if len(sensors) > 1 else 1
     rows = -(-len(sensors) // columns)
-    size = (5.6 * columns, 1.9 * rows + 0.8)
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Figure(figsize=(5.6 * columns, 1.9 * rows + 0.8), layout="constrained")
     has_several_recordings = len({sensor.recording for sensor in sensors}) > 1
     for i, sensor in enumerate(sensors):
         axes = figure.add_subplot(rows, columns, i + 1)
@@ -189,9 +188,9 @@ def comparison_figure(comparison: Comparison) -> Figure:
     stride = -(-len(comparison.time) // _MAX_POINTS)
     time = comparison.time[::stride]
     for axes, channel in zip(panels, comparison.channels, strict=False):
-        channel_values = channel.measured, channel.simulated
         unit, scale = display_unit(
-            channel.unit, max(float(np.abs(x).max()) for x in channel_values)
+            channel.unit,
+            max(float(np.abs(x).max()) for x in (channel.measured, channel.simulated)),
         )
         axes.plot(
             time, scale * channel.measured[::stride], color=RECORDED_COLOUR, label="measured"

@@ -3,7 +3,6 @@
 import textwrap
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -16,14 +15,19 @@ from crane.ratings.capacity_report import (
     table_note,
 )
 from crane.ratings.lifting_capacity import Capacity
-from crane.view.plots.capacity_figure import (
+from crane.view.plots.figure_style import (
+    FAINT_COLOUR,
+    INK_COLOUR,
+    escape_label,
+    escape_text,
+    figure_style,
+)
+from crane.view.plots.rating_figures import (
     capacity_heading,
     draw_capacity_panel,
     drawing_extent,
     factor_colours,
 )
-from crane.view.plots.figure_text import escape_label, escape_text
-from crane.view.plots.recording_figure import FAINT_COLOUR, FIGURE_STYLE, INK_COLOUR
 
 _PAGE_WIDTH, _PAGE_HEIGHT, _PAGE_MARGIN = (
     11.69,
@@ -36,7 +40,7 @@ _FACTS_WIDTH = 3.5  # width of the facts beside the charts [inch]
 _HEADING_HEIGHT = 0.35  # height of the heading [inch]
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def capacity_sheet_figure(chart: Capacity) -> Figure:
     """Return the page as a figure."""
     table = chart.table
@@ -51,8 +55,7 @@ def capacity_sheet_figure(chart: Capacity) -> Figure:
         fontweight="bold",
     )
     _write_text(figure, _PAGE_MARGIN, _PAGE_MARGIN, table_note(chart, table), colour="#555555")
-    table_bottom = _PAGE_MARGIN + 1.6 * _LINE_HEIGHT
-    table_top = _draw_table(figure, chart, table, table_bottom)
+    table_top = _draw_table(figure, chart, table, _PAGE_MARGIN + 1.6 * _LINE_HEIGHT)
     charts_right = _draw_charts(figure, chart, table_top + 0.2, top - _HEADING_HEIGHT)
     _draw_facts(figure, chart, charts_right, top - _HEADING_HEIGHT)
     return figure
@@ -170,27 +173,34 @@ def _draw_table(figure: Figure, chart: Capacity, table: LoadTable, bottom: float
                 colour="#555555",
             )
         y += _LINE_HEIGHT
-    headings = [f"{radius:g} m" for radius in table.radii] + ["farthest"]
-    for j, heading_text in enumerate(headings):
+    for j, heading_text in enumerate([f"{radius:g} m" for radius in table.radii] + ["farthest"]):
         middle = right_edges[slew_count * j : slew_count * (j + 1)].mean() - (
             width / 2 - 0.08 if slew_count > 1 else 0.0
         )
-        side = "center" if slew_count > 1 else "right"
-        _write_text(figure, middle, y, heading_text, size=size, ha=side, fontweight="bold")
+        _write_text(
+            figure,
+            middle,
+            y,
+            heading_text,
+            size=size,
+            ha="center" if slew_count > 1 else "right",
+            fontweight="bold",
+        )
     _write_text(figure, right_edges[-1], y, "at [m]", size=size, ha="right", fontweight="bold")
     return top
 
 
 def _draw_row_band(figure: Figure, y: float, right: float) -> None:
     """Draw a tinted band behind a row."""
-    patch = Rectangle(
-        (_PAGE_MARGIN / _PAGE_WIDTH, y / _PAGE_HEIGHT),
-        (right - _PAGE_MARGIN) / _PAGE_WIDTH,
-        _LINE_HEIGHT / _PAGE_HEIGHT,
-        facecolor=FAINT_COLOUR,
-        alpha=0.45,
-        transform=figure.transFigure,
-        linewidth=0,
-        zorder=-1,
+    figure.add_artist(
+        Rectangle(
+            (_PAGE_MARGIN / _PAGE_WIDTH, y / _PAGE_HEIGHT),
+            (right - _PAGE_MARGIN) / _PAGE_WIDTH,
+            _LINE_HEIGHT / _PAGE_HEIGHT,
+            facecolor=FAINT_COLOUR,
+            alpha=0.45,
+            transform=figure.transFigure,
+            linewidth=0,
+            zorder=-1,
+        )
     )
-    figure.add_artist(patch)

@@ -1,26 +1,31 @@
-"""Figures of identifications: forces, residuals, correlations, cylinder equations."""
+"""Figures of identifications and excitations: forces, residuals, correlations, trajectories."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from crane.common.samples import Array
+from crane.common.units import display_unit
+from crane.identification.excitation.periodic_excitation import Excitation
+from crane.identification.excitation.signal_excitation import SignalExcitation
 from crane.identification.hydraulics.cylinder_friction import CylinderFriction
 from crane.identification.hydraulics.orifice_equations import EquationSides
 from crane.identification.hydraulics.valve_curve import ValveCurve
 from crane.identification.mechanics.force_comparison import ForceComparison
 from crane.identification.mechanics.identification_result import Identification
 from crane.recordings.recording import FORCE_UNITS
-from crane.view.plots.figure_text import envelope, escape_label
-from crane.view.plots.recording_figure import (
+from crane.recordings.recording_summary import DISPLAY_UNITS
+from crane.view.plots.figure_style import (
     DASHED_STYLE,
-    FIGURE_STYLE,
+    FAINT_COLOUR,
     INK_COLOUR,
     RECORDED_COLOUR,
+    envelope,
+    escape_label,
+    figure_style,
 )
 
 _SEGMENT_COUNT = 8  # of a recording, whose periodograms are averaged
@@ -34,8 +39,12 @@ def force_time_figure(
     grid = {"height_ratios": (2, 1), "left": 0.14, "right": 0.985, "top": 0.9, "bottom": 0.13}
     upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={**grid, "hspace": 0.12})
     moving_mask = np.where(comparison.is_moving[:, drive_index], 1.0, np.nan)
-    measured = envelope(comparison.time, comparison.measured[:, drive_index])
-    upper.plot(*measured, color="#9db8d6", linewidth=1.6, label="measured")
+    upper.plot(
+        *envelope(comparison.time, comparison.measured[:, drive_index]),
+        color="#9db8d6",
+        linewidth=1.6,
+        label="measured",
+    )
     upper.plot(
         comparison.time,
         comparison.modelled[:, drive_index] * moving_mask,
@@ -81,9 +90,10 @@ def residual_spectrum_figure(
         moving_residuals = np.where(
             fit.is_moving[:, drive_index], fit.residuals[:, drive_index], 0.0
         )
-        rate = 1 / float(np.median(np.diff(fit.time)))
         frequency, power = welch(
-            moving_residuals, rate, nperseg=-(-len(moving_residuals) // _SEGMENT_COUNT)
+            moving_residuals,
+            1 / float(np.median(np.diff(fit.time))),
+            nperseg=-(-len(moving_residuals) // _SEGMENT_COUNT),
         )
         axes.loglog(frequency[1:], np.sqrt(power[1:]), color=color, linewidth=1.1, label=name)
     axes.set(xlabel="frequency [Hz]", ylabel=f"residual [{unit}/√Hz]")
@@ -109,8 +119,11 @@ def correlation_figure(R: Array, names: Sequence[str]) -> Figure:
     axes.tick_params(length=0)
     axes.grid(False)
     axes.spines[:].set_visible(False)
-    colour_bar_box = ((label_width + size + 0.15) / width, 0.35, 0.12 / width, 0.3)
-    figure.colorbar(image, cax=figure.add_axes(colour_bar_box), ticks=(-1, 0, 1))
+    figure.colorbar(
+        image,
+        cax=figure.add_axes(((label_width + size + 0.15) / width, 0.35, 0.12 / width, 0.3)),
+        ticks=(-1, 0, 1),
+    )
     return figure
 
 
@@ -135,7 +148,7 @@ _DOT_STYLE: Any = {
 _MAX_DOTS = 4000  # dots
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def equation_sides_figure(runs: Mapping[str, EquationSides], unit: str = "m") -> Figure:
     """Return both sides of equation (29) over time, a row per recording.
 
@@ -176,7 +189,7 @@ def equation_sides_figure(runs: Mapping[str, EquationSides], unit: str = "m") ->
     return figure
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def _single_figure(draw: Callable[..., None], *values: object) -> Figure:
     figure = Figure(figsize=(4.6, 3.4), layout="constrained")
     draw(figure.subplots(), *values)
@@ -219,13 +232,94 @@ def draw_friction(axes: Axes, friction: CylinderFriction, unit: str = "m") -> No
         label="steady samples",
         **_DOT_STYLE,
     )
-    extreme_speeds = friction.speed.min(), friction.speed.max()
     lowest_speed = np.abs(friction.speed).min()
-    for direction, extreme_speed in zip((-1, 1), extreme_speeds, strict=True):
+    for direction, extreme_speed in zip(
+        (-1, 1), (friction.speed.min(), friction.speed.max()), strict=True
+    ):
         v = direction * np.geomspace(
             lowest_speed, max(abs(extreme_speed), 1.01 * lowest_speed), 200
         )
-        label = "fit" if direction > 0 else None
-        axes.plot(scale * v, friction.predict(v), label=label, **DASHED_STYLE)
+        axes.plot(
+            scale * v, friction.predict(v), label="fit" if direction > 0 else None, **DASHED_STYLE
+        )
     axes.set(xlabel=f"speed [{text}]", ylabel=f"friction [{force}]")
     axes.legend(loc="upper left", markerscale=2)
+
+
+_MAX_POINTS = 2000  # instants that a line needs
+
+
+@figure_style
+def excitation_figure(excitation: Excitation) -> Figure:
+    """Return the figure of a trajectory; limits are dashed, lead times shaded."""
+    machine, reference, bounds = excitation.machine, excitation.trajectory, excitation.limits
+    time, q, v, _, tau = (x[:: -(-len(x) // _MAX_POINTS)] for x in excitation.motion())
+    leads = (0, reference.lead), (reference.duration - reference.lead, reference.duration)
+    figure, grid = _create_grid(2.4, len(machine.active))
+    for i, joint in enumerate(machine.active):
+        unit, scale = DISPLAY_UNITS[machine.unit(joint)]
+        force_unit, middle = FORCE_UNITS[machine.unit(joint)], bounds.stroke_middle[i]
+        rows = (
+            ("stroke", unit, scale, q, middle, bounds.half_stroke[i]),
+            ("velocity", f"{unit}/s", scale, v, 0.0, bounds.velocity[i]),
+            ("force", force_unit, 1.0, tau, 0.0, bounds.force[i]),
+        )
+        for axes, (name, label, factor, values, centre, limit) in zip(
+            grid[:, i], rows, strict=True
+        ):
+            lines = [(factor * values[:, i], RECORDED_COLOUR)]
+            limits = [factor * (centre - limit), factor * (centre + limit)]
+            _draw_lines(axes, time, lines, limits, f"{name} [{label}]")
+            for lead in leads:
+                axes.axvspan(*lead, color=FAINT_COLOUR, alpha=0.5)
+        grid[0, i].set_title(escape_label(joint))
+    return figure
+
+
+@figure_style
+def signals_figure(excitation: SignalExcitation) -> Figure:
+    """Return the figure of valve signals: signal, stroke with dashed limits, pressures."""
+    run, machine = excitation.run.columns(), excitation.machine
+    bar, per_bar = display_unit("Pa", 1e5)
+    figure, grid = _create_grid(3.0, len(excitation.signals))
+    for i, joint in enumerate(excitation.signals):
+        unit, scale = DISPLAY_UNITS[machine.unit(joint)]
+        index = machine.active.index(joint)
+        limits = scale * machine.lower[index], scale * machine.upper[index]
+        rows = (
+            ("signal [V]", 1.0, [f"voltage_{joint}"], ()),
+            (f"stroke [{unit}]", scale, [joint], limits),
+            (f"pressures A, B [{bar}]", per_bar, [f"pressure_{joint}_{x}" for x in "ab"], ()),
+        )
+        for axes, (label, factor, names, dashed) in zip(grid[:, i], rows, strict=True):
+            colours = zip(names, (RECORDED_COLOUR, "#2a8c4a"), strict=False)
+            lines = [(factor * run[name], colour) for name, colour in colours]
+            _draw_lines(axes, excitation.run.time, lines, dashed, label)
+        grid[0, i].set_title(escape_label(joint))
+    return figure
+
+
+def _create_grid(panel_width: float, columns: int) -> tuple[Figure, Any]:
+    """Return a figure with three rows of panels over time."""
+    figure = Figure(figsize=(panel_width * columns + 0.6, 6.0), layout="constrained")
+    grid = figure.subplots(3, columns, sharex=True, squeeze=False)
+    for axes in grid[-1]:
+        axes.set_xlabel("time [s]")
+    return figure, grid
+
+
+def _draw_lines(
+    axes: Axes,
+    time: Array,
+    lines: Sequence[tuple[Array, str]],
+    limits: Sequence[float],
+    label: str,
+) -> None:
+    """Draw lines (N,) in their colours, and finite limits dashed."""
+    for values, colour in lines:
+        axes.plot(time, values, color=colour)
+    for limit in limits:
+        if np.isfinite(limit):
+            axes.axhline(limit, **DASHED_STYLE)
+    axes.set_ylabel(label)
+    axes.margins(x=0.0)

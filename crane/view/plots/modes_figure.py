@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -12,14 +11,14 @@ from crane.common.samples import Array
 from crane.common.units import display_unit
 from crane.description.machine_lookup import CHANGES_SEPARATOR
 from crane.recordings.recording_summary import DISPLAY_UNITS, result_title
-from crane.simulation.linear import LinearModel, Mode
+from crane.simulation.linear.linear_model import LinearModel, Mode
 from crane.simulation.sensitivity.motion_sensitivities import ZERO_TOLERANCE, Sensitivities
-from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import (
-    FIGURE_STYLE,
+from crane.view.plots.figure_style import (
     INK_COLOUR,
     RECORDED_COLOUR,
     add_heading,
+    escape_label,
+    figure_style,
 )
 
 _CURVE_COLOURS = (
@@ -38,7 +37,7 @@ _MIN_MODAL_ASSURANCE = 0.2  # modal assurance of a mode that goes on
 _MIN_RESPONSE_SHARE = 1e-6  # share of the largest response that is not drawn
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def modes_figure(model: LinearModel) -> Figure:
     """Return poles with dominant states, and a panel of frequency responses per input."""
     frequencies = _frequency_grid(model)
@@ -60,7 +59,7 @@ def modes_figure(model: LinearModel) -> Figure:
     return figure
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def parameter_modes_figure(models: Sequence[tuple[dict[str, float], LinearModel]]) -> Figure:
     """Return frequency and damping over the first parameter; colours for the others."""
     names = list(models[0][0])
@@ -73,12 +72,19 @@ def parameter_modes_figure(models: Sequence[tuple[dict[str, float], LinearModel]
     for color, (family_values, family) in zip(
         _cycle_colours(len(families)), families.items(), strict=True
     ):
-        pairs = zip(names[1:], family_values, strict=True)
-        label_text = ", ".join(f"{name} {value:g}" for name, value in pairs)
+        label_text = ", ".join(
+            f"{name} {value:g}" for name, value in zip(names[1:], family_values, strict=True)
+        )
         family.sort(key=lambda pair: pair[0])
         for k, (x, frequency, damping) in enumerate(_track_modes(family)):
-            label = escape_label(label_text) if label_text and not k else "_"
-            upper.plot(x, frequency, color=color, marker="o", ms=2.5, label=label)
+            upper.plot(
+                x,
+                frequency,
+                color=color,
+                marker="o",
+                ms=2.5,
+                label=escape_label(label_text) if label_text and not k else "_",
+            )
             lower.plot(x, 100 * damping, color=color, marker="o", ms=2.5)
     upper.set(yscale="log", ylabel="frequency [Hz]")
     lower.set_ylabel("damping [%]")
@@ -175,8 +181,9 @@ def _draw_poles(axes: Axes, model: LinearModel) -> None:
     axes.set_xlim(10 ** np.floor(powers.min()), 10 ** (np.floor(powers.max()) + 1))
     axes.set_yscale("symlog", linthresh=1.0)
     axes.set(xlabel="frequency [Hz]", ylabel="damping [%]")
-    lowest = min((100 * mode.damping for mode in drawn_modes), default=0.0)
-    axes.set_ylim(min(0.0, 1.5 * lowest), 200.0)
+    axes.set_ylim(
+        min(0.0, 1.5 * min((100 * mode.damping for mode in drawn_modes), default=0.0)), 200.0
+    )
     zero_count = sum(mode.frequency == 0 for mode in model.modes)
     axes.set_title("poles" + (f" ({zero_count} more at zero)" if zero_count else ""))
 
@@ -194,8 +201,13 @@ def _draw_response(
         joint = model.outputs[i]
         unit, factor = DISPLAY_UNITS[model.machine.unit(joint)]
         if response[:, i].max() > _MIN_RESPONSE_SHARE * response[:, position_outputs].max():
-            label = escape_label(f"{joint} [{unit}/{model.units[model.inputs[input_index]]}]")
-            axes.loglog(frequencies, factor * response[:, i], color=color, lw=1.1, label=label)
+            axes.loglog(
+                frequencies,
+                factor * response[:, i],
+                color=color,
+                lw=1.1,
+                label=escape_label(f"{joint} [{unit}/{model.units[model.inputs[input_index]]}]"),
+            )
     axes.set(title=escape_label(f"per {model.inputs[input_index]}"), xlabel="frequency [Hz]")
     axes.legend(fontsize=6.5)
 
@@ -203,7 +215,7 @@ def _draw_response(
 _MAX_PANELS = 18  # panels
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def sensitivities_figure(sensitivities: Sensitivities) -> Figure:
     """Return a panel per output with nonzero sensitivities, a line per parameter."""
     effects = sensitivities.derivatives * sensitivities.typical_changes
@@ -220,8 +232,12 @@ def sensitivities_figure(sensitivities: Sensitivities) -> Figure:
     for k, (output, unit, values) in enumerate(panels):
         axes = figure.add_subplot(rows, columns, k + 1)
         for i, name in enumerate(sensitivities.parameters):
-            label = escape_label(f"{name} + {sensitivities.typical_changes[i]:.3g}")
-            axes.plot(sensitivities.recording.time, values[:, i], linewidth=1.0, label=label)
+            axes.plot(
+                sensitivities.recording.time,
+                values[:, i],
+                linewidth=1.0,
+                label=escape_label(f"{name} + {sensitivities.typical_changes[i]:.3g}"),
+            )
         axes.set_title(escape_label(f"{output} [{unit}]"), fontsize=8.5)
         if k >= len(panels) - columns:
             axes.set_xlabel("time [s]")

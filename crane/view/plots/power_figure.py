@@ -2,14 +2,13 @@
 
 from collections.abc import Mapping
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from crane.common.samples import Array
 from crane.common.units import display_unit, format_number
-from crane.hydraulics.power_balance import SHAFT_POWER
+from crane.hydraulics.circuit_equations import SHAFT_POWER
 from crane.recordings.recording_summary import result_title
 from crane.studies.power_balance_result import (
     POWER_CLASSES,
@@ -19,8 +18,7 @@ from crane.studies.power_balance_result import (
     part_kind,
     part_owner,
 )
-from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, add_heading
+from crane.view.plots.figure_style import INK_COLOUR, add_heading, escape_label, figure_style
 
 _CLASS_PALETTE = (
     "#2a8c4a", "#9a6b3f", "#1f5fa8", "#6f9bca", "#e0701a", "#b04a7a", "#7a7a7a", "#8a5fb0",
@@ -40,7 +38,7 @@ _OWNER_COLOURS = (
 _MAX_POINTS = 1500  # points of a stack
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def power_figure(balance: PowerBalance) -> Figure:
     """Return the power of the shafts over time, stacked by class and by joint.
 
@@ -70,8 +68,10 @@ def power_figure(balance: PowerBalance) -> Figure:
     for axes in (upper_axes, lower_axes):
         axes.set_ylabel(f"power [{unit}]")
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), reverse=True)
-    heading = result_title(balance.machine_name, f"{balance.task_name} power".strip())
-    add_heading(figure, escape_label(heading))
+    add_heading(
+        figure,
+        escape_label(result_title(balance.machine_name, f"{balance.task_name} power".strip())),
+    )
     return figure
 
 
@@ -133,7 +133,7 @@ _BAR_HEIGHT, _GROUP_GAP = 0.14, 0.12  # of a bar, between groups of them [inch]
 _MIN_BAR_SHARE = 1e-3  # share of the largest run's energy that has a bar
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def power_comparison_figure(comparison: PowerComparison) -> Figure:
     """Return shaft power over time, and energy by class with a bar per run."""
     runs = list(comparison.balances)
@@ -165,12 +165,18 @@ def power_comparison_figure(comparison: PowerComparison) -> Figure:
     time_axes.set_ylim(bottom=min(0.0, time_axes.get_ylim()[0]))
     figure.legend(loc="outside upper left", ncols=2)
     for i, (run, color) in enumerate(zip(runs, _run_colours(len(runs)), strict=True)):
-        bar_positions = [group_height * k + _BAR_HEIGHT * i for k in range(len(classes))]
         values = [scale * energies[run][kind] for kind in classes]
-        bars = bar_axes.barh(bar_positions, values, height=0.92 * _BAR_HEIGHT, color=color)
+        bars = bar_axes.barh(
+            [group_height * k + _BAR_HEIGHT * i for k in range(len(classes))],
+            values,
+            height=0.92 * _BAR_HEIGHT,
+            color=color,
+        )
         bar_axes.bar_label(bars, [format_number(x) for x in values], padding=2, fontsize=6.5)
-    group_centre = 0.5 * _BAR_HEIGHT * (len(runs) - 1)
-    bar_axes.set_yticks([group_height * k + group_centre for k in range(len(classes))], classes)
+    bar_axes.set_yticks(
+        [group_height * k + (0.5 * _BAR_HEIGHT * (len(runs) - 1)) for k in range(len(classes))],
+        classes,
+    )
     bar_axes.tick_params(axis="y", length=0)
     bar_axes.grid(visible=False, axis="y")
     bar_axes.invert_yaxis()

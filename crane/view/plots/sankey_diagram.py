@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -11,7 +10,7 @@ from matplotlib.path import Path as Outline
 from matplotlib.patheffects import withStroke
 
 from crane.common.units import format_number
-from crane.hydraulics.power_balance import SHAFT_POWER
+from crane.hydraulics.circuit_equations import SHAFT_POWER
 from crane.recordings.recording_summary import result_title
 from crane.studies.power_balance_result import (
     LOAD,
@@ -20,9 +19,8 @@ from crane.studies.power_balance_result import (
     part_kind,
     part_owner,
 )
-from crane.view.plots.figure_text import escape_label
+from crane.view.plots.figure_style import INK_COLOUR, escape_label, figure_style
 from crane.view.plots.power_figure import CLASS_COLOURS
-from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR
 
 _TOTAL_HEIGHT = 4.2  # of all that is given [inch]
 _LABEL_HEIGHT, _LABEL_GAP, _GROUP_GAP = (
@@ -84,7 +82,7 @@ class _SankeyGroup:
         return sum(item.energy for item in self.ribbons)
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def sankey_figure(balance: PowerBalance) -> Figure:
     """Return the energies from the shafts by pump and joint to losses and loads, in kJ and %.
 
@@ -122,8 +120,11 @@ class _SankeyDiagram:
             self._create_group(joint, [x for x in names if part_owner(x) == joint])
             for joint in balance.joints
         ]
-        circuit_names = [x for x in names if part_owner(x) not in balance.joints]
-        groups.append(self._create_group("circuit", circuit_names))
+        groups.append(
+            self._create_group(
+                "circuit", [x for x in names if part_owner(x) not in balance.joints]
+            )
+        )
         # groups that return more than they receive become sources
         self._returning_groups: dict[str, float] = {}
         for group in groups:
@@ -162,10 +163,11 @@ class _SankeyDiagram:
             if energy < _MIN_RIBBON_SHARE * self._total_energy:
                 small_energy += energy
             elif energy > 0:
-                color = CLASS_COLOURS[part_class(balance, name)]
                 ribbons.append(
                     _SankeyRibbon(
-                        escape_label(label or f"{part_owner_name} {kind}"), energy, color
+                        escape_label(label or f"{part_owner_name} {kind}"),
+                        energy,
+                        CLASS_COLOURS[part_class(balance, name)],
                     )
                 )
         if small_energy > _MIN_OTHERS_SHARE * self._total_energy:
@@ -183,10 +185,18 @@ class _SankeyDiagram:
         axes.set(xlim=(0.0, _FIGURE_WIDTH), ylim=(-figure_height, 0.0))
         axes.axis("off")
         self._axes, self._scale = axes, scale
-        heading = result_title(
-            self._balance.machine_name, f"{self._balance.task_name} energy".strip()
+        axes.text(
+            0.1,
+            -0.1,
+            escape_label(
+                result_title(
+                    self._balance.machine_name, f"{self._balance.task_name} energy".strip()
+                )
+            ),
+            fontsize=11,
+            fontweight="bold",
+            va="top",
         )
-        axes.text(0.1, -0.1, escape_label(heading), fontsize=11, fontweight="bold", va="top")
         if not self._total_energy > 0 or not self._owner_groups:
             axes.text(0.1, -0.6, "no energy", va="top")
             return figure
@@ -219,9 +229,13 @@ class _SankeyDiagram:
         flow = sum(group.total_energy - group.returned_energy for group in self._owner_groups)
         top = ribbon_top = 0.5 * (first_centre + last_centre + scale * flow)
         self._draw_bar(x, top, scale * flow, INK_COLOUR)
-        label = f"hydraulic {self._energy_text(flow)}"
         self._draw_text(
-            x - 0.04, top - 0.5 * scale * flow, label, "right", "center", is_vertical=True
+            x - 0.04,
+            top - 0.5 * scale * flow,
+            f"hydraulic {self._energy_text(flow)}",
+            "right",
+            "center",
+            is_vertical=True,
         )
         for group in self._owner_groups:
             ribbon_height = scale * (group.total_energy - group.returned_energy)
@@ -241,13 +255,17 @@ class _SankeyDiagram:
         y += 0.5 * _GROUP_GAP * (len(sources) - 1)
         for label, (energy, loss) in sources.items():
             self._draw_bar(x, y, scale * energy, INK_COLOUR)
-            label_y = y - 0.5 * scale * energy
             self._draw_text(
-                x - 0.08, label_y, f"{label}\n{self._energy_text(energy)}", ha="right", va="center"
+                x - 0.08,
+                y - 0.5 * scale * energy,
+                f"{label}\n{self._energy_text(energy)}",
+                ha="right",
+                va="center",
             )
             if loss > 0:
-                color = CLASS_COLOURS["pump"]
-                self._draw_ribbon((x + _BAR_WIDTH, y), (group_x, loss_top), scale * loss, color)
+                self._draw_ribbon(
+                    (x + _BAR_WIDTH, y), (group_x, loss_top), scale * loss, CLASS_COLOURS["pump"]
+                )
                 loss_top -= scale * loss
             ribbon_height = scale * (energy - loss)
             self._draw_ribbon(
@@ -276,8 +294,16 @@ class _SankeyDiagram:
                 (left, bar_bottom + return_height),
             ]
             corners.append((left + 0.1, bar_bottom + 0.5 * return_height))
-            color = CLASS_COLOURS[LOAD if group.label in self._balance.joints else "stored"]
-            self._axes.add_patch(Polygon(corners, facecolor=color, alpha=0.5, linewidth=0))
+            self._axes.add_patch(
+                Polygon(
+                    corners,
+                    facecolor=CLASS_COLOURS[
+                        LOAD if group.label in self._balance.joints else "stored"
+                    ],
+                    alpha=0.5,
+                    linewidth=0,
+                )
+            )
             label = f"gives back {self._kilojoule_text(group.returned_energy)}"
             self._draw_text(
                 left - 0.05, bar_bottom + 0.5 * return_height, label, ha="right", va="center"
@@ -322,8 +348,9 @@ class _SankeyDiagram:
         )  # fmt: skip
 
     def _draw_bar(self, x: float, top: float, size: float, color: str) -> None:
-        box = Rectangle((x, top - size), _BAR_WIDTH, size, facecolor=color, linewidth=0, zorder=2)
-        self._axes.add_patch(box)
+        self._axes.add_patch(
+            Rectangle((x, top - size), _BAR_WIDTH, size, facecolor=color, linewidth=0, zorder=2)
+        )
 
     def _draw_ribbon(
         self, start: tuple[float, float], end: tuple[float, float], size: float, color: str

@@ -61,21 +61,18 @@ def place_labels(canvas: SketchCanvas, labels: Sequence[SketchLabel]) -> None:
             gid=label.gid,
             path_effects=[withStroke(linewidth=2.0, foreground="white")],
         )
-        text_extent = text.get_window_extent(renderer)
-        half_size = np.array([text_extent.width, text_extent.height]) / 2 * 72 / figure.dpi * point
         texts.append(text)
+        half_size = np.array(text.get_window_extent(renderer).size) / 2 * 72 / figure.dpi * point
         candidates, gaps = _candidates(label, half_size, point)
         boxes.append(candidates)
         costs.append(_placement_costs(canvas, label, candidates, gaps))
     chosen = _choose_candidates(boxes, costs, point)
-    for label, text, candidates, best_index in zip(labels, texts, boxes, chosen, strict=True):
-        lower, upper = candidates[best_index]
+    for label, text, (lower, upper) in zip(labels, texts, chosen, strict=True):
         text.set_position(tuple((lower + upper) / 2))
         nearest = np.clip(label.position, lower, upper)
-        if np.linalg.norm(nearest - label.position) > (label.radius + _LEADER_LINE_GAP) * point:
-            start = label.position + (nearest - label.position) * label.radius / _nonzero_length(
-                (nearest - label.position) / point
-            )
+        distance = float(np.linalg.norm(nearest - label.position)) / point
+        if distance > label.radius + _LEADER_LINE_GAP:
+            start = label.position + (nearest - label.position) * label.radius / distance
             axes.plot(*np.array([start, nearest]).T, color=GREY, linewidth=0.6, zorder=8)
 
 
@@ -107,60 +104,41 @@ def _placement_costs(canvas: SketchCanvas, label: SketchLabel, boxes: Array, gap
         ):  # closer to another symbol than to its own
             cost = cost + np.where(distance - radius < gaps + 2.0, 5.0, 0)
     limits = np.array([canvas.axes.get_xlim(), canvas.axes.get_ylim()])
-    outside = (lower < limits[:, 0]).any(axis=1) | (upper > limits[:, 1]).any(axis=1)
-    return cost + np.where(outside, 500.0, 0)
-
-
-def _costs_with_labels(
-    other_boxes: Sequence[Array], boxes: Array, cost: Array, point_size: float
-) -> Array:
-    """Return costs (k,) of boxes (k, 2, 2) of a label, with other labels in boxes (2, 2)."""
-    for lower, upper in other_boxes:
-        box_gap = np.maximum(boxes[:, 0] - upper, lower - boxes[:, 1]).max(axis=1)
-        cost = cost + np.where(box_gap < 4 * point_size, 1000.0, 0)
-    return cost
+    return cost + np.where(
+        (lower < limits[:, 0]).any(axis=1) | (upper > limits[:, 1]).any(axis=1), 500.0, 0
+    )
 
 
 def _choose_candidates(
     boxes: Sequence[Array], costs: Sequence[Array], point_size: float
-) -> list[int]:
-    """Return the index of the chosen candidate of each label."""
-    order = sorted(range(len(boxes)), key=lambda i: -float(costs[i].min()))
+) -> list[Array]:
+    """Return the chosen candidate (2, 2) of each label; labels (k, 2, 2) should not overlap."""
     chosen: dict[int, int] = {}
     for sweep in range(_MAX_SWEEPS):
         previous = dict(chosen)
-        for i in order:
-            other_boxes = [boxes[j][best_index] for j, best_index in chosen.items() if j != i]
-            chosen[i] = int(
-                _costs_with_labels(other_boxes, boxes[i], costs[i], point_size).argmin()
-            )
+        for i in sorted(range(len(boxes)), key=lambda i: -float(costs[i].min())):
+            cost = costs[i]
+            for j, best_index in chosen.items():
+                if j != i:
+                    lower, upper = boxes[j][best_index]
+                    gap = np.maximum(boxes[i][:, 0] - upper, lower - boxes[i][:, 1]).max(axis=1)
+                    cost = cost + np.where(gap < 4 * point_size, 1000.0, 0)
+            chosen[i] = int(cost.argmin())
         if sweep and chosen == previous:
             break
-    return [chosen[i] for i in range(len(boxes))]
+    return [candidates[chosen[i]] for i, candidates in enumerate(boxes)]
 
 
 def _length_inside(segment: Array, lower: Array, upper: Array) -> Array:
     """Return the length (k,) of a line (2, 2) within boxes (k, 2), (k, 2)."""
     start, direction = segment[0], segment[1] - segment[0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        first_parameters, second_parameters = (
-            (lower - start) / direction,
-            (upper - start) / direction,
-        )
-    entry, exit_parameter = (
-        np.fmin(first_parameters, second_parameters),
-        np.fmax(first_parameters, second_parameters),
-    )
-    is_parallel_outside = (direction == 0) & ((start < lower) | (start > upper))
-    entry = np.where(direction == 0, -np.inf, entry).max(axis=1)
-    exit_parameter = np.where(direction == 0, np.inf, exit_parameter).min(axis=1)
-    share = np.minimum(exit_parameter, 1.0) - np.maximum(entry, 0.0)
-    share = np.where(is_parallel_outside.any(axis=1), 0.0, np.maximum(share, 0.0))
-    return np.asarray(share * np.linalg.norm(direction))
-
-
-def _nonzero_length(vector: Array) -> float:
-    return max(float(np.linalg.norm(vector)), 1e-12)
+        crossings = np.array([(lower - start) / direction, (upper - start) / direction])
+    entry = np.where(direction == 0, -np.inf, np.fmin(*crossings)).max(axis=1)
+    end = np.where(direction == 0, np.inf, np.fmax(*crossings)).min(axis=1)
+    share = np.maximum(np.minimum(end, 1.0) - np.maximum(entry, 0.0), 0.0)
+    is_outside = ((direction == 0) & ((start < lower) | (start > upper))).any(axis=1)
+    return np.asarray(np.where(is_outside, 0.0, share) * np.linalg.norm(direction))
 
 
 def find_clear_point(
@@ -178,11 +156,17 @@ def find_clear_point(
     distance = np.full(len(grid), np.inf)
     for start, end in segments:
         direction = end - start
-        share = np.clip(
-            (grid - start) @ direction / max(float(direction @ direction), 1e-30), 0, 1
-        )
         distance = np.minimum(
-            distance, np.linalg.norm(grid - start - share[:, None] * direction, axis=1)
+            distance,
+            np.linalg.norm(
+                grid
+                - start
+                - np.clip(
+                    (grid - start) @ direction / max(float(direction @ direction), 1e-30), 0, 1
+                )[:, None]
+                * direction,
+                axis=1,
+            ),
         )
     return grid[distance.argmax()], float(distance.max())
 
@@ -192,7 +176,6 @@ def _is_within_polygon(points: Array, corners: Array) -> NDArray[np.bool_]:
     inside = np.zeros(len(points), dtype=bool)
     x, y = points.T
     for (a, b), (c, d) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        is_crossing = (b > y) != (d > y)
         if b != d:
-            inside ^= is_crossing & (x < a + (y - b) * (c - a) / (d - b))
+            inside ^= ((b > y) != (d > y)) & (x < a + (y - b) * (c - a) / (d - b))
     return inside

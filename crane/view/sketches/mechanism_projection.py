@@ -47,8 +47,10 @@ class _MechanismProjection:
         self.axes, self.axis_cosines = plane.project(axes), np.abs(axes @ plane.normal)
         self.parents = [int(parent) for parent in model.parents]
         self.turns = [False] + [machine.unit(name) == "rad" for name in machine.joints]
-        chain_of = {x: i for i, chain in enumerate(machine.chains) for x in chain.joints}
-        self.chains = [-1] + [chain_of.get(name, 0) for name in machine.joints]
+        self.chains = [-1] + [
+            {x: i for i, chain in enumerate(machine.chains) for x in chain.joints}.get(name, 0)
+            for name in machine.joints
+        ]
         self.tip_body, self.tip = 0, None
         if machine.tip is not None:
             frame = model.frames[machine.frame(machine.tip)]
@@ -71,26 +73,34 @@ class _MechanismProjection:
         for index, (joint, position) in enumerate(self.loop_frames):
             self.points[joint].append(position)
             if index % 2:
-                loop = self.machine.closure.equations.loops[index // 2]
-                pins.append(
-                    SketchPin(loop.name, self.loop_frames[index - 1][1], position, index // 2 + 1)
-                )
+                name = self.machine.closure.equations.loops[index // 2].name
+                mate = self.loop_frames[index - 1][1]
+                pins.append(SketchPin(name, mate, position, index // 2 + 1))
         if self.tip is not None:
             self.points[self.tip_body].append(self.tip)
-        slides = [
-            self._create_slide(i)
-            for i, is_revolute in enumerate(self.turns)
-            if i and not is_revolute
+        joints = range(1, len(self.parents))
+        slides = [self._create_slide(i) for i in joints if not self.turns[i]]
+        bodies = [
+            SketchBody(
+                _distinct_points(self.points[i], self.size),
+                self.chains[i],
+                i in self.tip_supports,
+                self.plane.project(self.data.oMi[i].act(self.model.inertias[i].lever)),
+            )
+            for i in joints
         ]
-        bodies = [self._create_body(i) for i in range(1, len(self.parents))]
         ground = [
             (at, np.array([0.0, -1.0])) for at in _distinct_points(self.points[0], self.size)
         ]
         if self._has_base():
             base_point, collar = self.outer[0][0], collars[0]
             ground = [item for item in ground if np.abs(item[0] - collar.position).max() > 0]
-            upward_distance = collar.axis @ (self._farthest_point(1) - base_point)
-            ground.append((base_point, -np.sign(upward_distance or 1.0) * collar.axis))
+            position = self.origins[1]
+            farthest = max(
+                self.outer[1], key=lambda x: float(np.abs(x - position).max()), default=position
+            )
+            direction = -np.sign(collar.axis @ (farthest - base_point) or 1.0)
+            ground.append((base_point, direction * collar.axis))
             if len(base_line := _distinct_points([base_point, collar.position], self.size)) > 1:
                 bodies.append(SketchBody(base_line, -1, False, base_point))
         return SketchMechanism(
@@ -115,22 +125,14 @@ class _MechanismProjection:
             outer_points[self.tip_body].append(self.tip)
         return outer_points
 
-    def _farthest_point(self, joint: int) -> Array:
-        """Return the point of a body that is farthest from its joint."""
-        position = self.origins[joint]
-        return max(
-            self.outer[joint], key=lambda x: float(np.abs(x - position).max()), default=position
-        )
-
     def _has_base(self) -> bool:
-        """Return whether the first joint axis goes through the world's origin."""
-        first = self.origins[1]
-        axis = self.axes[1]
-        axis_offset = first - (first @ axis) * axis
+        """Return whether the first joint is revolute about an axis through the world's origin."""
+        first, axis = self.origins[1], self.axes[1]
+        tolerance = COINCIDENCE_TOLERANCE * self.machine.closure.characteristic_length
         return bool(
-            self.axis_cosines[1] < _MIN_PIN_COSINE
-            and np.linalg.norm(axis_offset)
-            < COINCIDENCE_TOLERANCE * self.machine.closure.characteristic_length
+            self.turns[1]
+            and self.axis_cosines[1] < _MIN_PIN_COSINE
+            and np.linalg.norm(first - (first @ axis) * axis) < tolerance
         )
 
     def _pins_and_collars(self) -> tuple[list[SketchPin], list[SketchCollar]]:
@@ -157,9 +159,8 @@ class _MechanismProjection:
         axial_distances = [float((point - previous_origin) @ axis) for point in self.outer[joint]]
         length = max(axial_distances, key=abs, default=0.0)
         min_distance = _COLLAR_DISTANCE_SHARE * self.size
-        is_isolated = parent == 0 and not (joint == 1 and self._has_base())
         if (
-            is_isolated
+            (parent == 0 and not (joint == 1 and self._has_base()))
             or abs(length) < min_distance
             or all(np.linalg.norm(point - position) > min_distance for point in pins)
         ):
@@ -210,9 +211,10 @@ class _MechanismProjection:
         sign, length = (1.0 if end >= inner_coordinate else -1.0), abs(end - inner_coordinate)
         offsets = [sign * (limit - value) for limit in (lower, upper) if np.isfinite(limit)]
         min_length = length + min(offsets) if offsets else 0.6 * length
-        max_length = length + max(offsets) if offsets else 1.4 * length
         barrel = (
-            _BARREL_LENGTH_SHARE * min_length if min_length > 0.25 * max_length else 0.5 * length
+            _BARREL_LENGTH_SHARE * min_length
+            if min_length > 0.25 * (length + max(offsets) if offsets else 1.4 * length)
+            else 0.5 * length
         )
         inner_length = max(length - 0.9 * min_length, 0.0) + 0.05 * barrel
         inner_length = min(inner_length, 0.94 * barrel)
@@ -230,31 +232,20 @@ class _MechanismProjection:
             is_rail=False,
         )
 
-    def _create_body(self, joint: int) -> SketchBody:
-        centre_of_mass = self.data.oMi[joint].act(self.model.inertias[joint].lever)
-        return SketchBody(
-            _distinct_points(self.points[joint], self.size),
-            self.chains[joint],
-            joint in self.tip_supports,
-            self.plane.project(centre_of_mass),
-        )
-
     def _regions(self) -> dict[int, Array]:
         """Return the corners that each loop encloses: its pin and those of both branches."""
         regions = {}
-        for number in range(1, len(self.loop_frames) // 2 + 1):
-            (first_joint, position), (second_joint, _) = self.loop_frames[
-                2 * number - 2 : 2 * number
+        supports = self.model.supports
+        pairs = zip(self.loop_frames[::2], self.loop_frames[1::2], strict=True)
+        for number, ((first_joint, position), (second_joint, _)) in enumerate(pairs, start=1):
+            shared = set(supports[first_joint]) & set(supports[second_joint])
+            paths = [
+                [j for j in reversed(list(supports[body])) if j not in shared and self.turns[j]]
+                for body in (second_joint, first_joint)
             ]
-            paths = []
-            shared = set(self.model.supports[first_joint]) & set(self.model.supports[second_joint])
-            planar = True
-            for body in (second_joint, first_joint):
-                path = [j for j in reversed(list(self.model.supports[body])) if j not in shared]
-                planar &= all(self.axis_cosines[j] > 0.99 for j in path if self.turns[j])
-                paths.append([self.origins[j] for j in path if self.turns[j]])
-            corners = _distinct_points([position, *paths[0], *reversed(paths[1])], self.size)
-            if planar and len(corners) > 2:
+            path = [*paths[0], *reversed(paths[1])]
+            corners = _distinct_points([position, *(self.origins[j] for j in path)], self.size)
+            if all(self.axis_cosines[j] > 0.99 for j in path) and len(corners) > 2:
                 regions[number] = corners
         return regions
 
@@ -262,10 +253,9 @@ class _MechanismProjection:
 def _distinct_points(points: Sequence[Array], size: float) -> Array:
     """Return points (k, 2) without those that repeat an earlier one."""
     distinct: list[Array] = []
+    tolerance = COINCIDENCE_TOLERANCE * size
     for point in points:
-        if not any(
-            np.abs(point - other).max() < COINCIDENCE_TOLERANCE * size for other in distinct
-        ):
+        if all(np.abs(point - other).max() >= tolerance for other in distinct):
             distinct.append(point)
     return np.array(distinct).reshape(-1, 2)
 
@@ -349,5 +339,6 @@ def _forward_direction(
         machine.model, home_data, machine.coordinates.configuration(machine.home)
     )
     joint = machine.model.getJointId(machine.active[section.slewing_joint])
-    slew_rotation = data.oMi[joint].rotation @ home_data.oMi[joint].rotation.T
-    return np.asarray(slew_rotation @ section.first_direction)
+    return np.asarray(
+        (data.oMi[joint].rotation @ home_data.oMi[joint].rotation.T) @ section.first_direction
+    )

@@ -16,8 +16,7 @@ from matplotlib.ticker import MaxNLocator
 from crane.common.samples import Array
 from crane.machine.machine import Machine
 from crane.recordings.recording_summary import DISPLAY_UNITS
-from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import INK_COLOUR
+from crane.view.plots.figure_style import INK_COLOUR, escape_label
 from crane.view.sketches.sketch_elements import DrawingPlane, SketchMechanism
 
 HullCorner = tuple[float, ...]
@@ -57,16 +56,6 @@ class SketchCanvas:
         self.axes.plot(*points.T, color=colour, linewidth=width, **options)
         self.occupied_segments += list(np.stack([points[:-1], points[1:]], axis=1))
 
-    def draw_polygon(
-        self, points: Array, colour: str, width: float, fill_opacity: float, z_order: float
-    ) -> None:
-        """Draw a polygon with corners (k, 2) [m], filled with a tint of its colour."""
-        closed = np.vstack([points, points[:1]])
-        self.axes.add_patch(
-            Polygon(points, facecolor=colour, alpha=fill_opacity, linewidth=0, zorder=z_order)
-        )
-        self.draw_line(closed, colour, width, zorder=z_order)
-
     def draw_box(
         self, start: Array, end: Array, width: float, colour: str, z_order: float
     ) -> None:
@@ -86,52 +75,31 @@ class SketchCanvas:
                 zorder=z_order,
             )
         )
-        closed = np.vstack([corners, corners[:1]])
-        self.occupied_segments += list(np.stack([closed[:-1], closed[1:]], axis=1))
-
-    def draw_joint(self, name: str, position: Array) -> None:
-        """Draw a revolute joint of the tree."""
-        self._draw_marker(position, 6.0, f"joint {name}", JOINT_MARKER)
-        self.occupied_discs.append((position, 4.0))
-
-    def draw_loop(self, name: str, position: Array, mate: Array) -> None:
-        """Draw a loop joint: a ring on its first body, a dot on its second."""
-        self._draw_marker(position, 5.5, f"loop {name}", LOOP_MARKER)
-        self._draw_marker(mate, 6.5, f"loop {name} mate", DOT_MARKER)
-        self.occupied_discs.append((position, 6.0))
+        self.occupied_segments += list(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1))
 
     def draw_collar(self, name: str, position: Array, axis: Array) -> None:
         """Draw a revolute joint whose axis lies in the plane."""
         axis_point = axis * self.point_size
         self.draw_box(position - 7 * axis_point, position + 7 * axis_point, 11.0, INK_COLOUR, 4.5)
         axis_line = np.array([position - 20 * axis_point, position + 20 * axis_point])
-        self.axes.plot(
-            *axis_line.T, color=INK_COLOUR, linewidth=0.8, linestyle=(0, (8, 2, 1.5, 2)), zorder=5
-        )
-        self._draw_marker(position, 4.0, f"joint {name}", DOT_MARKER | {"markersize": 0.1})
-        self.occupied_segments.append(axis_line)
-        self.occupied_discs.append((position, 7.0))
+        self.draw_line(axis_line, INK_COLOUR, 0.8, linestyle=(0, (8, 2, 1.5, 2)), zorder=5)
+        self.draw_marker(position, 4.0, f"joint {name}", DOT_MARKER | {"markersize": 0.1}, 7.0)
 
     def draw_ground(
         self, position: Array, down_direction: Array, ground_gap: float | None
     ) -> None:
         """Draw the ground: a support under a pin, or a hatched line below a point [points]."""
-        lateral = np.array([-down_direction[1], down_direction[0]])
-        ground_point = (
-            position
-            + (11.0 if ground_gap is None else ground_gap) * self.point_size * down_direction
-        )
+        lateral = self.point_size * np.array([-down_direction[1], down_direction[0]])
+        gap = 11.0 if ground_gap is None else ground_gap
+        ground_point = position + gap * self.point_size * down_direction
         if ground_gap is None:
-            width = 7 * self.point_size * lateral
-            support = np.array([position, ground_point - width, ground_point + width])
+            support = np.array([position, ground_point - 7 * lateral, ground_point + 7 * lateral])
             self.axes.add_patch(
                 Polygon(support, facecolor="white", edgecolor=INK_COLOUR, linewidth=1.2, zorder=2)
             )
             self.occupied_segments += [support[[0, 1]], support[[0, 2]]]
         self.draw_hatching(
-            ground_point - 15 * self.point_size * lateral,
-            ground_point + 15 * self.point_size * lateral,
-            down_direction,
+            ground_point - 15 * lateral, ground_point + 15 * lateral, down_direction
         )
 
     def draw_hatching(self, start: Array, end: Array, down_direction: Array) -> None:
@@ -148,17 +116,6 @@ class SketchCanvas:
         offset = 3 * self.point_size * down_direction
         self.occupied_segments.append(np.array([start + offset, end + offset]))
         self.occupied_segments.append(np.array([start + 2 * offset, end + 2 * offset]))
-
-    def draw_centre_of_mass(self, position: Array) -> None:
-        """Draw a centre of mass."""
-        for z_order, style in zip((5.2, 5.3, 5.3), (CENTRE_MARKER, *QUARTER_MARKERS), strict=True):
-            self._draw_marker(position, z_order, "centre of mass", style)
-        self.occupied_discs.append((position, 4.5))
-
-    def draw_tip(self, position: Array) -> None:
-        """Draw the tip as a cross that is larger than a pin."""
-        self._draw_marker(position, 5.4, "tip", TIP_MARKER)
-        self.occupied_discs.append((position, 6.0))
 
     def draw_number(self, number: int, position: Array) -> None:
         """Draw the number of a loop in its region."""
@@ -179,40 +136,45 @@ class SketchCanvas:
         )  # fmt: skip
         self.occupied_discs.append((position, 7.5))
 
-    def _draw_marker(
-        self, position: Array, z_order: float, gid: str, style: dict[str, Any]
+    def draw_marker(
+        self,
+        position: Array,
+        z_order: float,
+        gid: str,
+        style: dict[str, Any],
+        radius: float | None = None,
     ) -> None:
+        """Draw a symbol; with a radius [points] labels keep away from it."""
         self.axes.plot(*position[:, None], zorder=z_order, gid=gid, **marker_options(style))
+        if radius is not None:
+            self.occupied_discs.append((position, radius))
 
 
 def marker_options(style: dict[str, Any]) -> dict[str, Any]:
     """Return options of a line that shows only its marker."""
-    default_style = {
+    return {
         "linestyle": "none",
         "color": INK_COLOUR,
         "markeredgecolor": INK_COLOUR,
         "markeredgewidth": 1.2,
-    }
-    return default_style | style
+    } | style
 
 
 def convex_hull(points: Array) -> Array:
     """Return the corners (k, 2) of the convex hull of points (n, 2), counterclockwise."""
     ordered = sorted(map(tuple, points.tolist()))
-
-    def turns_left(one: HullCorner, two: HullCorner, three: HullCorner) -> bool:
-        (a, b), (c, d), (x, y) = one, two, three
-        return (c - a) * (y - b) - (d - b) * (x - a) > 0
-
-    def half(row: Sequence[HullCorner]) -> list[HullCorner]:
+    hull: list[HullCorner] = []
+    for row in (ordered, ordered[::-1]):
         chain: list[HullCorner] = []
-        for corner in row:
-            while len(chain) > 1 and not turns_left(chain[-2], chain[-1], corner):
+        for x, y in row:
+            while len(chain) > 1:
+                (a, b), (c, d) = chain[-2:]
+                if (c - a) * (y - b) - (d - b) * (x - a) > 0:
+                    break
                 chain.pop()
-            chain.append(corner)
-        return chain[:-1]
-
-    return np.array(half(ordered) + half(ordered[::-1]) or ordered)
+            chain.append((x, y))
+        hull += chain[:-1]
+    return np.array(hull or ordered)
 
 
 _MAX_WIDTH, _MAX_HEIGHT, _MIN_WIDTH = 454.0, 353.0, 331.0  # of the axes [points]
@@ -249,8 +211,7 @@ def create_sketch_layout(
     corners = np.array([_mechanism_bounds(fitted) for fitted in (mechanism, *other_mechanisms)])
     lower, upper = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
     span = np.maximum(upper - lower, 0.05 * mechanism.size)
-    available = np.array([_MAX_WIDTH, _MAX_HEIGHT]) - 2 * _MARGIN
-    point_size = float((span / available).max())  # [m]
+    point_size = float((span / (np.array([_MAX_WIDTH, _MAX_HEIGHT]) - 2 * _MARGIN)).max())  # [m]
     axes_width, axes_height = np.maximum(span / point_size + 2 * _MARGIN, [_MIN_WIDTH, 0.0])
     coordinate_lines = _coordinate_lines(machine, q, int((axes_width + _LEFT_MARGIN) / 5.2))
     columns = max(int((axes_width + _LEFT_MARGIN) / 92), 1)
@@ -275,11 +236,23 @@ def create_sketch_layout(
     for axis, length in ((axes.xaxis, axes_width), (axes.yaxis, axes_height)):
         axis.set_major_locator(MaxNLocator(max(int(length / 55), 2), steps=[1, 2, 5, 10]))
     left = 12 / width
-    name = escape_label(machine.name.replace("_", " "))
-    figure.text(left, 1 - 8 / height, name, va="top", fontsize=11, fontweight="bold")
+    figure.text(
+        left,
+        1 - 8 / height,
+        escape_label(machine.name.replace("_", " ")),
+        va="top",
+        fontsize=11,
+        fontweight="bold",
+    )
     for row, line in enumerate(coordinate_lines):
-        line_y = 1 - (23 + _LINE_HEIGHT * row) / height
-        figure.text(left, line_y, line, va="top", fontsize=8, color="#555555")
+        figure.text(
+            left,
+            1 - (23 + _LINE_HEIGHT * row) / height,
+            line,
+            va="top",
+            fontsize=8,
+            color="#555555",
+        )
     figure.legend(
         handles=list(legend),
         labels=[str(entry[0].get_label()) for entry in legend],
@@ -298,9 +271,7 @@ def create_sketch_layout(
 
 def _mechanism_bounds(mechanism: SketchMechanism) -> tuple[Array, Array]:
     """Return the lower and upper corner (2,) of all points [m]."""
-    points = [drawn_pin.position for drawn_pin in mechanism.pins] + [
-        item.position for item in mechanism.collars
-    ]
+    points = [item.position for item in (*mechanism.pins, *mechanism.collars)]
     points += [end for x in mechanism.slides for end in (x.start, x.mouth, x.rod_outer_end)]
     points += [corner for body in mechanism.bodies for corner in body.points]
     points += [position for position, _ in mechanism.ground]
@@ -309,21 +280,17 @@ def _mechanism_bounds(mechanism: SketchMechanism) -> tuple[Array, Array]:
 
 def _coordinate_lines(machine: Machine, q: Array, line_length: int) -> list[str]:
     """Return the active coordinates as lines of limited length."""
-    lines: list[str] = []
+    lines: list[list[str]] = []
     length = line_length
     for joint, value in zip(machine.active, q[machine.closure.active], strict=True):
         unit, scale = DISPLAY_UNITS[machine.unit(joint)]
         number = f"{scale * value:.1f}".removesuffix(".0").replace("-", "\u2212")
         number = "0" if number == "\u22120" else number
-        coordinate_text = (
-            f"{format_joint_symbol(joint)} = "
-            f"{number}{'°' if unit == 'deg' else chr(0x2009) + unit}"
-        )
         text_length = len(joint) + len(number) + 8
         if length + text_length > line_length:
-            lines.append(coordinate_text)
-            length = text_length
-        else:
-            lines[-1] += f",   {coordinate_text}"
-            length += text_length
-    return lines
+            lines.append([])
+            length = 0
+        length += text_length
+        unit_text = "°" if unit == "deg" else f"\u2009{unit}"
+        lines[-1].append(f"{format_joint_symbol(joint)} = {number}{unit_text}")
+    return [",   ".join(texts) for texts in lines]

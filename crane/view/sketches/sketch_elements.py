@@ -66,8 +66,7 @@ def find_plane(machine: Machine, q: Array, view: str | None = None) -> DrawingPl
     home_data = pin.Data(machine.model)
     pin.forwardKinematics(machine.model, home_data, machine.home)
     axes, carriers = _revolute_axes(machine, home_data)
-    is_parallel = np.abs(axes @ axes.T) > 1 - _PARALLEL_TOLERANCE
-    counts = is_parallel.sum(axis=1)
+    counts = (np.abs(axes @ axes.T) > 1 - _PARALLEL_TOLERANCE).sum(axis=1)
     if 2 * counts.max(initial=0) < max(len(axes), 1):
         raise InputError(
             f"{machine.name} has no plane: no more than {counts.max(initial=0)} of its "

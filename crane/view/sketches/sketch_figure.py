@@ -1,11 +1,11 @@
 """Sketch of a mechanism as a figure."""
 
+import itertools
 import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -15,8 +15,7 @@ from numpy.typing import ArrayLike
 from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.machine.machine import Machine
-from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import FIGURE_STYLE, write_figure
+from crane.view.plots.figure_style import escape_label, figure_style, write_figure
 from crane.view.sketches.label_placement import SketchLabel, find_clear_point, place_labels
 from crane.view.sketches.mechanism_projection import COINCIDENCE_TOLERANCE, project_mechanism
 from crane.view.sketches.sketch_canvas import (
@@ -25,6 +24,7 @@ from crane.view.sketches.sketch_canvas import (
     JOINT_MARKER,
     LOOP_MARKER,
     QUARTER_MARKERS,
+    TIP_MARKER,
     SketchCanvas,
     convex_hull,
     create_sketch_layout,
@@ -34,7 +34,6 @@ from crane.view.sketches.sketch_canvas import (
 from crane.view.sketches.sketch_elements import (
     SketchBody,
     SketchMechanism,
-    SketchPin,
     SketchSlide,
     find_plane,
 )
@@ -91,7 +90,7 @@ def sketch(
     )
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def sketch_figure(
     machine: Machine,
     q_a: ArrayLike | None = None,
@@ -118,11 +117,18 @@ def sketch_figure(
     drawing_plane = find_plane(machine, q, plane)
     mechanism = project_mechanism(machine, q, drawing_plane)
     ghosts = [project_mechanism(machine, other, drawing_plane) for other in other_configurations]
-    legend = _legend(machine, show_centres_of_mass) + [
-        (_ghost_line(i),) for i in range(len(ghosts))
-    ]
-    figure, canvas = create_sketch_layout(mechanism, drawing_plane, machine, q, legend, ghosts)
-    _draw_regions(canvas, mechanism)
+    figure, canvas = create_sketch_layout(
+        mechanism,
+        drawing_plane,
+        machine,
+        q,
+        _legend(machine, show_centres_of_mass) + [(_ghost_line(i),) for i in range(len(ghosts))],
+        ghosts,
+    )
+    # small regions above large ones
+    for number, corners in sorted(mechanism.regions.items(), key=lambda x: -_polygon_area(x[1])):
+        tint = REGION_COLOURS[(number - 1) % len(REGION_COLOURS)]
+        canvas.axes.add_patch(Polygon(corners, facecolor=tint, linewidth=0, zorder=1))
     for i, ghost in enumerate(ghosts):
         _draw_ghost(canvas, ghost, mechanism, i)
     for body in sorted(mechanism.bodies, key=lambda body: body.carries_tip):
@@ -130,15 +136,15 @@ def sketch_figure(
     for slide in mechanism.slides:
         _draw_slide(canvas, slide)
     for position, down_direction in mechanism.ground:
-        canvas.draw_ground(
-            position, down_direction, _ground_gap(mechanism, position, down_direction)
-        )
+        canvas.draw_ground(position, down_direction, _ground_gap(mechanism, position))
     for item in mechanism.collars:
         canvas.draw_collar(item.name, item.position, item.axis)
     if show_centres_of_mass:
-        _draw_centres(canvas, mechanism)
+        for body in mechanism.bodies:
+            if body.chain >= 0:
+                _draw_centre_of_mass(canvas, body.centre_of_mass)
     if mechanism.tip is not None:
-        canvas.draw_tip(mechanism.tip)
+        canvas.draw_marker(mechanism.tip, 5.4, "tip", TIP_MARKER, 6.0)
     _draw_pins(canvas, mechanism)
     _number_regions(canvas, mechanism)
     place_labels(canvas, _create_labels(mechanism))
@@ -149,30 +155,30 @@ def _legend(machine: Machine, show_centres_of_mass: bool) -> list[tuple[Line2D, 
     """Return one entry per sub-chain and kind of symbol, each of superposed lines."""
     entries: list[tuple[Line2D, ...]] = []
     for i, chain in enumerate(machine.chains):
-        if not chain.joints:
-            continue  # nothing has its colour
-        colour = CHAIN_COLOURS[i % len(CHAIN_COLOURS)]
-        entries.append(
-            (Line2D([], [], color=colour, linewidth=3.0, label=escape_label(chain.name)),)
-        )
-    symbols: dict[str, list[Any]] = {"joint": [JOINT_MARKER], "loop": [LOOP_MARKER, DOT_MARKER]}
+        if chain.joints:  # or nothing has its colour
+            style: Any = {"color": CHAIN_COLOURS[i % len(CHAIN_COLOURS)], "linewidth": 3.0}
+            entries.append((Line2D([], [], label=escape_label(chain.name), **style),))
+    symbols: dict[str, list[Any]] = {"joint": [JOINT_MARKER]}
+    if machine.closure.equations.loops:
+        symbols["loop"] = [LOOP_MARKER, DOT_MARKER]
     if show_centres_of_mass:
         symbols["centre of mass"] = [CENTRE_MARKER, *QUARTER_MARKERS]
     for name, styles in symbols.items():
-        if name != "loop" or machine.closure.equations.loops:
-            entries.append(
-                tuple(Line2D([], [], label=name, **marker_options(look)) for look in styles)
-            )
+        entries.append(tuple(Line2D([], [], label=name, **marker_options(x)) for x in styles))
     return entries
 
 
 def _ghost_line(index: int, points: Array | None = None) -> Line2D:
     """Return a dashed line of another assembly mode; without points for the legend."""
     x, y = np.zeros((2, 0)) if points is None else points.T
-    label = f"other assembly {index + 1}"
-    style = _GHOST_DASHES[index % len(_GHOST_DASHES)]
     return Line2D(
-        x, y, color=GHOST_COLOUR, linewidth=1.1, linestyle=style, label=label, zorder=2.2
+        x,
+        y,
+        color=GHOST_COLOUR,
+        linewidth=1.1,
+        linestyle=_GHOST_DASHES[index % len(_GHOST_DASHES)],
+        label=f"other assembly {index + 1}",
+        zorder=2.2,
     )
 
 
@@ -180,23 +186,10 @@ def _draw_ghost(
     canvas: SketchCanvas, ghost: SketchMechanism, home_mechanism: SketchMechanism, index: int
 ) -> None:
     """Draw the parts of another assembly mode that are not at home."""
-    outlines = [
-        (x.points, y.points) for x, y in zip(ghost.bodies, home_mechanism.bodies, strict=True)
-    ]
-    for ghost_slide, home_slide in zip(ghost.slides, home_mechanism.slides, strict=True):
-        outlines.append(
-            (
-                np.array([ghost_slide.start, ghost_slide.rod_outer_end]),
-                np.array([home_slide.start, home_slide.rod_outer_end]),
-            )
-        )
-    for ghost_points, home_points in outlines:
-        if (
-            len(ghost_points) < 2
-            or np.abs(ghost_points - home_points).max() < 1e-6 * home_mechanism.size
-        ):
+    for points, home_points in zip(_outlines(ghost), _outlines(home_mechanism), strict=True):
+        if len(points) < 2 or np.abs(points - home_points).max() < 1e-6 * home_mechanism.size:
             continue
-        corners = convex_hull(ghost_points)
+        corners = convex_hull(points)
         if len(corners) > 2:
             corners = np.vstack([corners, corners[:1]])
         line = _ghost_line(index, corners)
@@ -204,13 +197,9 @@ def _draw_ghost(
         canvas.axes.add_line(line)
 
 
-def _draw_regions(canvas: SketchCanvas, mechanism: SketchMechanism) -> None:
-    """Tint the region of each loop, small regions above large ones."""
-    for number, corners in sorted(
-        mechanism.regions.items(), key=lambda item: -_polygon_area(item[1])
-    ):
-        colour = REGION_COLOURS[(number - 1) % len(REGION_COLOURS)]
-        canvas.axes.add_patch(Polygon(corners, facecolor=colour, linewidth=0, zorder=1))
+def _outlines(mechanism: SketchMechanism) -> list[Array]:
+    slides = (np.array([x.start, x.rod_outer_end]) for x in mechanism.slides)
+    return [*(body.points for body in mechanism.bodies), *slides]
 
 
 def _number_regions(canvas: SketchCanvas, mechanism: SketchMechanism) -> None:
@@ -229,33 +218,31 @@ def _number_regions(canvas: SketchCanvas, mechanism: SketchMechanism) -> None:
             canvas.draw_number(number, number_position)
 
 
-def _ground_gap(
-    mechanism: SketchMechanism, position: Array, down_direction: Array
-) -> float | None:
+def _ground_gap(mechanism: SketchMechanism, position: Array) -> float | None:
     """Return the distance from a point down to the ground [points]; None for a pin."""
     tolerance = COINCIDENCE_TOLERANCE * mechanism.size
-    if any(
-        np.abs(drawn_pin.position - position).max() < tolerance for drawn_pin in mechanism.pins
-    ):
+    if any(np.abs(x.position - position).max() < tolerance for x in mechanism.pins):
         return None
-    is_on_collar = any(
-        np.abs(item.position - position).max() < tolerance for item in mechanism.collars
-    )
-    return 7.0 if is_on_collar else 0.0
+    is_on_collar = (np.abs(x.position - position).max() < tolerance for x in mechanism.collars)
+    return 7.0 if any(is_on_collar) else 0.0
 
 
-def _draw_centres(canvas: SketchCanvas, mechanism: SketchMechanism) -> None:
-    for body in mechanism.bodies:
-        if body.chain >= 0:
-            canvas.draw_centre_of_mass(body.centre_of_mass)
+def _draw_centre_of_mass(canvas: SketchCanvas, position: Array) -> None:
+    canvas.draw_marker(position, 5.2, "centre of mass", CENTRE_MARKER, 4.5)
+    for style in QUARTER_MARKERS:
+        canvas.draw_marker(position, 5.3, "centre of mass", style)
 
 
 def _draw_pins(canvas: SketchCanvas, mechanism: SketchMechanism) -> None:
+    """Draw revolute joints of the tree as rings, loop joints as rings with a dot."""
     for drawn_pin in mechanism.pins:
         if drawn_pin.loop_number:
-            canvas.draw_loop(drawn_pin.name, drawn_pin.position, drawn_pin.mate_position)
+            gid = f"loop {drawn_pin.name}"
+            canvas.draw_marker(drawn_pin.position, 5.5, gid, LOOP_MARKER, 6.0)
+            canvas.draw_marker(drawn_pin.mate_position, 6.5, f"{gid} mate", DOT_MARKER)
         else:
-            canvas.draw_joint(drawn_pin.name, drawn_pin.position)
+            gid = f"joint {drawn_pin.name}"
+            canvas.draw_marker(drawn_pin.position, 6.0, gid, JOINT_MARKER, 4.0)
 
 
 def _draw_body(canvas: SketchCanvas, body: SketchBody) -> None:
@@ -263,15 +250,18 @@ def _draw_body(canvas: SketchCanvas, body: SketchBody) -> None:
     z_order, points = 2.6 if body.carries_tip else 2.4, body.points
     if len(points) < 2:
         return
-    if _extent_across(points) >= _MIN_POLYGON_WIDTH * canvas.point_size:
-        canvas.draw_polygon(
-            convex_hull(points), colour, 2.6 if body.carries_tip else 1.8, 0.22, z_order
+    direction, normal = np.linalg.svd(points - points.mean(axis=0))[2]
+    if float(np.ptp(points @ normal)) >= _MIN_POLYGON_WIDTH * canvas.point_size:
+        corners = convex_hull(points)
+        canvas.axes.add_patch(
+            Polygon(corners, facecolor=colour, alpha=0.22, linewidth=0, zorder=z_order)
         )
-        return
-    direction = np.linalg.svd(points - points.mean(axis=0))[2][0]
-    length = float(np.ptp(points @ direction)) / canvas.point_size
-    width = min(4.2 if body.carries_tip else 2.6, length / 2)
-    canvas.draw_line(points[np.argsort(points @ direction)], colour, width, zorder=z_order)
+        width, points = 2.6 if body.carries_tip else 1.8, np.vstack([corners, corners[:1]])
+    else:
+        length = float(np.ptp(points @ direction)) / canvas.point_size
+        width = min(4.2 if body.carries_tip else 2.6, length / 2)
+        points = points[np.argsort(points @ direction)]
+    canvas.draw_line(points, colour, width, zorder=z_order)
 
 
 def _draw_slide(canvas: SketchCanvas, slide: SketchSlide) -> None:
@@ -309,8 +299,13 @@ def _draw_slide(canvas: SketchCanvas, slide: SketchSlide) -> None:
         zorder=3.2,
     )
     piston_half = np.array([-direction[1], direction[0]]) * (width / 2 - 1.4) * point
-    piston = np.array([slide.rod_inner_end - piston_half, slide.rod_inner_end + piston_half])
-    canvas.axes.plot(*piston.T, color=rod_colour, linewidth=3.0, solid_capstyle="butt", zorder=3.3)
+    canvas.axes.plot(
+        *np.array([slide.rod_inner_end - piston_half, slide.rod_inner_end + piston_half]).T,
+        color=rod_colour,
+        linewidth=3.0,
+        solid_capstyle="butt",
+        zorder=3.3,
+    )
 
 
 def _create_labels(mechanism: SketchMechanism) -> list[SketchLabel]:
@@ -318,30 +313,23 @@ def _create_labels(mechanism: SketchMechanism) -> list[SketchLabel]:
     labels = []
     remaining = [shown for shown in mechanism.pins if not shown.loop_number]
     while remaining:
-        tolerance = 0.002 * mechanism.size
-        coincident = [
-            other
-            for other in remaining
-            if np.abs(other.position - remaining[0].position).max() < tolerance
+        position = remaining[0].position
+        is_coincident = [
+            np.abs(other.position - position).max() < 0.002 * mechanism.size for other in remaining
         ]
-        text = ", ".join(format_joint_symbol(name) for name in _sorted_names(coincident))
-        labels.append(SketchLabel(text, remaining[0].position, 4.0, "label"))
-        remaining = [other for other in remaining if other not in coincident]
-    for drawn_pin in mechanism.pins:
-        if drawn_pin.loop_number:
-            number_text = (
-                chr(0x2460 + drawn_pin.loop_number - 1)
-                if drawn_pin.loop_number <= 20
-                else f"({drawn_pin.loop_number})"
-            )
-            labels.append(
-                SketchLabel(
-                    f"{number_text} {format_joint_symbol(drawn_pin.name)}",
-                    drawn_pin.position,
-                    6.0,
-                    "label",
-                )
-            )
+        names = sorted(
+            (x.name for x in itertools.compress(remaining, is_coincident)),
+            key=lambda name: [(x.isdigit(), x.zfill(9)) for x in re.split(r"(\d+)", name)],
+        )  # in natural order, q2 before q10
+        labels.append(
+            SketchLabel(", ".join(map(format_joint_symbol, names)), position, 4.0, "label")
+        )
+        remaining = [x for x, is_in in zip(remaining, is_coincident, strict=True) if not is_in]
+    for x in mechanism.pins:
+        if number := x.loop_number:
+            number_text = chr(0x2460 + number - 1) if number <= 20 else f"({number})"
+            text = f"{number_text} {format_joint_symbol(x.name)}"
+            labels.append(SketchLabel(text, x.position, 6.0, "label"))
     labels += [
         SketchLabel(format_joint_symbol(item.name), item.position, 8.0, "label")
         for item in mechanism.collars
@@ -352,20 +340,6 @@ def _create_labels(mechanism: SketchMechanism) -> list[SketchLabel]:
     if mechanism.tip is not None:
         labels.append(SketchLabel("tip", mechanism.tip, 7.0, "label tip"))
     return labels
-
-
-def _sorted_names(pins: Sequence[SketchPin]) -> list[str]:
-    """Return names in natural order, q2 before q10."""
-    return sorted(
-        (drawn_pin.name for drawn_pin in pins),
-        key=lambda name: [(x.isdigit(), x.zfill(9)) for x in re.split(r"(\d+)", name)],
-    )
-
-
-def _extent_across(points: Array) -> float:
-    """Return the extent [m] of points (k, 2) across the line through them."""
-    normal = np.linalg.svd(points - points.mean(axis=0))[2][-1]
-    return float(np.ptp(points @ normal))
 
 
 def _polygon_area(corners: Array) -> float:

@@ -1,7 +1,8 @@
 """Canvas of a circuit drawing: wires of nets, ports, lines and texts, in points."""
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,13 +12,14 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Circle, Polygon
 from matplotlib.patheffects import withStroke
 from matplotlib.textpath import TextPath
+from numpy.typing import ArrayLike
 
-from crane.common.samples import Array
-from crane.view.plots.recording_figure import INK_COLOUR
+from crane.view.plots.figure_style import INK_COLOUR
 
 SheetPoint = tuple[float, float]
 _COORDINATE_TOLERANCE = 1e-6  # [points]
 _SIGNAL_DASHES = (0, (3, 2))
+LINE_HEIGHT = 7.6  # of words [points]
 SMALL_TEXT_SIZE, NAME_TEXT_SIZE, MIN_TEXT_SIZE = 6.3, 8.0, 5.2  # sizes of words [points]
 
 
@@ -27,16 +29,12 @@ def _fit_text(text: str, size: float, available_width: float, weight: str) -> tu
     def measure_width(text: str) -> float:
         return float(TextPath((0, 0), text, size=size, prop=font).get_extents().width)
 
-    text_width, min_scale = measure_width(text), min(MIN_TEXT_SIZE / size, 1.0)
-    if text_width * min_scale > available_width and not text.startswith("$"):
-        end = len(text)
-        while (
-            measure_width(text[:end].rstrip("\\") + "…") * min_scale > available_width and end > 1
-        ):
-            end -= 1
-        text = text[:end].rstrip("\\") + "…"
-        text_width = measure_width(text)
-    return text, size * min(available_width / text_width, 1.0)
+    min_scale = min(MIN_TEXT_SIZE / size, 1.0)
+    shortened, end = text, 1 if text.startswith("$") else len(text)
+    while measure_width(shortened) * min_scale > available_width and end > 1:
+        end -= 1
+        shortened = text[:end].rstrip("\\") + "…"
+    return shortened, size * min(available_width / measure_width(shortened), 1.0)
 
 
 @dataclass(frozen=True)
@@ -59,8 +57,8 @@ class SymbolPose:
         """Transform points to the sheet."""
         out = []
         for x, y in points:
-            x, y = (-x if self.is_mirrored else x), y
-            for _ in range(self.quarter_turns % 4):
+            x = -x if self.is_mirrored else x
+            for _ in range(self.quarter_turns):
                 x, y = -y, x
             out.append((self.x + x, self.y + y))
         return out
@@ -87,13 +85,13 @@ class CircuitWire:
     def contains(self, point: SheetPoint) -> bool:
         """Return whether a point lies on the wire."""
         (a, b), (c, d), (x, y) = self.start, self.end, point
-        is_within = min(a, c) - _COORDINATE_TOLERANCE <= x <= max(a, c) + _COORDINATE_TOLERANCE
-        is_within = (
-            is_within
-            and min(b, d) - _COORDINATE_TOLERANCE <= y <= max(b, d) + _COORDINATE_TOLERANCE
-        )
+        tolerance = _COORDINATE_TOLERANCE
+        is_within_x = min(a, c) - tolerance <= x <= max(a, c) + tolerance
+        is_within_y = min(b, d) - tolerance <= y <= max(b, d) + tolerance
         return (
-            is_within and abs((c - a) * (y - b) - (d - b) * (x - a)) < _COORDINATE_TOLERANCE * 100
+            is_within_x
+            and is_within_y
+            and abs((c - a) * (y - b) - (d - b) * (x - a)) < tolerance * 100
         )
 
 
@@ -130,24 +128,22 @@ class CircuitCanvas:
 
     def draw_wire(self, net: str, *points: SheetPoint, is_signal: bool = False) -> None:
         """Draw a line of a net through points; dashed for a signal."""
-        distinct_points = [points[0]]
-        distinct_points += [b for a, b in zip(points, points[1:], strict=False) if a != b]
-        if len(distinct_points) < 2:
+        segments = [pair for pair in itertools.pairwise(points) if pair[0] != pair[1]]
+        if not segments:
             return
-        self.wires += [
-            CircuitWire(net, a, b)
-            for a, b in zip(distinct_points, distinct_points[1:], strict=False)
-        ]
+        self.wires += [CircuitWire(net, a, b) for a, b in segments]
         style: dict[str, Any] = {"linewidth": 1.0}
         if is_signal:
             style = {"linewidth": 0.7, "linestyle": _SIGNAL_DASHES}
-        self.draw_line(distinct_points, zorder=2.0, gid=f"wire {net}", **style)
+        self.draw_line(
+            [segments[0][0], *(end for _, end in segments)], zorder=2.0, gid=f"wire {net}", **style
+        )
 
     def add_port(self, component: str, net: str, position: SheetPoint) -> None:
         """Add a port of a symbol."""
         self.ports.append(SymbolPort(component, net, position))
 
-    def draw_line(self, points: Sequence[SheetPoint], **options: Any) -> None:
+    def draw_line(self, points: Sequence[ArrayLike], **options: Any) -> None:
         """Draw a line of a symbol."""
         style: dict[str, Any] = {
             "color": INK_COLOUR, "linewidth": 0.8, "zorder": 3.2, "solid_capstyle": "round",
@@ -156,7 +152,7 @@ class CircuitCanvas:
         self.axes.plot(*np.array(points, dtype=float).T, **style)
 
     def draw_shape(
-        self, points: Sequence[SheetPoint], is_filled: bool = False, **options: Any
+        self, points: Sequence[ArrayLike], is_filled: bool = False, **options: Any
     ) -> None:
         """Draw a closed outline, white or filled."""
         style = {
@@ -167,6 +163,11 @@ class CircuitCanvas:
             "joinstyle": "miter",
         } | options
         self.axes.add_patch(Polygon(np.array(points, dtype=float), closed=True, **style))
+
+    def draw_box(self, corner: SheetPoint, opposite_corner: SheetPoint, **options: Any) -> None:
+        """Draw a white rectangle with sides along the sheet."""
+        (x, y), (end_x, end_y) = corner, opposite_corner
+        self.draw_shape([(x, y), (end_x, y), (end_x, end_y), (x, end_y)], **options)
 
     def draw_circle(self, position: SheetPoint, radius: float, **options: Any) -> None:
         """Draw a circle, white by default."""
@@ -184,26 +185,30 @@ class CircuitCanvas:
         """Draw a line with a filled head at its end."""
         first, second = np.array(start), np.array(end)
         direction = (second - first) / float(np.linalg.norm(second - first))
-        normal = np.array([-direction[1], direction[0]])
-        head_base: Array = second - size * direction
-        self.draw_line(
-            [start, (float(head_base[0]), float(head_base[1]))], solid_capstyle="butt", **options
+        half_width = 0.38 * size * np.array([-direction[1], direction[0]])
+        base = second - size * direction
+        self.draw_line([first, base], solid_capstyle="butt", **options)
+        self.draw_shape(
+            [second, base + half_width, base - half_width],
+            is_filled=True,
+            linewidth=0.0,
+            zorder=3.3,
         )
-        head_points = [second, head_base + 0.38 * size * normal, head_base - 0.38 * size * normal]
-        corners = [(float(x), float(y)) for x, y in head_points]
-        self.draw_shape(corners, is_filled=True, linewidth=0.0, zorder=3.3)
 
     def draw_spring(self, start: SheetPoint, end: SheetPoint, *, half_width: float = 2.2) -> None:
         """Draw a spring."""
-        first, second = np.array(start), np.array(end)
-        direction = second - first
-        normal = (
-            np.array([-direction[1], direction[0]]) / float(np.linalg.norm(direction)) * half_width
+        first, direction = np.array(start), np.array(end) - np.array(start)
+        self.draw_line(
+            [
+                first
+                + share * direction
+                + side
+                * half_width
+                * (np.array([-direction[1], direction[0]]) / float(np.linalg.norm(direction)))
+                for share, side in zip(np.linspace(0, 1, 7), (0, 1, -1, 1, -1, 1, 0), strict=True)
+            ],
+            linewidth=0.7,
         )
-        shares = np.linspace(0, 1, 7)
-        sides = [0, 1, -1, 1, -1, 1, 0]
-        points = [first + s * direction + k * normal for s, k in zip(shares, sides, strict=True)]
-        self.draw_line([(float(x), float(y)) for x, y in points], linewidth=0.7)
 
     def draw_text(
         self, x: float, y: float, text: str, gid: str, size: float = SMALL_TEXT_SIZE,
@@ -213,27 +218,55 @@ class CircuitCanvas:
         if len(text) * size > available_width:  # no letter is wider than its height
             text, size = _fit_text(text, size, available_width, options.get("weight", "normal"))
         style: dict[str, Any] = {"ha": "center", "va": "center", "zorder": 9} | options
-        halo = [withStroke(linewidth=1.6, foreground="white")]
-        self.axes.text(x, y, text, fontsize=size, gid=gid, path_effects=halo, **style)
+        self.axes.text(
+            x,
+            y,
+            text,
+            fontsize=size,
+            gid=gid,
+            path_effects=[withStroke(linewidth=1.6, foreground="white")],
+            **style,
+        )
+
+    def draw_texts(
+        self, x: float, y: float, texts: Iterable[str], gid: str, **options: Any
+    ) -> None:
+        """Write lines of text below each other, the first centred at y; see `draw_text`."""
+        for k, text in enumerate(texts):
+            self.draw_text(x, y - LINE_HEIGHT * k, text, gid, **options)
+
+    def draw_labels(
+        self,
+        position: SheetPoint,
+        component: str,
+        name: str,
+        texts: Iterable[str],
+        available_width: float,
+    ) -> None:
+        """Write the name of a component, and texts below it."""
+        x, y = position
+        self.draw_text(
+            x, y, name, f"name {component}", NAME_TEXT_SIZE, available_width, weight="bold"
+        )
+        self.draw_texts(x, y - 9, texts, f"label {component}", available_width=available_width)
 
     def draw_junctions(self) -> None:
         """Mark points where three or more wires of a net meet."""
-        ends = sorted({(w.net, at) for w in self.wires for at in (w.start, w.end)})
-        for net, position in ends:
-            if any(
-                p.position == position and p.component.startswith("shuttle") for p in self.ports
-            ):
+        shuttles = {x.position for x in self.ports if x.component.startswith("shuttle")}
+        for net, position in sorted({(w.net, at) for w in self.wires for at in (w.start, w.end)}):
+            if position in shuttles:
                 continue
-            branch_count = 0
-            for wire in self.wires:
-                if wire.net == net and wire.contains(position):
-                    branch_count += 1 if position in (wire.start, wire.end) else 2
-            if branch_count > 2:
+            if (
+                sum(
+                    1 if position in (wire.start, wire.end) else 2
+                    for wire in self.wires
+                    if wire.net == net and wire.contains(position)
+                )
+                > 2
+            ):
                 self.draw_circle(
                     position,
                     1.5,
-                    facecolor=INK_COLOUR,
-                    linewidth=0.0,
-                    zorder=4.0,
                     gid=f"dot {net}",
+                    **{"facecolor": INK_COLOUR, "linewidth": 0.0, "zorder": 4.0},
                 )

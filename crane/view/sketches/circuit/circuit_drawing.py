@@ -1,26 +1,26 @@
 """Drawing of a hydraulic circuit: rails, functions above, pumps and other items below."""
 
+import itertools
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import matplotlib as mpl
+import numpy as np
 from matplotlib.figure import Figure
 
 from crane.common.errors import InputError
 from crane.hydraulics.circuit_elements import TANK_NODE
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.machine.machine import Machine
-from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import FIGURE_STYLE, write_figure
-from crane.view.sketches.circuit import circuit_section
-from crane.view.sketches.circuit.circuit_canvas import SMALL_TEXT_SIZE, CircuitCanvas
+from crane.view.plots.figure_style import escape_label, figure_style, write_figure
+from crane.view.sketches.circuit.circuit_canvas import LINE_HEIGHT, SMALL_TEXT_SIZE, CircuitCanvas
 from crane.view.sketches.circuit.circuit_functions import (
     CircuitFunction,
     OpenCentreLines,
     valve_rows,
 )
-from crane.view.sketches.circuit.circuit_section import CircuitSection
+from crane.view.sketches.circuit.circuit_section import SECTION_WIDTH, TOP_HEIGHT, CircuitSection
 from crane.view.sketches.circuit.supply_items import SupplyItem, create_supply_items
 from crane.view.sketches.circuit.valve_symbols import SPOOL_HEIGHT
 
@@ -45,7 +45,7 @@ def sketch_circuit(machine: Machine, path: str | Path) -> None:
     write_figure(path, lambda: circuit_figure(machine)[0])
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def circuit_figure(machine: Machine) -> tuple[Figure, CircuitCanvas]:
     """Return the figure of a circuit and its canvas; see `sketch_circuit`.
 
@@ -53,40 +53,46 @@ def circuit_figure(machine: Machine) -> tuple[Figure, CircuitCanvas]:
     above the rails that it is connected to; pumps, tank, accumulators and elements are below the
     lowest rails. Coordinates are points.
     """
-    hydraulics = machine.hydraulics
-    if hydraulics is None:
+    if machine.hydraulics is None:
         raise InputError(
             f"'{machine.name}' has no hydraulic circuit, sketch its mechanism or add 'hydraulics'"
         )
-    return _CircuitDrawing(machine, hydraulics).draw()
+    return _CircuitDrawing(machine, machine.hydraulics).draw()
 
 
 class _CircuitDrawing:
     """Layout of a circuit."""
 
     def __init__(self, machine: Machine, hydraulics: Hydraulics):
-        self._machine, self._hydraulics = machine, hydraulics
+        self._machine = machine
         functions = _circuit_functions(machine, hydraulics)
-        count = -(-len(functions) // _FUNCTIONS_PER_ROW)
-        self._function_rows = _split_into_rows(functions, count)
+        self._function_rows = _split_into_rows(functions)
         self._open_centres = OpenCentreLines(hydraulics, self._function_rows)
-        items = create_supply_items(hydraulics, functions)
-        functions_width = (
-            max(len(row) for row in self._function_rows) * circuit_section.SECTION_WIDTH
-        )
+        functions_width = max(map(len, self._function_rows)) * SECTION_WIDTH
         self._item_rows = _pack_items(
-            items, max(functions_width, _FUNCTIONS_PER_ROW * circuit_section.SECTION_WIDTH)
+            create_supply_items(hydraulics, functions),
+            max(functions_width, _FUNCTIONS_PER_ROW * SECTION_WIDTH),
         )
         items_width = max(sum(item.width for item in row) + 16 for row in self._item_rows)
-        self._net_names = _rail_nets(hydraulics, functions, self._open_centres)
-        labels = {net: _rail_label(hydraulics, net) for net in self._net_names}
-        self._label_width = 4 + 0.62 * SMALL_TEXT_SIZE * max(map(len, labels.values()))
-        self._rail_labels = labels
         self._content_width = max(functions_width, items_width)
+        # all nets that may have a rail, from the top
+        self._rail_labels = {
+            net: _rail_label(hydraulics, net)
+            for net in [
+                *[f"{kind} {name}" for kind in ("LS", "N") for name in hydraulics.pumps],
+                *self._open_centres.row_nets,
+                TANK_NODE,
+                *hydraulics.pumps,
+                *hydraulics.lines,
+                *hydraulics.accumulators,
+                *[f"{x.joint}.{side}" for x in functions for side in "ab"],
+            ]
+        }
+        self._label_width = 4 + 0.62 * SMALL_TEXT_SIZE * max(map(len, self._rail_labels.values()))
 
     def draw(self) -> tuple[Figure, CircuitCanvas]:
         nets_by_row = self._used_nets()
-        risers = [net for net in self._net_names if sum(net in row for row in nets_by_row) > 1]
+        risers = [net for net in self._rail_labels if sum(net in row for row in nets_by_row) > 1]
         left = self._label_width + 5.0 * len(risers)
         heights = [self._row_height(k, len(row)) for k, row in enumerate(nets_by_row)]
         width = _MARGIN + left + self._content_width + 2 * _MARGIN
@@ -101,10 +107,9 @@ class _CircuitDrawing:
                   weight="bold", ha="left")  # fmt: skip
         top, rail_heights_by_row = height - _HEADING_HEIGHT, []
         for k, row in enumerate(nets_by_row):
-            height_above = self._height_above_rail(k)
-            start = top - height_above
-            rails = {net: start - _RAIL_SPACING * i for i, net in enumerate(row)}
-            self._draw_row(canvas, k, rails, _MARGIN + left, start)
+            top_rail = top - self._height_above_rail(k)
+            rails = {net: top_rail - _RAIL_SPACING * i for i, net in enumerate(row)}
+            self._draw_row(canvas, k, rails, _MARGIN + left, top_rail)
             rail_heights_by_row.append(rails)
             top -= heights[k]
         self._draw_rails(canvas, rail_heights_by_row, risers, _MARGIN + self._label_width)
@@ -113,48 +118,48 @@ class _CircuitDrawing:
 
     def _used_nets(self) -> list[list[str]]:
         """Return the nets with a rail by row; items hang below the last row of functions."""
-        rows: list[set[str]] = []
+        first_item_row = len(self._function_rows) - 1
+        rows: list[set[str]] = [set() for _ in range(first_item_row + len(self._item_rows))]
         for k, functions in enumerate(self._function_rows):
-            row = {net for x in functions for net in x.rails.values()}
-            rows.append(row | self._open_centres.required_nets(k))
-        for k, items in enumerate(self._item_rows):
-            row_index = len(self._function_rows) - 1 + k
-            if row_index == len(rows):
-                rows.append(set())
-            rows[row_index] |= {net for item in items for net, _ in item.wires}
-        return [[net for net in self._net_names if net in row] for row in rows]
+            rows[k] |= {net for x in functions for net in x.rails.values()}
+            rows[k] |= self._open_centres.required_nets(k)
+        for k, items in enumerate(self._item_rows, start=first_item_row):
+            rows[k] |= {net for item in items for net, _ in item.wires}
+        return [[net for net in self._rail_labels if net in row] for row in rows]
 
     def _height_above_rail(self, row: int) -> float:
         if row >= len(self._function_rows):
             return 14.0
-        return (
-            self._valve_height(row)
-            + SPOOL_HEIGHT
-            + self._actuator_height(row)
-            + circuit_section.TOP_HEIGHT
-        )
+        return self._valve_height(row) + self._actuator_height(row) + TOP_HEIGHT
 
     def _valve_height(self, row: int) -> float:
         """Return the height of the valves above the highest rail."""
         functions = self._function_rows[row]
-        text_height = 4 + 7.6 * max(len(x.valve_texts) for x in functions)
-        required_height = 12 + max(max(x.height_below for x in functions), text_height)
+        required_height = 12 + max(
+            max(x.height_below for x in functions),
+            4 + LINE_HEIGHT * max(len(x.valve_texts) for x in functions),
+        )
         return required_height + 4.0 * self._open_centres.line_count(row) + 2
 
     def _actuator_height(self, row: int) -> float:
-        """Return the height of the actuators' middle above the valves."""
-        functions = self._function_rows[row]
-        rows = max(sum(h for _, h in valve_rows(x)) for x in functions)
-        return rows + 20 + (6 if self._open_centres.line_count(row) else 0)
+        """Return the height of the actuators' middle above the lower edge of the valves."""
+        return (
+            SPOOL_HEIGHT
+            + max(sum(h for _, h in valve_rows(x)) for x in self._function_rows[row])
+            + 20
+            + (6 if self._open_centres.line_count(row) else 0)
+        )
+
+    def _items_below(self, row: int) -> list[SupplyItem]:
+        item_row = row - len(self._function_rows) + 1
+        return self._item_rows[item_row] if item_row >= 0 else []
 
     def _row_height(self, row: int, rail_count: int) -> float:
-        item_row = row - len(self._function_rows) + 1
-        height_below = 18.0
-        if 0 <= item_row < len(self._item_rows):
-            height_below = (
-                _ITEM_DISTANCE + max(item.height for item in self._item_rows[item_row]) + 6
-            )
-        return self._height_above_rail(row) + _RAIL_SPACING * (rail_count - 1) + height_below
+        return (
+            self._height_above_rail(row)
+            + _RAIL_SPACING * (rail_count - 1)
+            + (_ITEM_DISTANCE + max((x.height for x in self._items_below(row)), default=0.0) + 6)
+        )
 
     def _draw_row(
         self,
@@ -168,42 +173,38 @@ class _CircuitDrawing:
         if row < len(self._function_rows):
             functions = self._function_rows[row]
             valve = top_rail + self._valve_height(row)
-            actuator = valve + SPOOL_HEIGHT + self._actuator_height(row)
-            spare_width = max(
-                self._content_width - len(functions) * circuit_section.SECTION_WIDTH, 0.0
-            )
-            first = left + (
-                spare_width / 2
-                if spare_width < circuit_section.SECTION_WIDTH
-                else 0.25 * spare_width
-            )
-            middles = [
-                first + (i + 0.5) * circuit_section.SECTION_WIDTH for i in range(len(functions))
-            ]
+            spare_width = max(self._content_width - len(functions) * SECTION_WIDTH, 0.0)
             levels = self._open_centres.line_heights(row, valve)
             centre_ends = {}
-            for function, x in zip(functions, middles, strict=True):
+            for i, function in enumerate(functions):
+                x = (
+                    left
+                    + (0.5 if spare_width < SECTION_WIDTH else 0.25) * spare_width
+                    + (i + 0.5) * SECTION_WIDTH
+                )
                 centre_ports = CircuitSection(
-                    canvas, function, x, valve, actuator, rail_heights, levels
+                    canvas,
+                    function,
+                    x,
+                    valve,
+                    valve + self._actuator_height(row),
+                    rail_heights,
+                    levels,
                 ).draw()
                 if centre_ports is not None:
                     centre_ends[function.joint] = x, *centre_ports
             self._open_centres.draw(canvas, row, centre_ends, rail_heights, levels)
-        item_row = row - len(self._function_rows) + 1
-        if not 0 <= item_row < len(self._item_rows):
-            return
         occupied_x = [w.start[0] for w in canvas.wires[previous_wires:] if w.start[0] == w.end[0]]
         item_top = min(rail_heights.values(), default=top_rail) - _ITEM_DISTANCE
-        cursor = left
-        for item in self._item_rows[item_row]:
+        for item in self._items_below(row):
             while any(
-                abs(cursor + position - other) < _MIN_WIRE_DISTANCE
+                abs(left + position - other) < _MIN_WIRE_DISTANCE
                 for _, position in item.wires
                 for other in occupied_x
             ):
-                cursor += 1.0
-            item.draw(canvas, cursor, item_top, rail_heights)
-            cursor += item.width
+                left += 1.0
+            item.draw(canvas, left, item_top, rail_heights)
+            left += item.width
 
     def _draw_rails(
         self,
@@ -212,25 +213,22 @@ class _CircuitDrawing:
         risers: Sequence[str],
         left: float,
     ) -> None:
-        for net in self._net_names:
-            signal = net.startswith(("LS ", "N "))
-            lane_index = risers.index(net) if net in risers else len(risers)
-            lane = left + 5.0 * lane_index
+        for net, label in self._rail_labels.items():
+            is_signal = net.startswith(("LS ", "N "))
+            lane = left + 5.0 * (risers.index(net) if net in risers else len(risers))
             heights = [row[net] for row in rail_heights_by_row if net in row]
             for y in heights:
-                wire_ends = [w.end[0] for w in canvas.wires if w.net == net and w.end[1] == y]
-                wire_ends += [w.start[0] for w in canvas.wires if w.net == net and w.start[1] == y]
-                for first, second in zip(
-                    [lane, *sorted(set(wire_ends))], sorted(set(wire_ends)), strict=False
-                ):
-                    canvas.draw_wire(net, (first, y), (second, y), is_signal=signal)
-                canvas.draw_text(left - 4, y, self._rail_labels[net], f"rail {net}", ha="right")
+                wires = [wire for wire in canvas.wires if wire.net == net]
+                ends = sorted({end[0] for w in wires for end in (w.start, w.end) if end[1] == y})
+                for first, second in itertools.pairwise([lane, *ends]):
+                    canvas.draw_wire(net, (first, y), (second, y), is_signal=is_signal)
+                canvas.draw_text(left - 4, y, label, f"rail {net}", ha="right")
                 if lane > left:
                     canvas.draw_line(
                         [(left - 2, y), (lane, y)], linewidth=0.4, color="#8a8a8a", zorder=1
                     )
-            for first, second in zip(heights, heights[1:], strict=False):
-                canvas.draw_wire(net, (lane, first), (lane, second), is_signal=signal)
+            for first, second in itertools.pairwise(heights):
+                canvas.draw_wire(net, (lane, first), (lane, second), is_signal=is_signal)
 
 
 def _circuit_functions(machine: Machine, hydraulics: Hydraulics) -> list[CircuitFunction]:
@@ -254,58 +252,44 @@ def _circuit_functions(machine: Machine, hydraulics: Hydraulics) -> list[Circuit
     return functions
 
 
-def _split_into_rows(
-    functions: Sequence[CircuitFunction], count: int
-) -> list[list[CircuitFunction]]:
+def _split_into_rows(functions: Sequence[CircuitFunction]) -> list[list[CircuitFunction]]:
     """Split functions into rows of similar length, with the nets of open centres."""
-    nets: dict[str, int] = {}
-    rows: list[list[CircuitFunction]] = []
-    remaining = iter(functions)
-    for k in range(count):
-        row = []
-        for _ in range(len(functions) // count + (k < len(functions) % count)):
-            function = next(remaining)
-            if function.valve.centre > 0:
-                supply = function.valve.supply
-                i = nets[supply] = nets.get(supply, -1) + 1
-                inlet_net = f"C {supply} {i}" if i else supply
-                function = replace(function, centre_nets=(inlet_net, f"C {supply} {i + 1}"))
-            row.append(function)
-        rows.append(row)
-    return rows
+    counts: Counter[str] = Counter()
+    connected = []
+    for function in functions:
+        if function.valve.centre > 0:
+            supply = function.valve.supply
+            inlet_net = f"C {supply} {counts[supply]}" if counts[supply] else supply
+            counts[supply] += 1
+            outlet_net = f"C {supply} {counts[supply]}"
+            function = replace(function, centre_nets=(inlet_net, outlet_net))
+        connected.append(function)
+    indices = np.array_split(range(len(functions)), -(-len(functions) // _FUNCTIONS_PER_ROW))
+    return [[connected[i] for i in row] for row in indices]
 
 
 def _pack_items(items: Sequence[SupplyItem], max_width: float) -> list[list[SupplyItem]]:
     """Pack items into rows of limited width; items with `stays_in_row` stay together."""
     rows: list[list[SupplyItem]] = [[]]
     for item in items:
-        used_width = sum(x.width for x in rows[-1])
-        if rows[-1] and not item.stays_in_row and used_width + item.width + 16 > max_width:
+        if (
+            rows[-1]
+            and not item.stays_in_row
+            and (sum(x.width for x in (*rows[-1], item)) + 16) > max_width
+        ):
             rows.append([])
         rows[-1].append(item)
     return rows
 
 
-def _rail_nets(
-    hydraulics: Hydraulics, functions: Sequence[CircuitFunction], centres: OpenCentreLines
-) -> list[str]:
-    """Return all nets that may have a rail, from the top."""
-    signals = [f"LS {name}" for name in hydraulics.pumps]
-    signals += [f"N {name}" for name in hydraulics.pumps]
-    nodes = [TANK_NODE, *hydraulics.pumps, *hydraulics.lines, *hydraulics.accumulators]
-    return [*signals, *centres.row_nets, *nodes,
-            *(f"{x.joint}.{side}" for x in functions for side in "ab")]  # fmt: skip
-
-
 def _rail_label(hydraulics: Hydraulics, net: str) -> str:
     kind, _, name = net.partition(" ")
-    is_single_pump = len(hydraulics.pumps) == 1
     label = net
     if kind == "C" and name:
         label = f"{name.split()[0]} centre"
     elif kind in ("LS", "N") and name:
-        sign = {"LS": "LS", "N": "pN"}[kind]
-        label = sign if is_single_pump else f"{sign} {name}"
+        sign = "LS" if kind == "LS" else "pN"
+        label = sign if len(hydraulics.pumps) == 1 else f"{sign} {name}"
     return escape_label(
         label if len(label) <= _MAX_LABEL_LENGTH else f"{label[: _MAX_LABEL_LENGTH - 1]}…"
     )

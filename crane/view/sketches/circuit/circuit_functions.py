@@ -34,7 +34,7 @@ class CircuitFunction:
         tapped_chambers: Chambers "a" and "b" that other components are connected to.
         has_load_sensing: Whether its load pressure goes to a pump or to other valves.
         shares_load_sensing: Whether other functions share this load-sensing line.
-        centre_nets: Nets before and behind its open centre; None for a closed centre.
+        centre_nets: Nets before and behind its open centre; none for a closed centre.
     """
 
     joint: str
@@ -46,17 +46,16 @@ class CircuitFunction:
     tapped_chambers: frozenset[str] = frozenset()
     has_load_sensing: bool = False
     shares_load_sensing: bool = False
-    centre_nets: tuple[str, str] | None = None
+    centre_nets: tuple[str, ...] = ()
 
     @property
     def ports(self) -> list[str]:
         """Lower ports of the valve, from the left."""
-        has_separate_returns = self.valve.return_a != self.valve.return_b
         availability = {
-            "Ta": has_separate_returns,
+            "Ta": self.valve.return_a != self.valve.return_b,
             "LS": self.has_load_sensing,
             "P": True,
-            "C": self.centre_nets is not None,
+            "C": bool(self.centre_nets),
             "T": True,
         }
         return [name for name, is_present in availability.items() if is_present]
@@ -85,45 +84,37 @@ class CircuitFunction:
         valve = self.valve
         margin = valve.margin or (self.supply.margin if valve.sharing else 0.0)
         root_pressure_drop = (margin or _ORIFICE_DROP) ** 0.5
-        flow_in, flow_out = (
-            format_flow(valve.c1 * root_pressure_drop),
-            format_flow(valve.c4 * root_pressure_drop),
-        )
-        texts = (
-            [f"{flow_in} l/min"] if flow_in == flow_out else [f"{flow_in} | {flow_out}", "l/min"]
-        )
-        if valve.spool_b:
-            texts.insert(0, "2 spools: A, B")
+        flows = [format_flow(x * root_pressure_drop) for x in (valve.c1, valve.c4)]
+        texts = ["2 spools: A, B"] if valve.spool_b else []
+        if flows[0] == flows[1]:
+            texts.append(f"{flows[0]} l/min")
+        else:
+            texts += [" | ".join(flows), "l/min"]
         if valve.margin > 0:
             return [*texts, f"Δp {format_pressure(valve.margin)}"]
-        return [*texts, "sharing"] if margin else [*texts, f"at {format_pressure(_ORIFICE_DROP)}"]
+        return [*texts, "sharing" if margin else f"at {format_pressure(_ORIFICE_DROP)}"]
 
 
 def port_lane(function: CircuitFunction, port: str) -> float:
     """Return the offset of a port's lane from the middle of the section."""
-    if port == "P" and function.centre_nets is not None:
-        return _SUPPLY_LANE_BESIDE_CENTRE
-    return _PORT_LANES[port]
+    return (
+        _SUPPLY_LANE_BESIDE_CENTRE if (port == "P" and function.centre_nets) else _PORT_LANES[port]
+    )
 
 
 def valve_rows(function: CircuitFunction) -> list[tuple[str, float]]:
     """Return names and heights of the rows between valve and actuator, upwards."""
-    cylinder, valve = function.cylinder, function.valve
-    rows: list[tuple[str, float]] = []
-    for side in "ab":
-        if getattr(cylinder, f"counterbalance_{side}") is not None:
-            rows.append((f"counterbalance_{side}", 32.0))
-    if cylinder.rupture_a or cylinder.rupture_b:
-        rows.append(("rupture", 22.0))
-    if cylinder.relief or cylinder.refill:
-        rows.append(("port", 44.0 if cylinder.relief else 34.0))
-    if cylinder.cross_relief:
-        rows.append(("cross", 48.0))
-    if valve.regeneration:
-        rows.append(("regeneration", 24.0))
-    if function.tapped_chambers:
-        rows.append(("tap", 8.0))
-    return rows
+    cylinder = function.cylinder
+    heights = {
+        "counterbalance a": 32.0 if cylinder.counterbalance_a is not None else 0.0,
+        "counterbalance b": 32.0 if cylinder.counterbalance_b is not None else 0.0,
+        "rupture": 22.0 if cylinder.rupture_a or cylinder.rupture_b else 0.0,
+        "port": 44.0 if cylinder.relief else 34.0 if cylinder.refill else 0.0,
+        "cross": 48.0 if cylinder.cross_relief else 0.0,
+        "regeneration": 24.0 if function.valve.regeneration else 0.0,
+        "tap": 8.0 if function.tapped_chambers else 0.0,
+    }
+    return [(name, height) for name, height in heights.items() if height]
 
 
 class OpenCentreLines:
@@ -138,50 +129,41 @@ class OpenCentreLines:
     """
 
     def __init__(self, hydraulics: Hydraulics, function_rows: Sequence[Sequence[CircuitFunction]]):
-        self._hydraulics, self._function_rows = hydraulics, function_rows
-        self._pump_names = [
-            name
-            for name in hydraulics.pumps
-            if any(x.centre_nets and x.valve.supply == name for row in function_rows for x in row)
+        self._hydraulics = hydraulics
+        self._last_joints: dict[str, str] = {}
+        self._rows: list[dict[str, list[CircuitFunction]]] = []
+        for functions in function_rows:
+            in_series = [x for x in functions if x.centre_nets]
+            self._last_joints |= {x.valve.supply: x.joint for x in in_series}
+            row = {
+                name: [x for x in in_series if x.valve.supply == name] for name in hydraulics.pumps
+            }
+            self._rows.append({name: row[name] for name in row if row[name]})
+        self.row_nets = [
+            functions[-1].centre_nets[1]
+            for row in self._rows
+            for functions in row.values()
+            if not self._ends_with(functions[-1])
         ]
-        self._last_joints = {
-            x.valve.supply: x.joint for row in function_rows for x in row if x.centre_nets
-        }
-        self.row_nets: list[str] = []
-        for row in function_rows:
-            for name in self._pump_names:
-                row_functions = [x for x in row if x.centre_nets and x.valve.supply == name]
-                if row_functions and row_functions[-1].joint != self._last_joints[name]:
-                    assert row_functions[-1].centre_nets is not None
-                    self.row_nets.append(row_functions[-1].centre_nets[1])
 
-    def _functions_of_pump(self, row: int, name: str) -> list[CircuitFunction]:
-        return [x for x in self._function_rows[row] if x.centre_nets and x.valve.supply == name]
+    def _ends_with(self, function: CircuitFunction) -> bool:
+        return function.joint == self._last_joints[function.valve.supply]
 
     def line_count(self, row: int) -> int:
         """Return the number of open-centre lines of a row."""
-        return sum(bool(self._functions_of_pump(row, name)) for name in self._pump_names)
+        return len(self._rows[row])
 
     def line_heights(self, row: int, valve_height: float) -> dict[str, float]:
         """Return the heights of the open-centre lines below the valves, by pump."""
-        heights: dict[str, float] = {}
-        for name in self._pump_names:
-            if self._functions_of_pump(row, name):
-                heights[name] = valve_height - 11.0 - 4.0 * len(heights)
-        return heights
+        return {name: valve_height - 11.0 - 4.0 * k for k, name in enumerate(self._rows[row])}
 
     def required_nets(self, row: int) -> set[str]:
         """Return the nets of a row that need a rail."""
         nets: set[str] = set()
-        for name in self._pump_names:
-            row_functions = self._functions_of_pump(row, name)
-            if not row_functions:
-                continue
-            first, last = row_functions[0].centre_nets, row_functions[-1].centre_nets
-            assert first is not None and last is not None
-            nets.add(first[0])
-            if row_functions[-1].joint != self._last_joints[name]:
-                nets.add(last[1])
+        for name, functions in self._rows[row].items():
+            nets.add(functions[0].centre_nets[0])
+            if not self._ends_with(functions[-1]):
+                nets.add(functions[-1].centre_nets[1])
                 continue
             nets.add(TANK_NODE)
             if self._hydraulics.pumps[name].control == "negative":
@@ -205,69 +187,52 @@ class OpenCentreLines:
             rail_heights: Heights of the rails by net.
             line_heights: See `line_heights`.
         """
-        for number, name in enumerate(line_heights):
-            level, row_functions = line_heights[name], self._functions_of_pump(row, name)
-            lane: float | None = None
-            for function in row_functions:
+        for number, (name, functions) in enumerate(self._rows[row].items()):
+            level, first_net = line_heights[name], functions[0].centre_nets[0]
+            lane = centre_ends[functions[0].joint][0] - _FEED_LANE - 4.0 * number
+            canvas.draw_wire(first_net, (lane, rail_heights[first_net]), (lane, level))
+            for function in functions:
                 x, inlet, outlet = centre_ends[function.joint]
-                assert function.centre_nets is not None
                 inlet_net, outlet_net = function.centre_nets
-                if lane is None:
-                    lane = x - _FEED_LANE - 4.0 * number
-                    canvas.draw_wire(inlet_net, (lane, rail_heights[inlet_net]), (lane, level))
                 canvas.draw_wire(inlet_net, (lane, level), (inlet[0], level), inlet)
                 lane = x + _RETURN_LANE + _LANE_SPACING * number
-                outlet_height = outlet[1] + 9
-                canvas.draw_wire(
-                    outlet_net,
-                    outlet,
-                    (outlet[0], outlet_height),
-                    (lane, outlet_height),
-                    (lane, level),
-                )
-            assert lane is not None
-            self._draw_end(canvas, name, lane, level, row_functions[-1], rail_heights)
+                top = outlet[1] + 9
+                canvas.draw_wire(outlet_net, outlet, (outlet[0], top), (lane, top), (lane, level))
+            if self._ends_with(functions[-1]):
+                self._draw_end(canvas, name, (lane, level), outlet_net, rail_heights)
+            else:
+                canvas.draw_wire(outlet_net, (lane, level), (lane, rail_heights[outlet_net]))
 
     def _draw_end(
         self,
         canvas: CircuitCanvas,
         name: str,
-        lane: float,
-        line_height: float,
-        last_function: CircuitFunction,
+        end: SheetPoint,
+        net: str,
         rail_heights: Mapping[str, float],
     ) -> None:
-        supply = self._hydraulics.pumps[name]
-        assert last_function.centre_nets is not None
-        net = last_function.centre_nets[1]
-        if last_function.joint != self._last_joints[name]:
-            canvas.draw_wire(net, (lane, line_height), (lane, rail_heights[net]))
-            return
+        """Draw the end of a line at the tank, through a throttle if the pump has one."""
+        supply, lane, tank_rail = self._hydraulics.pumps[name], end[0], rail_heights[TANK_NODE]
         if not supply.throttle:
-            component = f"bypass {name}"
-            canvas.add_port(component, net, (lane, line_height))
-            canvas.add_port(component, TANK_NODE, (lane, line_height))
-            canvas.draw_wire(TANK_NODE, (lane, line_height), (lane, rail_heights[TANK_NODE]))
+            canvas.add_port(f"bypass {name}", net, end)
+            canvas.add_port(f"bypass {name}", TANK_NODE, end)
+            canvas.draw_wire(TANK_NODE, end, (lane, tank_rail))
             return
-        middle = line_height - 5 - valve_symbols.THROTTLE_HALF_LENGTH
-        canvas.draw_wire(
-            net, (lane, line_height), (lane, middle + valve_symbols.THROTTLE_HALF_LENGTH)
-        )
+        component = f"throttle {name}"
         valve_symbols.draw_throttle(
-            canvas, SymbolPose(lane, middle, 2), f"throttle {name}", (net, TANK_NODE)
-        )
-        canvas.draw_wire(
-            TANK_NODE,
-            (lane, middle - valve_symbols.THROTTLE_HALF_LENGTH),
-            (lane, rail_heights[TANK_NODE]),
+            canvas,
+            SymbolPose(lane, end[1] - 5 - valve_symbols.THROTTLE_HALF_LENGTH, 2),
+            component,
+            (net, TANK_NODE),
+            ([end], [(lane, tank_rail)]),
         )
         if supply.control == "negative":
             signal, signal_lane = f"N {name}", lane + _SIGNAL_OFFSET
-            canvas.add_port(f"throttle {name}", signal, (lane, line_height))
+            canvas.add_port(component, signal, end)
             canvas.draw_wire(
                 signal,
-                (lane, line_height),
-                (signal_lane, line_height),
-                (signal_lane, rail_heights[signal]),
+                end,
+                (signal_lane, end[1]),
+                ((signal_lane, rail_heights[signal])),
                 is_signal=True,
             )

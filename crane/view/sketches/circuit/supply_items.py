@@ -1,6 +1,6 @@
 """Items below the rails of a circuit drawing: tank, engine, pumps, accumulators, elements."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from crane.hydraulics.circuit_elements import (
@@ -11,20 +11,30 @@ from crane.hydraulics.circuit_elements import (
     Supply,
 )
 from crane.hydraulics.hydraulic_circuit import Hydraulics
-from crane.view.plots.figure_text import escape_label
+from crane.view.plots.figure_style import escape_label
 from crane.view.sketches.circuit import machine_symbols, valve_symbols
-from crane.view.sketches.circuit.circuit_canvas import NAME_TEXT_SIZE, CircuitCanvas, SymbolPose
+from crane.view.sketches.circuit.circuit_canvas import (
+    LINE_HEIGHT,
+    CircuitCanvas,
+    SheetPoint,
+    SymbolPose,
+)
 from crane.view.sketches.circuit.circuit_functions import CircuitFunction
 from crane.view.sketches.circuit.valve_symbols import (
+    CHECK_HALF_LENGTH,
+    RELIEF_HALF_LENGTH,
+    THROTTLE_HALF_LENGTH,
+    WirePaths,
     format_flow,
     format_number,
     format_pressure,
     format_volume,
 )
 
-_LINE_HEIGHT = 7.6
 _SHAFT_DEPTH = 58.0  # of pumps and engine, below where they hang
 CONTROL_LABELS = {"pressure": "p", "load-sensing": "LS", "negative": "NFC", "positive": "PFC"}
+Rails = Mapping[str, float]
+_HALF_LENGTHS = {"relief": RELIEF_HALF_LENGTH, "check": CHECK_HALF_LENGTH}  # of other elements
 
 
 @dataclass(frozen=True)
@@ -36,198 +46,76 @@ class SupplyItem:
         height: Height of the item.
         wires: Nets of its lines upwards, with offsets from its left edge.
         stays_in_row: Whether it stays in the row of the previous item.
+        draw: Draws the item with its left edge at x and its top at y, below rails at heights by
+            net.
     """
 
     width: float
     height: float
-    wires: tuple[tuple[str, float], ...]
+    wires: Sequence[tuple[str, float]]
     stays_in_row: bool
-
-    def draw(self, canvas: CircuitCanvas, x: float, y: float, rails: Mapping[str, float]) -> None:
-        """Draw the item with its left edge at x and its top at y."""
+    draw: Callable[[CircuitCanvas, float, float, Rails], None]
 
 
 def create_supply_items(
     hydraulics: Hydraulics, functions: Sequence[CircuitFunction]
 ) -> list[SupplyItem]:
     """Return all items below the rails, from the left."""
-    items: list[SupplyItem] = [_create_tank(hydraulics)]
+    items = [_create_tank(hydraulics.supply)]
     if hydraulics.engine is not None:
         items.append(_create_engine(hydraulics.engine))
     for i, (name, supply) in enumerate(hydraulics.pumps.items()):
-        fed_functions = [x for x in functions if x.valve.supply == name]
-        senses = (
-            any(x.has_load_sensing for x in fed_functions) and supply.control == "load-sensing"
+        has_load_sensing = supply.control == "load-sensing" and any(
+            x.has_load_sensing for x in functions if x.valve.supply == name
         )
         # to the previous pump, to the engine, or to an unknown drive
-        shaft = 116.0 if i else 64.0 if hydraulics.engine is not None else 24.0
-        items.append(_create_pump(name, supply, senses, shaft))
+        items.append(
+            _create_pump(
+                name,
+                supply,
+                has_load_sensing,
+                116.0 if i else 64.0 if hydraulics.engine is not None else 24.0,
+            )
+        )
     items += [_create_accumulator(name, x) for name, x in hydraulics.accumulators.items()]
     items += [_create_element(name, x) for name, x in hydraulics.elements.items()]
     return items
 
 
-def _draw_labels(
-    canvas: CircuitCanvas,
-    x: float,
-    y: float,
-    available_width: float,
-    component: str,
-    name: str,
-    texts: Sequence[str],
-) -> None:
-    """Write a name at y and texts below it."""
-    canvas.draw_text(
-        x,
-        y,
-        name,
-        f"name {component}",
-        size=NAME_TEXT_SIZE,
-        weight="bold",
-        available_width=available_width - 6,
-    )
-    for k, text in enumerate(texts):
-        canvas.draw_text(
-            x,
-            y - 9 - _LINE_HEIGHT * k,
-            text,
-            f"label {component}",
-            available_width=available_width - 6,
-        )
-
-
-@dataclass(frozen=True)
-class _TankItem(SupplyItem):
-    texts: tuple[str, ...]
-
-    def draw(self, canvas: CircuitCanvas, x: float, y: float, rails: Mapping[str, float]) -> None:
+def _create_tank(supply: Supply) -> SupplyItem:
+    def draw(canvas: CircuitCanvas, x: float, y: float, rails: Rails) -> None:
         position = x + 20
         canvas.draw_wire(TANK_NODE, (position, rails[TANK_NODE]), (position, y - 14))
         valve_symbols.draw_tank(canvas, (position, y - 14), "tank", TANK_NODE, 11.0)
-        _draw_labels(canvas, position, y - 26, self.width, "tank", "tank", self.texts)
+        canvas.draw_labels((position, y - 26), "tank", "tank", [format_pressure(supply.tank)], 38)
+
+    return SupplyItem(44.0, 44.0, [(TANK_NODE, 20.0)], True, draw)
 
 
-def _create_tank(hydraulics: Hydraulics) -> _TankItem:
-    return _TankItem(
-        44.0, 44.0, ((TANK_NODE, 20.0),), True, (format_pressure(hydraulics.supply.tank),)
-    )
-
-
-@dataclass(frozen=True)
-class _EngineItem(SupplyItem):
-    texts: tuple[str, ...]
-
-    def draw(self, canvas: CircuitCanvas, x: float, y: float, rails: Mapping[str, float]) -> None:
-        position = x + 20
+def _create_engine(engine: Engine) -> SupplyItem:
+    def draw(canvas: CircuitCanvas, x: float, y: float, rails: Rails) -> None:
+        middle = (x + 20, y - _SHAFT_DEPTH)
         # the shaft goes on into the first pump
-        machine_symbols.draw_shaft(
-            canvas, (position, y - _SHAFT_DEPTH), (x + self.width, y - _SHAFT_DEPTH)
-        )
-        machine_symbols.draw_engine(canvas, (position, y - _SHAFT_DEPTH), "engine")
-        _draw_labels(
-            canvas, position, y - _SHAFT_DEPTH - 20, self.width, "engine", "engine", self.texts
+        machine_symbols.draw_shaft(canvas, middle, (x + 44, middle[1]))
+        machine_symbols.draw_engine(canvas, middle, "engine")
+        canvas.draw_labels(
+            ((middle[0], middle[1] - 20)),
+            "engine",
+            "engine",
+            [
+                f"{format_number(engine.speed * 9.5492966)} rpm",
+                f"{format_number(engine.torque * engine.speed / 1e3)} kW",
+            ],
+            38,
         )
 
-
-def _create_engine(engine: Engine) -> _EngineItem:
-    speed_text = f"{format_number(engine.speed * 9.5492966)} rpm"
-    power_text = f"{format_number(engine.torque * engine.speed / 1e3)} kW"
-    return _EngineItem(44.0, _SHAFT_DEPTH + 40, (), True, (speed_text, power_text))
-
-
-@dataclass(frozen=True)
-class _PumpItem(SupplyItem):
-    name: str
-    supply: Supply
-    has_load_sensing: bool
-    shaft_length: float
-    texts: tuple[str, ...]
-
-    def draw(self, canvas: CircuitCanvas, x: float, y: float, rails: Mapping[str, float]) -> None:
-        name, supply, component = self.name, self.supply, f"pump {self.name}"
-        position, middle = x + 52, y - _SHAFT_DEPTH
-        machine_symbols.draw_shaft(
-            canvas, (position - self.shaft_length, middle), (position, middle)
-        )
-        machine_symbols.draw_pump(
-            canvas, (position, middle), component, name, supply.control != "fixed"
-        )
-        canvas.draw_wire(
-            name, (position, middle + machine_symbols.PUMP_RADIUS), (position, rails[name])
-        )
-        bottom = middle - machine_symbols.PUMP_RADIUS
-        canvas.draw_wire("suction " + component, (position, bottom), (position, bottom - 5))
-        valve_symbols.draw_tank(
-            canvas, (position, bottom - 5), f"tank {component}", "suction " + component
-        )
-        _draw_labels(
-            canvas,
-            position,
-            bottom - 16,
-            2 * self.width - 104,
-            component,
-            escape_label(name),
-            self.texts,
-        )
-        if supply.control in CONTROL_LABELS:
-            box, control = (x + 20, y - 30), f"regulator {name}"
-            machine_symbols.draw_regulator(
-                canvas, box, CONTROL_LABELS[supply.control], control, supply.power > 0
-            )
-            signal_height, lane = box[1] - 2, position - 14.5
-            canvas.draw_line(
-                [(box[0] + 11, signal_height), (lane, signal_height), (lane, middle - 12)],
-                linewidth=0.6,
-            )
-            signal = {"load-sensing": f"LS {name}", "negative": f"N {name}"}.get(supply.control)
-            if signal is not None and any(net == signal for net, _ in self.wires):
-                lane = box[0]
-                canvas.add_port(control, signal, (lane, box[1] + 6))
-                canvas.draw_wire(signal, (lane, box[1] + 6), (lane, rails[signal]), is_signal=True)
-        elif supply.power > 0:
-            machine_symbols.draw_regulator(
-                canvas, (x + 20, y - 30), "P", f"regulator {name}", True
-            )
-        if supply.relief > 0:
-            relief, lane, top = f"relief {name}", position + 22, y - 8
-            body = top - 3 - valve_symbols.RELIEF_HALF_LENGTH
-            canvas.draw_wire(
-                name, (position, top), (lane, top), (lane, body + valve_symbols.RELIEF_HALF_LENGTH)
-            )
-            valve_symbols.draw_relief_valve(
-                canvas, SymbolPose(lane, body, 2, is_mirrored=True), relief, (name, TANK_NODE)
-            )
-            canvas.draw_wire(
-                TANK_NODE,
-                (lane, body - valve_symbols.RELIEF_HALF_LENGTH),
-                (lane, body - valve_symbols.RELIEF_HALF_LENGTH - 3),
-            )
-            valve_symbols.draw_tank(
-                canvas,
-                (lane, body - valve_symbols.RELIEF_HALF_LENGTH - 3),
-                f"tank {relief}",
-                TANK_NODE,
-                4.5,
-            )
-            canvas.draw_text(
-                lane + 14, body + 4, format_pressure(supply.relief), f"label {relief}", ha="left"
-            )
+    return SupplyItem(44.0, _SHAFT_DEPTH + 40, [], True, draw)
 
 
 def _create_pump(
     name: str, supply: Supply, has_load_sensing: bool, shaft_length: float
-) -> _PumpItem:
-    texts = [f"{format_flow(supply.flow)} l/min"] if supply.flow else ["unlimited flow"]
-    if supply.control != "fixed":
-        texts.append(f"max. {format_pressure(supply.pressure)}" if supply.control != "pressure"
-                     else format_pressure(supply.pressure))  # fmt: skip
-    if supply.control == "load-sensing":
-        texts.append(f"LS + {format_pressure(supply.margin)}")
-    if supply.control == "negative":
-        texts.append(f"pN {format_pressure(supply.signal)}")
-    if supply.power:
-        sharing_text = f" of {', '.join(supply.summed)}" if supply.summed else ""
-        texts.append(f"{format_number(supply.power / 1e3)} kW{sharing_text}")
+) -> SupplyItem:
+    texts = _pump_texts(supply)
     wires = [(name, 52.0)]
     if has_load_sensing:
         wires.append((f"LS {name}", 20.0))
@@ -235,112 +123,153 @@ def _create_pump(
         wires.append((f"N {name}", 20.0))
     if supply.relief:
         wires.append((name, 52.0))
-    height = _SHAFT_DEPTH + machine_symbols.PUMP_RADIUS + 21 + _LINE_HEIGHT * len(texts)
-    labels = tuple(escape_label(text) for text in texts)
-    return _PumpItem(
-        116.0, height, tuple(wires), True, name, supply, has_load_sensing, shaft_length, labels
+
+    def draw(canvas: CircuitCanvas, x: float, y: float, rails: Rails) -> None:
+        component, (position, middle) = f"pump {name}", (x + 52, y - _SHAFT_DEPTH)
+        machine_symbols.draw_shaft(canvas, ((position - shaft_length, middle)), (position, middle))
+        machine_symbols.draw_pump(
+            canvas, (position, middle), component, name, supply.control != "fixed"
+        )
+        canvas.draw_wire(
+            name, ((position, middle + machine_symbols.PUMP_RADIUS)), (position, rails[name])
+        )
+        canvas.draw_labels(
+            ((position, middle - machine_symbols.PUMP_RADIUS - 16)),
+            component,
+            escape_label(name),
+            texts,
+            122,
+        )
+        _draw_regulator(canvas, name, supply, (x + 20, y - 30), (position - 14.5, middle - 12))
+        for net, offset in wires:
+            if net != name:
+                port = (x + offset, y - 24)
+                canvas.add_port(f"regulator {name}", net, port)
+                canvas.draw_wire(net, port, (port[0], rails[net]), is_signal=True)
+        if supply.relief > 0:
+            relief, lane, top = f"relief {name}", position + 22, y - 8
+            pose = SymbolPose(lane, top - 3 - RELIEF_HALF_LENGTH, 2, True)
+            valve_symbols.draw_relief_valve(
+                canvas, pose, relief, (name, TANK_NODE), ([(position, top), (lane, top)], ())
+            )
+            valve_symbols.draw_tank(
+                canvas,
+                ((lane, pose.y - RELIEF_HALF_LENGTH)),
+                f"tank {relief}",
+                TANK_NODE,
+                4.5,
+                drop=3,
+            )
+            canvas.draw_text(
+                lane + 14, pose.y + 4, format_pressure(supply.relief), f"label {relief}", ha="left"
+            )
+
+    return SupplyItem(
+        116.0,
+        _SHAFT_DEPTH + machine_symbols.PUMP_RADIUS + 21 + LINE_HEIGHT * len(texts),
+        wires,
+        True,
+        draw,
     )
 
 
-@dataclass(frozen=True)
-class _AccumulatorItem(SupplyItem):
-    name: str
-    texts: tuple[str, ...]
+def _draw_regulator(
+    canvas: CircuitCanvas, name: str, supply: Supply, middle: SheetPoint, pump: SheetPoint
+) -> None:
+    """Draw the regulator of a pump, if it has one, with its line to the pump."""
+    component, has_power_limit = f"regulator {name}", supply.power > 0
+    control = CONTROL_LABELS.get(supply.control, "")
+    if control or has_power_limit:
+        machine_symbols.draw_regulator(canvas, middle, control or "P", component, has_power_limit)
+    if control:
+        height = middle[1] - 2
+        canvas.draw_line([(middle[0] + 11, height), (pump[0], height), pump], linewidth=0.6)
 
-    def draw(self, canvas: CircuitCanvas, x: float, y: float, rails: Mapping[str, float]) -> None:
-        component, position, middle = f"accumulator {self.name}", x + 34, y - 20
-        canvas.draw_wire(self.name, (x + 14, rails[self.name]), (x + 14, middle - 22),
-                 (position, middle - 22), (position, middle - 17))  # fmt: skip
-        machine_symbols.draw_accumulator(canvas, (position, middle), component, self.name)
-        _draw_labels(
-            canvas,
-            position,
-            middle - 32,
-            self.width,
+
+def _pump_texts(supply: Supply) -> list[str]:
+    texts = [f"{format_flow(supply.flow)} l/min" if supply.flow else "unlimited flow"]
+    if supply.control != "fixed":
+        limit = "" if supply.control == "pressure" else "max. "
+        texts.append(f"{limit}{format_pressure(supply.pressure)}")
+    if supply.control == "load-sensing":
+        texts.append(f"LS + {format_pressure(supply.margin)}")
+    if supply.control == "negative":
+        texts.append(f"pN {format_pressure(supply.signal)}")
+    if supply.power:
+        sharing_text = f" of {', '.join(supply.summed)}" if supply.summed else ""
+        texts.append(f"{format_number(supply.power / 1e3)} kW{sharing_text}")
+    return [escape_label(text) for text in texts]
+
+
+def _create_accumulator(name: str, gas: Accumulator) -> SupplyItem:
+    def draw(canvas: CircuitCanvas, x: float, y: float, rails: Rails) -> None:
+        component, lane, position, middle = f"accumulator {name}", x + 14, x + 34, y - 20
+        bottom, port = middle - 22, (position, middle - 17)
+        canvas.draw_wire(name, (lane, rails[name]), (lane, bottom), (position, bottom), port)
+        machine_symbols.draw_accumulator(canvas, (position, middle), component, name)
+        canvas.draw_labels(
+            (position, middle - 32),
             component,
-            escape_label(self.name),
-            self.texts,
+            escape_label(name),
+            (format_volume(gas.volume), f"p₀ {format_pressure(gas.precharge)}"),
+            62,
         )
 
-
-def _create_accumulator(name: str, gas: Accumulator) -> _AccumulatorItem:
-    texts = format_volume(gas.volume), f"p₀ {format_pressure(gas.precharge)}"
-    return _AccumulatorItem(68.0, 72.0, ((name, 14.0),), False, name, texts)
+    return SupplyItem(68.0, 72.0, [(name, 14.0)], False, draw)
 
 
-@dataclass(frozen=True)
-class _ElementItem(SupplyItem):
-    name: str
-    element: CircuitElement
-    texts: tuple[str, ...]
-
-    def draw(self, canvas: CircuitCanvas, x: float, y: float, rails: Mapping[str, float]) -> None:
-        element, component = self.element, f"element {self.name}"
-        nets = element.source, element.target
-        if TANK_NODE in nets:
-            ends_in_tank = element.target == TANK_NODE
-            net, position, middle = (nets[0] if ends_in_tank else nets[1]), x + 34, y - 20
-            canvas.draw_wire(net, (position, rails[net]), (position, middle + self._half_length))
-            pose = SymbolPose(position, middle, 2 if ends_in_tank else 0, is_mirrored=ends_in_tank)
-            bottom = middle - self._half_length
-            canvas.draw_wire(TANK_NODE, (position, bottom), (position, bottom - 4))
-            valve_symbols.draw_tank(canvas, (position, bottom - 4), f"tank {component}", TANK_NODE)
-        else:
-            middle, position = y - 24, x + 34
-            for net, sign in zip(nets, (-1, 1), strict=True):
-                lane = position + sign * 18
-                canvas.draw_wire(
-                    net,
-                    (position + sign * self._half_length, middle),
-                    (lane, middle),
-                    (lane, rails[net]),
-                )
-            pose = SymbolPose(position, middle, 3, is_mirrored=True)
-        self._draw_symbol(canvas, pose, component)
-        _draw_labels(canvas, x + 34, y - 52, 68.0, component, escape_label(self.name), self.texts)
-
-    @property
-    def _half_length(self) -> float:
-        return {
-            "relief": valve_symbols.RELIEF_HALF_LENGTH,
-            "check": valve_symbols.CHECK_HALF_LENGTH,
-        }.get(self.element.kind, valve_symbols.THROTTLE_HALF_LENGTH)
-
-    def _draw_symbol(self, canvas: CircuitCanvas, pose: SymbolPose, component: str) -> None:
-        element = self.element
-        nets = element.source, element.target
-        if element.kind == "relief":
-            valve_symbols.draw_relief_valve(canvas, pose, component, nets)
-        elif element.kind == "check":
-            valve_symbols.draw_check_valve(
-                canvas, pose, component, nets, has_spring=element.pressure > 0
-            )
-        else:
-            valve_symbols.draw_throttle(
-                canvas, pose, component, nets, element.kind == "leak", bool(element.joints)
-            )
-
-
-def _create_element(name: str, element: CircuitElement) -> _ElementItem:
-    texts = []
+def _create_element(name: str, element: CircuitElement) -> SupplyItem:
+    component, nets, texts = f"element {name}", (element.source, element.target), []
     if element.kind == "leak":
         per_bar = element.gain * 1e5
         is_small = per_bar < 1e-3 / 6e4
-        texts.append(
-            f"{format_flow(per_bar * (1e3 if is_small else 1))} {'m' * is_small}l/min per bar"
-        )
+        flow_text = format_flow(per_bar * (1e3 if is_small else 1))
+        texts.append(f"{flow_text} {'m' * is_small}l/min per bar")
     elif element.coefficient:
         texts.append(f"{format_flow(element.coefficient * 1e6**0.5)} l/min at 10 bar")
     if element.pressure:
         texts.append(format_pressure(element.pressure))
-    if element.joints:
-        side = "" if element.side == "both" else f" {element.side}"
-        texts += [f"by {joint}{side}" for joint in element.joints]
+    side = "" if element.side == "both" else f" {element.side}"
+    texts += [f"by {joint}{side}" for joint in element.joints]
+
+    def draw(canvas: CircuitCanvas, x: float, y: float, rails: Rails) -> None:
+        position = x + 34
+        if TANK_NODE in nets:
+            ends_in_tank = nets[1] == TANK_NODE
+            net = nets[0] if ends_in_tank else nets[1]
+            pose = SymbolPose(position, y - 20, 2 if ends_in_tank else 0, ends_in_tank)
+            paths = [(position, rails[net])], ()
+            _draw_element(canvas, element, pose, component, paths if ends_in_tank else paths[::-1])
+            bottom = (position, y - 20 - _HALF_LENGTHS.get(element.kind, THROTTLE_HALF_LENGTH))
+            valve_symbols.draw_tank(canvas, bottom, f"tank {component}", TANK_NODE, drop=4)
+        else:
+            lanes = zip(nets, (position - 18, position + 18), strict=True)
+            source_path, target_path = (
+                [(lane, rails[net]), (lane, y - 24)] for net, lane in lanes
+            )
+            pose = SymbolPose(position, y - 24, 3, is_mirrored=True)
+            _draw_element(canvas, element, pose, component, (source_path, target_path))
+        labels = [escape_label(text) for text in texts]
+        canvas.draw_labels((position, y - 52), component, escape_label(name), labels, 62)
+
+    wires = [(nets[0], 16.0), (nets[1], 52.0)]
+    if TANK_NODE in nets:
+        wires = [(net, 34.0) for net in nets if net != TANK_NODE]
+    return SupplyItem(76.0, 57.0 + LINE_HEIGHT * len(texts), wires, False, draw)
+
+
+def _draw_element(
+    canvas: CircuitCanvas,
+    element: CircuitElement,
+    pose: SymbolPose,
+    component: str,
+    paths: WirePaths,
+) -> None:
     nets = element.source, element.target
-    wires = [(net, 34.0) for net in nets if net != TANK_NODE]
-    if TANK_NODE not in nets:
-        wires = [(nets[0], 16.0), (nets[1], 52.0)]
-    labels = tuple(escape_label(text) for text in texts)
-    return _ElementItem(
-        76.0, 57.0 + _LINE_HEIGHT * len(texts), tuple(wires), False, name, element, labels
-    )
+    if element.kind == "relief":
+        valve_symbols.draw_relief_valve(canvas, pose, component, nets, paths)
+    elif element.kind == "check":
+        valve_symbols.draw_check_valve(canvas, pose, component, nets, paths, element.pressure > 0)
+    else:
+        is_leak, is_adjustable = element.kind == "leak", bool(element.joints)
+        valve_symbols.draw_throttle(canvas, pose, component, nets, paths, is_leak, is_adjustable)

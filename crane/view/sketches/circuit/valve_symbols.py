@@ -58,11 +58,11 @@ class SpoolSymbol:
         x: Middle of the middle box.
         y: Lower edge.
         lower_ports: Lower ports from the left, of "Ta", "LS", "P", "C", "T".
-        upper_ports: Upper ports, of "A", "C", "B".
+        upper_ports: Upper ports, of "A", "C'", "B"; "C'" is the upper outlet of the open centre.
         has_float_position: Whether it has a floating position.
 
     Attributes:
-        port_positions: Positions by name; "C'" is the upper outlet of the open centre.
+        port_positions: Positions of the ports of the middle box by name.
     """
 
     def __init__(
@@ -75,115 +75,65 @@ class SpoolSymbol:
     ):
         self._x, self._y, self._has_float_position = x, y, has_float_position
         self._width = 15.0 if has_float_position else 20.0
-        self._lower_ports = dict(
-            zip(lower_ports, self._spread_ports(len(lower_ports)), strict=True)
-        )
-        self._upper_ports = dict(
-            zip(upper_ports, self._spread_ports(len(upper_ports)), strict=True)
-        )
-        self.port_positions: dict[str, SheetPoint] = {
-            name: (x + port_offset, y) for name, port_offset in self._lower_ports.items()
-        }
-        self.port_positions |= {
-            ("C'" if name == "C" else name): (x + at, y + SPOOL_HEIGHT)
-            for name, at in self._upper_ports.items()
-        }
-
-    def _spread_ports(self, count: int) -> list[float]:
         half_range = 0.35 * self._width
-        return [half_range * (2 * i / (count - 1) - 1) for i in range(count)]
+        self.port_positions: dict[str, SheetPoint] = {
+            name: (x + half_range * (2 * i / (len(names) - 1) - 1), level)
+            for names, level in ((lower_ports, y), (upper_ports, y + SPOOL_HEIGHT))
+            for i, name in enumerate(names)
+        }
 
     def draw(self, canvas: CircuitCanvas, component: str) -> None:
         """Draw the symbol."""
-        x, y, w = self._x, self._y, self._width
-        first, last = x - 1.5 * w, x + (2.5 if self._has_float_position else 1.5) * w
-        corners = [(first, y), (last, y), (last, y + SPOOL_HEIGHT), (first, y + SPOOL_HEIGHT)]
-        canvas.draw_shape(corners, gid=component)
-        for k in range(1, 4 if self._has_float_position else 3):
+        x, y, w, ports = self._x, self._y, self._width, self.port_positions
+        box_count = 4 if self._has_float_position else 3
+        first, last = x - 1.5 * w, x + (box_count - 1.5) * w
+        canvas.draw_box((first, y), (last, y + SPOOL_HEIGHT), gid=component)
+        for k in range(1, box_count):
             canvas.draw_line([(first + k * w, y), (first + k * w, y + SPOOL_HEIGHT)])
         for height in (y - 1.8, y + SPOOL_HEIGHT + 1.8):  # of a proportional valve
             canvas.draw_line([(first, height), (last, height)], linewidth=0.6)
+        bottom, top, spring_height = y + 1.5, y + 0.46 * SPOOL_HEIGHT, y + 0.74 * SPOOL_HEIGHT
         for end_x, sign in ((first, -1), (last, 1)):
-            canvas.draw_spring(
-                (end_x, y + 0.74 * SPOOL_HEIGHT),
-                (end_x + sign * _END_WIDTH, y + 0.74 * SPOOL_HEIGHT),
-                half_width=3.0,
-            )
-            box = sorted((end_x, end_x + sign * _END_WIDTH))
-            box_bottom, box_top = y + 1.5, y + 0.46 * SPOOL_HEIGHT
-            canvas.draw_shape(
-                [(box[0], box_bottom), (box[1], box_bottom), (box[1], box_top), (box[0], box_top)]
-            )
-            canvas.draw_arrow(
-                (box[0] - 0.5, box_bottom - 1.5), (box[1] + 0.5, box_top + 1.5), size=3.0
-            )
+            outer_x = end_x + sign * _END_WIDTH
+            canvas.draw_spring((end_x, spring_height), (outer_x, spring_height), half_width=3.0)
+            left, right = sorted((end_x, outer_x))
+            canvas.draw_box((left, bottom), (right, top))
+            canvas.draw_arrow((left - 0.5, bottom - 1.5), (right + 0.5, top + 1.5), size=3.0)
             canvas.draw_line(
                 [
-                    (end_x + sign * 0.3 * _END_WIDTH, box_bottom),
-                    (end_x + sign * 0.7 * _END_WIDTH, box_top),
+                    *[(end_x + sign * 0.3 * _END_WIDTH, bottom)],
+                    (end_x + sign * 0.7 * _END_WIDTH, top),
                 ]
             )
-        tank_a = "Ta" if "Ta" in self._lower_ports else "T"
-        self._draw_flow_paths(canvas, x - w, [("P", "A"), ("B", "T")], set())
-        self._draw_middle_position(canvas, x)
-        self._draw_flow_paths(canvas, x + w, [("P", "B"), ("A", tank_a)], set())
+        self._draw_position(canvas, -w, [("P", "A"), ("B", "T")])
+        self._draw_position(canvas, 0.0, [("C", "C'")] if "C" in ports else [])
+        self._draw_position(canvas, w, [("P", "B"), ("A", ("Ta" if "Ta" in ports else "T"))])
         if self._has_float_position:
-            self._draw_float_position(canvas, x + 2 * w)
+            connected = [name for name in ("A", "B", "Ta", "T") if name in ports]
+            level = y + 0.55 * SPOOL_HEIGHT
+            for name in connected:
+                position_x, port_y = ports[name]
+                canvas.draw_line([(position_x + 2 * w, port_y), (position_x + 2 * w, level)])
+            port_x = [ports[name][0] + 2 * w for name in connected]
+            canvas.draw_line([(min(port_x), level), (max(port_x), level)])
+            self._draw_closed_ports(canvas, 2 * w, connected)
 
-    def _draw_flow_paths(
-        self,
-        canvas: CircuitCanvas,
-        x: float,
-        flow_paths: list[tuple[str, str]],
-        used_ports: set[str],
+    def _draw_position(
+        self, canvas: CircuitCanvas, offset: float, flow_paths: list[tuple[str, str]]
     ) -> None:
-        for source, target in flow_paths:
-            start, end = self._port_position(x, source), self._port_position(x, target)
-            canvas.draw_arrow(start, end, size=4.0)
-            used_ports |= {source, target}
-        self._draw_closed_ports(canvas, x, used_ports | {"LS"})
+        for path in flow_paths:
+            (x, y), (end_x, end_y) = (self.port_positions[name] for name in path)
+            canvas.draw_arrow((x + offset, y), (end_x + offset, end_y), size=4.0)
+        self._draw_closed_ports(canvas, offset, [name for path in flow_paths for name in path])
 
-    def _port_position(self, x: float, name: str) -> SheetPoint:
-        if name in self._upper_ports:
-            return x + self._upper_ports[name], self._y + SPOOL_HEIGHT
-        return x + self._lower_ports[name], self._y
-
-    def _draw_closed_ports(self, canvas: CircuitCanvas, x: float, used_ports: set[str]) -> None:
-        for row, level, sign in (
-            (self._lower_ports, self._y, 1),
-            (self._upper_ports, self._y + SPOOL_HEIGHT, -1),
-        ):
-            for name, position in row.items():
-                if name in used_ports:
-                    continue
-                end = level + sign * 5
-                canvas.draw_line([(x + position, level), (x + position, end)])
-                canvas.draw_line([(x + position - 2, end), (x + position + 2, end)])
-
-    def _draw_middle_position(self, canvas: CircuitCanvas, x: float) -> None:
-        used_ports = {"LS"}
-        if "C" in self._lower_ports:
-            start, end = (
-                (x + self._lower_ports["C"], self._y),
-                (x + self._upper_ports["C"], self._y + SPOOL_HEIGHT),
-            )
-            canvas.draw_arrow(start, end, size=4.0)
-            used_ports.add("C")
-        self._draw_closed_ports(canvas, x, used_ports)
-
-    def _draw_float_position(self, canvas: CircuitCanvas, x: float) -> None:
-        connection_height = self._y + 0.55 * SPOOL_HEIGHT
-        connected_ports = [
-            name
-            for name in ("A", "B", "Ta", "T")
-            if name in {**self._upper_ports, **self._lower_ports}
-        ]
-        for name in connected_ports:
-            position = self._port_position(x, name)
-            canvas.draw_line([position, (position[0], connection_height)])
-        port_x = [self._port_position(x, name)[0] for name in connected_ports]
-        canvas.draw_line([(min(port_x), connection_height), (max(port_x), connection_height)])
-        self._draw_closed_ports(canvas, x, {*connected_ports, "LS"})
+    def _draw_closed_ports(
+        self, canvas: CircuitCanvas, offset: float, open_ports: Sequence[str]
+    ) -> None:
+        for name, (x, y) in self.port_positions.items():
+            if name not in (*open_ports, "LS"):
+                x, end = x + offset, y + (5 if y == self._y else -5)
+                canvas.draw_line([(x, y), (x, end)])
+                canvas.draw_line([(x - 2, end), (x + 2, end)])
 
 
 RELIEF_HALF_LENGTH, CHECK_HALF_LENGTH, THROTTLE_HALF_LENGTH, COMPENSATOR_HALF_LENGTH = (
@@ -193,6 +143,7 @@ RELIEF_HALF_LENGTH, CHECK_HALF_LENGTH, THROTTLE_HALF_LENGTH, COMPENSATOR_HALF_LE
     8.0,
 )  # from the middle to either port
 _PILOT_DASHES = (0, (2, 1.5))
+WirePaths = tuple[Sequence[SheetPoint], Sequence[SheetPoint]]
 
 
 def _draw_ports(
@@ -200,28 +151,57 @@ def _draw_ports(
     pose: SymbolPose,
     component: str,
     nets: tuple[str, str],
+    paths: WirePaths,
     port_distance: float,
     body_half_length: float,
 ) -> None:
-    for net, sign in zip(nets, (-1, 1), strict=True):
-        canvas.add_port(component, net, pose.transform_point(0, sign * port_distance))
+    """Add both ports, and draw their lines to the body and the wires that end at them."""
+    for net, path, sign in zip(nets, paths, (-1, 1), strict=True):
+        port, end = pose((0, sign * port_distance), (0, sign * body_half_length))
+        canvas.add_port(component, net, port)
+        canvas.draw_wire(net, *path, port)
         if port_distance > body_half_length:
-            canvas.draw_line(
-                pose((0, sign * port_distance), (0, sign * body_half_length)), linewidth=1.0
-            )
+            canvas.draw_line([port, end], linewidth=1.0)
+
+
+def _draw_spool_valve(
+    canvas: CircuitCanvas,
+    pose: SymbolPose,
+    component: str,
+    half_width: float,
+    arrow_x: float,
+    spring_end: float,
+    pilot_y: float,
+) -> None:
+    """Draw a valve with a spring and a pilot line."""
+    canvas.draw_box(*pose((-half_width, -half_width), (half_width, half_width)), gid=component)
+    canvas.draw_arrow(*pose((arrow_x, -half_width), (arrow_x, half_width)))
+    canvas.draw_spring(*pose((half_width, 0), (spring_end, 0)))
+    canvas.draw_line(
+        pose((0, pilot_y), (-8.5, pilot_y), (-8.5, 0), (-half_width, 0)),
+        linewidth=0.6,
+        linestyle=_PILOT_DASHES,
+    )
 
 
 def draw_relief_valve(
-    canvas: CircuitCanvas, pose: SymbolPose, component: str, nets: tuple[str, str]
+    canvas: CircuitCanvas,
+    pose: SymbolPose,
+    component: str,
+    nets: tuple[str, str],
+    paths: WirePaths,
 ) -> None:
-    """Draw a pressure relief valve."""
-    _draw_ports(canvas, pose, component, nets, RELIEF_HALF_LENGTH, 5.5)
-    canvas.draw_shape(pose((-5.5, -5.5), (5.5, -5.5), (5.5, 5.5), (-5.5, 5.5)), gid=component)
-    canvas.draw_arrow(*pose((2.2, -5.5), (2.2, 5.5)))
-    canvas.draw_spring(*pose((5.5, 0), (12, 0)))
-    canvas.draw_line(
-        pose((0, -7.5), (-8.5, -7.5), (-8.5, 0), (-5.5, 0)), linewidth=0.6, linestyle=_PILOT_DASHES
-    )
+    """Draw a pressure relief valve.
+
+    Args:
+        canvas: Canvas of the drawing.
+        pose: Pose of the symbol.
+        component: Name of the component.
+        nets: Nets of inlet and outlet.
+        paths: Points of the wires that end at the inlet and at the outlet.
+    """
+    _draw_ports(canvas, pose, component, nets, paths, RELIEF_HALF_LENGTH, 5.5)
+    _draw_spool_valve(canvas, pose, component, 5.5, 2.2, 12, -7.5)
 
 
 def draw_compensator(
@@ -229,17 +209,12 @@ def draw_compensator(
     pose: SymbolPose,
     component: str,
     nets: tuple[str, str],
+    paths: WirePaths,
     senses_outlet: bool,
 ) -> None:
     """Draw a pressure compensator, closed by its inlet or outlet pressure."""
-    _draw_ports(canvas, pose, component, nets, COMPENSATOR_HALF_LENGTH, 6.0)
-    canvas.draw_shape(pose((-6, -6), (6, -6), (6, 6), (-6, 6)), gid=component)
-    canvas.draw_arrow(*pose((0, -6), (0, 6)))
-    canvas.draw_spring(*pose((6, 0), (11, 0)))
-    y = -7.5 if senses_outlet else 7.5
-    canvas.draw_line(
-        pose((0, y), (-8.5, y), (-8.5, 0), (-6, 0)), linewidth=0.6, linestyle=_PILOT_DASHES
-    )
+    _draw_ports(canvas, pose, component, nets, paths, COMPENSATOR_HALF_LENGTH, 6.0)
+    _draw_spool_valve(canvas, pose, component, 6, 0, 11, -7.5 if senses_outlet else 7.5)
 
 
 def draw_check_valve(
@@ -247,18 +222,19 @@ def draw_check_valve(
     pose: SymbolPose,
     component: str,
     nets: tuple[str, str],
+    paths: WirePaths,
     has_spring: bool = False,
 ) -> None:
     """Draw a check valve, optionally with a spring."""
-    for net, sign in zip(nets, (-1, 1), strict=True):
-        canvas.add_port(component, net, pose.transform_point(0, sign * CHECK_HALF_LENGTH))
+    _draw_ports(canvas, pose, component, nets, paths, CHECK_HALF_LENGTH, CHECK_HALF_LENGTH)
     canvas.draw_line(pose((0, -CHECK_HALF_LENGTH), (0, -3.8)), linewidth=1.0)
     canvas.draw_circle(pose.transform_point(0, 0.4), 3.0, gid=component)
     canvas.draw_line(pose((-4.4, 0.4), (0, -3.9), (4.4, 0.4)))
+    outlet = pose((0, 3.4), (0, CHECK_HALF_LENGTH))
     if has_spring:
-        canvas.draw_spring(*pose((0, 3.4), (0, CHECK_HALF_LENGTH)), half_width=1.8)
+        canvas.draw_spring(*outlet, half_width=1.8)
     else:
-        canvas.draw_line(pose((0, 3.4), (0, CHECK_HALF_LENGTH)), linewidth=1.0)
+        canvas.draw_line(outlet, linewidth=1.0)
 
 
 def draw_throttle(
@@ -266,15 +242,14 @@ def draw_throttle(
     pose: SymbolPose,
     component: str,
     nets: tuple[str, str],
+    paths: WirePaths,
     is_laminar: bool = False,
     is_adjustable: bool = False,
 ) -> None:
     """Draw an orifice or a laminar throttle; an arrow shows that it is adjustable."""
-    for net, sign in zip(nets, (-1, 1), strict=True):
-        canvas.add_port(component, net, pose.transform_point(0, sign * THROTTLE_HALF_LENGTH))
-    canvas.draw_line(
-        pose((0, -THROTTLE_HALF_LENGTH), (0, THROTTLE_HALF_LENGTH)), linewidth=1.0, gid=component
-    )
+    half_length = THROTTLE_HALF_LENGTH
+    _draw_ports(canvas, pose, component, nets, paths, half_length, half_length)
+    canvas.draw_line(pose((0, -half_length), (0, half_length)), linewidth=1.0, gid=component)
     for sign in (-1, 1):
         if is_laminar:
             arc = [(sign * (4.6 - 2.8 * math.cos(0.25 * k)), 1.25 * k) for k in range(-4, 5)]
@@ -286,11 +261,15 @@ def draw_throttle(
 
 
 def draw_rupture_valve(
-    canvas: CircuitCanvas, pose: SymbolPose, component: str, nets: tuple[str, str]
+    canvas: CircuitCanvas,
+    pose: SymbolPose,
+    component: str,
+    nets: tuple[str, str],
+    paths: WirePaths,
 ) -> None:
     """Draw a hose rupture valve."""
-    _draw_ports(canvas, pose, component, nets, CHECK_HALF_LENGTH + 2, 6.5)
-    canvas.draw_shape(pose((-6, -6.5), (6, -6.5), (6, 6.5), (-6, 6.5)), gid=component)
+    _draw_ports(canvas, pose, component, nets, paths, CHECK_HALF_LENGTH + 2, 6.5)
+    canvas.draw_box(*pose((-6, -6.5), (6, 6.5)), gid=component)
     canvas.draw_circle(pose.transform_point(0, 0.5), 2.2, zorder=3.1)
     canvas.draw_line(pose((-3.4, -2.4), (0, -5.6), (3.4, -2.4)))
     canvas.draw_spring(*pose((0, -1.6), (0, -5.4)), half_width=1.2)
@@ -303,9 +282,7 @@ def draw_shuttle_valve(
     """Draw a shuttle valve."""
     x, y = position
     canvas.add_port(component, net, position)
-    canvas.draw_shape(
-        [(x - 4, y - 2.6), (x + 4, y - 2.6), (x + 4, y + 2.6), (x - 4, y + 2.6)], gid=component
-    )
+    canvas.draw_box((x - 4, y - 2.6), (x + 4, y + 2.6), gid=component)
     canvas.draw_circle((x, y), 1.6, zorder=3.1)
     for sign in (-1, 1):
         canvas.draw_line([(x + sign * 3.6, y + 2), (x + sign * 1.8, y), (x + sign * 3.6, y - 2)],
@@ -313,18 +290,20 @@ def draw_shuttle_valve(
 
 
 def draw_tank(
-    canvas: CircuitCanvas, position: SheetPoint, component: str, net: str, half_width: float = 5.0
+    canvas: CircuitCanvas,
+    position: SheetPoint,
+    component: str,
+    net: str,
+    half_width: float = 5.0,
+    drop: float = 0.0,
 ) -> None:
-    """Draw a tank with its line."""
-    x, y = position
-    canvas.add_port(component, net, position)
+    """Draw a tank at the end of a line that goes down from a position by `drop`."""
+    x, y = position[0], position[1] - drop
+    canvas.draw_wire(net, position, (x, y))
+    canvas.add_port(component, net, (x, y))
+    left, right = x - half_width, x + half_width
     canvas.draw_line(
-        [
-            (x - half_width, y + 3.2),
-            (x - half_width, y - 2),
-            (x + half_width, y - 2),
-            (x + half_width, y + 3.2),
-        ],
+        [(left, y + 3.2), (left, y - 2), (right, y - 2), (right, y + 3.2)],
         linewidth=1.0,
         gid=component,
     )

@@ -1,15 +1,24 @@
-"""The section of a machine file on what an identification estimates, `identification`."""
+"""The sections of a machine file on its sensors and on what an identification estimates."""
 
 import math
 from typing import Any
 
-from crane.common.errors import InputError
+from crane.common.errors import InputError, suggest_names
+from crane.common.units import accepted_units
 from crane.description.estimation_settings import EstimationSettings, ParameterPrior, TermValues
+from crane.description.sensors import (
+    SENSOR_PARAMETERS,
+    TIME,
+    VALVE_SIGNAL_PREFIX,
+    Sensor,
+    quantity_names,
+    quantity_unit,
+    signal_delay_error,
+)
+from crane.formats.machine_file.structure_sections import TreeBuilder
 from crane.formats.machine_file.yaml_section import YamlSection
 from crane.formats.machine_file.yaml_values import as_boolean, as_float
 from crane.machine.machine import Machine
-
-_TERM_HINT = "on, off, a number or a list of numbers"
 
 
 def read_estimation(top: YamlSection) -> EstimationSettings:
@@ -44,7 +53,7 @@ def _read_term(section: YamlSection, name: str) -> TermValues | None:
         return () if is_wanted else None
     if isinstance(value, str) and not math.isfinite(as_float(value)):
         label = f"'{name}' of {section.title} is '{value}'"
-        raise section.error_at(name, f"{label}, give {_TERM_HINT}")
+        raise section.error_at(name, f"{label}, give on, off, a number or a list of numbers")
     return section.numbers(name) if isinstance(value, list) else (section.number(name),)
 
 
@@ -59,3 +68,30 @@ def _term_data(values: TermValues | None) -> bool | float | list[float]:
     if not values:
         return values is not None
     return values[0] if len(values) == 1 else list(values)
+
+
+def read_sensors(top: YamlSection, tree: TreeBuilder) -> dict[str, Sensor]:
+    """Sensors by the quantity that they measure."""
+
+    def read_sensor(name: str, item: YamlSection) -> Sensor:
+        unit = quantity_unit(tree.tree, name)
+        if unit is None:
+            known = suggest_names(quantity_names(tree.tree), name)
+            raise tree.unknown_name_error(
+                str(item.error_at(None, f"'{name}' is no quantity of this machine, {known}"))
+            )
+        units = accepted_units(unit)
+        if "unit" in item and (given := item.text("unit")) not in units:
+            raise item.error_at(
+                "unit", f"'{name}' is in [{given}], give {' or '.join(units) or 'no unit'}"
+            )
+        if name == TIME and any(key in item for key in SENSOR_PARAMETERS):
+            raise item.error_at(None, "time has a column and a unit, and no numbers of a sensor")
+        if name.startswith(VALVE_SIGNAL_PREFIX) and "delay" in item:
+            raise item.error_at("delay", str(signal_delay_error(name, name)))
+        try:
+            return Sensor(**item.values())
+        except InputError as error:
+            raise item.error_at(None, f"'{name}': {error}") from None
+
+    return top.read_map("sensors", read_sensor)

@@ -1,9 +1,9 @@
-"""Load charts over radius and height: contours, coloured by limiting factor."""
+"""Figures of load charts and tool forces over radius and height, by limiting factor."""
 
 import itertools
 from collections.abc import Mapping, Sequence
+from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from contourpy import contour_generator
 from matplotlib.axes import Axes
@@ -11,6 +11,7 @@ from matplotlib.colors import ListedColormap
 from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from matplotlib.patches import Patch as Swatch
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
@@ -18,9 +19,16 @@ from crane.common.samples import Array
 from crane.common.units import display_unit
 from crane.ratings.capacity_report import slew_labels
 from crane.ratings.lifting_capacity import Capacity
+from crane.ratings.tool_forces import ToolForce
 from crane.recordings.recording_summary import result_title
-from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, add_heading
+from crane.view.plots.figure_style import (
+    INK_COLOUR,
+    add_heading,
+    add_side_colour_bar,
+    escape_label,
+    figure_style,
+    set_round_ticks,
+)
 from crane.view.sketches.mechanism_projection import MachineOutline, machine_outline
 
 FACTOR_COLOURS = (
@@ -44,7 +52,7 @@ _MAX_CONTOURS, _CONTOUR_QUANTILES = (
 _ROUND_VALUES = np.array([1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def capacity_figure(chart: Capacity) -> Figure:
     """Return the figure of a load chart, a panel per slew angle."""
     lower, upper = drawing_extent(chart)
@@ -55,8 +63,7 @@ def capacity_figure(chart: Capacity) -> Figure:
     height = float(np.clip(8.6 / columns * content_height / content_width, 3.0, 6.5))
     width = float(np.clip(columns * height * content_width / content_height + 1.0, 5.0, 10.0))
     figure = Figure(figsize=(width, lines * height + 1.3), layout="constrained")
-    panels = figure.subplots(lines, columns, squeeze=False).ravel()
-    for k, axes in enumerate(panels):
+    for k, axes in enumerate(figure.subplots(lines, columns, squeeze=False).ravel()):
         if k < panel_count:
             draw_capacity_panel(axes, chart, k)
             if k % columns:
@@ -147,9 +154,13 @@ def draw_capacity_panel(axes: Axes, chart: Capacity, k: int) -> None:
         _draw_contours(axes, chart, k)
     else:
         b, a = np.nonzero(np.isfinite(index))
-        faces = [factor_tints[int(i)] for i in index[b, a]]
         axes.scatter(
-            chart.radii[a], chart.heights[b], c=faces, edgecolors=INK_COLOUR, s=30, zorder=3
+            chart.radii[a],
+            chart.heights[b],
+            c=[factor_tints[int(i)] for i in index[b, a]],
+            edgecolors=INK_COLOUR,
+            s=30,
+            zorder=3,
         )
     if lower[1] < 0 < upper[1] and chart.section.coordinate_names[1] == "height":
         axes.axhline(0.0, color=INK_COLOUR, linewidth=1.0, zorder=2)
@@ -157,8 +168,7 @@ def draw_capacity_panel(axes: Axes, chart: Capacity, k: int) -> None:
     u, w = chart.section.coordinate_names
     axes.set(xlabel=f"{u} [m]", ylabel=f"{w} [m]")
     axes.set_title(slew_labels(chart)[k], fontsize=9.5, loc="left")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MaxNLocator(8, steps=[1, 2, 2.5, 5, 10]))
+    set_round_ticks(axes, 8)
 
 
 def load_contours(chart: Capacity, k: int) -> list[tuple[float, list[Array]]]:
@@ -307,3 +317,102 @@ def _draw_machine(axes: Axes, machine_outline: MachineOutline) -> None:
         axes.plot(*np.array([start, end]).T, color=ROD_COLOUR, linewidth=1.2, zorder=5.4)
         axes.plot(*np.array([start, mouth]).T, color=BODY_COLOUR, linewidth=2.8, zorder=5.5,
                   solid_capstyle="butt")  # fmt: skip
+
+
+_FORCE_COLOURS = (
+    "#1f5fa8",
+    "#e0701a",
+    "#2a8c4a",
+    "#8a5fb0",
+    "#d9b53f",
+    "#b04a7a",
+    "#3f8f9f",
+    "#9a6b3f",
+    "#7a7a7a",
+    "#6f9bca",
+    "#c2452d",
+    "#333333",
+)
+_MAX_ARROWS = 12  # along the larger side
+
+
+@figure_style
+def tool_force_figure(chart: ToolForce) -> Figure:
+    """Return a row per slew angle: forces with arrows, and limiting factors."""
+    count, active_factors = len(chart.slews), chart.active_factors
+    all_forces, directions = chart.forces / 1e3, chart.section_directions()
+    largest_force = float(np.nanmax(np.where(np.isfinite(all_forces), all_forces, np.nan)))
+    aspect = float(np.ptp(chart.heights)) / max(float(np.ptp(chart.radii)), 1e-9)
+    height = float(np.clip(4.2 * aspect, 2.6, 6.5)) * count + 2.0
+    figure = Figure(figsize=(9.6, height), layout="constrained")
+    grid = figure.subplots(count, 2, squeeze=False, sharex=True, sharey=True)
+    colors = {k: _FORCE_COLOURS[j % len(_FORCE_COLOURS)] for j, k in enumerate(active_factors)}
+    options: Any = {"shading": "nearest", "rasterized": True}
+    for s, (left, right) in enumerate(grid):
+        forces = np.ma.masked_invalid(all_forces[s])
+        mesh = left.pcolormesh(
+            chart.radii, chart.heights, forces, cmap="viridis", vmin=0.0, vmax=largest_force,
+            **options,
+        )  # fmt: skip
+        if np.ptp(forces.compressed()) > 0 and min(forces.shape) > 1:
+            lines = left.contour(chart.radii, chart.heights, forces,
+                                 levels=MaxNLocator(8).tick_values(0, largest_force),
+                                 colors="white", linewidths=0.7)  # fmt: skip
+            left.clabel(lines, fmt="%g", fontsize=7)
+        _draw_arrows(left, chart, all_forces[s], directions[s], largest_force)
+        add_side_colour_bar(left, mesh, "force [kN]")
+        factor_index = np.full(forces.shape, np.nan)
+        for j, k in enumerate(active_factors):
+            factor_index[chart.limiting_factor_index[s] == k] = j
+        palette = ListedColormap(list(colors.values()) or [INK_COLOUR])
+        right.pcolormesh(chart.radii, chart.heights, np.ma.masked_invalid(factor_index),
+                         cmap=palette, vmin=-0.5, vmax=max(len(colors), 1) - 0.5,
+                         **options)  # fmt: skip
+        slew_text = f", slewed {np.rad2deg(chart.slews[s]):.4g}°" if count > 1 else ""
+        u, w = chart.section.coordinate_names
+        left.set(title=f"largest force{slew_text}", ylabel=f"{w} [m]")
+        right.set_title("limiting factor")
+        for axes in (left, right):
+            axes.set_aspect("equal")
+            axes.grid(False)
+            if s == count - 1:
+                axes.set_xlabel(f"{u} [m]")
+    figure.legend(
+        handles=[
+            Swatch(color=color, label=escape_label(str(chart.limiting_factors[k])))
+            for k, color in colors.items()
+        ],
+        loc="outside lower center",
+        ncols=2,
+        fontsize=8,
+    )
+    add_heading(
+        figure, escape_label(result_title(chart.machine.name, f"tool force, {chart.direction}"))
+    )
+    return figure
+
+
+def _draw_arrows(
+    axes: Axes, chart: ToolForce, forces: Array, directions: Array, largest_force: float
+) -> None:
+    """Draw the direction of the force at some positions; the length shows the magnitude."""
+    step = max(1, max(forces.shape) // _MAX_ARROWS)
+    rows, columns = (np.arange(n % step // 2, n, step) for n in forces.shape)
+    b, a = np.meshgrid(rows, columns, indexing="ij")
+    b, a = (x[np.isfinite(forces[b, a])] for x in (b, a))
+    if len(b):
+        arrow_length = max(np.ptp(chart.radii), np.ptp(chart.heights)) / _MAX_ARROWS
+        arrow_vectors = directions[b, a] * (forces[b, a] / largest_force * arrow_length)[:, None]
+        axes.quiver(
+            chart.radii[a],
+            chart.heights[b],
+            *arrow_vectors.T,
+            angles="xy",
+            scale_units="xy",
+            scale=1.0,
+            color="#f2f2f2",
+            edgecolor=INK_COLOUR,
+            linewidth=0.4,
+            width=0.008,
+            pivot="mid",
+        )

@@ -1,9 +1,8 @@
-"""Figures of design studies: curves, maps, or scatter plots with rank correlations."""
+"""Figures of studies and design optimizations: curves, maps, scatter plots, solutions."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
@@ -12,13 +11,14 @@ from scipy.stats import rankdata
 
 from crane.common.samples import Array
 from crane.recordings.recording_summary import result_title
+from crane.studies.optimization.design_optimization import Design
 from crane.studies.study_table import Study
-from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import (
+from crane.view.plots.figure_style import (
     DASHED_STYLE,
-    FIGURE_STYLE,
     RECORDED_COLOUR,
     add_heading,
+    escape_label,
+    figure_style,
 )
 
 _MAX_PANELS = 12  # measures of one picture
@@ -28,7 +28,7 @@ _TASK_COLORS = ("#2a9d6f", "#8a5fb0", "#c2452d", "#7f7f3f", "#3f8f9f")
 _INFEASIBLE_COLOUR = "#d9d9d9"
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def study_figure(study: Study) -> Figure:
     """Return the figure of a study, a panel per measure that varies.
 
@@ -41,8 +41,10 @@ def study_figure(study: Study) -> Figure:
         figure = _draw_scatter(study, shown_measures[:_MAX_SCATTER_ROWS])
     else:
         figure = _draw_panels(study, shown_measures)
-    heading = result_title(Path(study.machine_reference).stem, ", ".join(study.tasks))
-    add_heading(figure, escape_label(heading))
+    add_heading(
+        figure,
+        escape_label(result_title(Path(study.machine_reference).stem, ", ".join(study.tasks))),
+    )
     return figure
 
 
@@ -62,8 +64,7 @@ def _column_label(study: Study, name: str) -> str:
 def _draw_panels(study: Study, shown_measures: list[str]) -> Figure:
     columns = 2 if len(shown_measures) == 4 else min(_MAX_COLUMNS, len(shown_measures))
     rows = -(-len(shown_measures) // columns)
-    size = (max(5.2, 4.0 * columns), 3.3 * rows + 0.5)
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Figure(figsize=(max(5.2, 4.0 * columns), 3.3 * rows + 0.5), layout="constrained")
     for index, name in enumerate(shown_measures):
         axes = figure.add_subplot(rows, columns, index + 1)
         if len(study.parameters) == 1:
@@ -197,12 +198,73 @@ def _draw_scatter(study: Study, shown_measures: list[str]) -> Figure:
         len(shown_measures), len(study.parameters), sharex="col", sharey="row", squeeze=False
     )
     for row, name in zip(panels, shown_measures, strict=True):
-        values = study.columns[name]
         best_variant = study.rank(name)[:1]
         for axes, parameter in zip(row, study.parameters, strict=True):
-            x = study.columns[parameter]
-            _draw_cloud(axes, x, values, best_variant)
+            _draw_cloud(axes, study.columns[parameter], study.columns[name], best_variant)
         row[0].set_ylabel(_column_label(study, name))
     for axes, parameter in zip(panels[-1], study.parameters, strict=True):
         axes.set_xlabel(_column_label(study, parameter))
+    return figure
+
+
+@figure_style
+def design_figure(result: Design) -> Figure:
+    """Return solutions over their ranges, and of several objectives the first two."""
+    is_multi_objective = len(result.objectives) > 1
+    height = max(2.2, 0.9 + 0.34 * len(result.parameter_names))
+    figure = Figure(
+        figsize=(
+            10.0 if is_multi_objective else 7.0,
+            max(height, 3.6 if is_multi_objective else 2.2),
+        )
+    )
+    axes = figure.subplots(1, 2 if is_multi_objective else 1, squeeze=False)[0]
+    parameter_axes, ranges = axes[-1], result.upper - result.lower
+    rows = np.arange(len(result.parameter_names))
+    for k, x in enumerate(reversed(result.solutions)):
+        is_best = k == len(result.solutions) - 1
+        parameter_axes.plot(
+            (x.values - result.lower) / ranges,
+            rows,
+            "o-" if is_best and not is_multi_objective else "o",
+            color=RECORDED_COLOUR if is_best or is_multi_objective else "#b8b8b8",
+            markersize=5,
+            linewidth=1.2,
+            label=("best" if not is_multi_objective else "solutions") if is_best else None,
+        )
+    parameter_axes.plot(
+        (result.initial.values - result.lower) / ranges,
+        rows,
+        "D",
+        color="#c2452d",
+        markersize=5,
+        label="before",
+    )
+    parameter_axes.set_yticks(rows, [escape_label(name) for name in result.parameter_names])
+    parameter_axes.set(
+        ylim=(len(rows) - 0.5, -0.5), xlim=(-0.03, 1.03), xlabel="share of the range"
+    )
+    parameter_axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncol=2, frameon=False)
+    if is_multi_objective:
+        axes[0].plot(
+            *np.array([x.objectives[:2] for x in result.solutions]).T,
+            "o",
+            linestyle=DASHED_STYLE,
+            color=RECORDED_COLOUR,
+            markersize=5,
+            linewidth=1.0,
+        )
+        axes[0].plot(*result.initial.objectives[:2], "D", color="#c2452d", markersize=6)
+        axes[0].set(
+            xlabel=escape_label(result.objectives[0]), ylabel=escape_label(result.objectives[1])
+        )
+    goal = "; ".join(result.objectives)
+    figure.suptitle(
+        escape_label(f"{result.machine.name}: {goal}"),
+        x=0.01,
+        ha="left",
+        fontsize=10,
+        fontweight="bold",
+    )
+    figure.tight_layout(rect=(0, 0, 1, 0.97))
     return figure

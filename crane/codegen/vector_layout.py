@@ -1,0 +1,89 @@
+"""Layouts: names of the parts of a vector; formulas, which compute one."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from crane.codegen.symbolic import Scalar
+
+ArgumentKind = Literal["count", "array"]  # a number, or the address of an array or function
+
+
+class Layout:
+    """Named consecutive parts of a vector.
+
+    Args:
+        parts: Lengths by name; a length may be 0.
+
+    Attributes:
+        parts: Lengths by name.
+        size: Length of the vector.
+    """
+
+    def __init__(self, **parts: int):
+        self.parts: Mapping[str, int] = parts
+        starts = itertools.accumulate(parts.values(), initial=0)
+        self._slices = {
+            name: slice(start, start + parts[name])
+            for name, start in zip(parts, starts, strict=False)
+        }
+        self.size = sum(parts.values())
+
+    def __repr__(self) -> str:
+        return f"Layout({', '.join(f'{name}={length}' for name, length in self.parts.items())})"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Layout) and [*self.parts.items()] == [*other.parts.items()]
+
+    def __hash__(self) -> int:
+        return hash(tuple(self.parts.items()))
+
+    def __getitem__(self, name: str) -> slice:
+        """Where a part is."""
+        return self._slices[name]
+
+    def start_index(self, name: str) -> int:
+        """Index of a part's first element."""
+        return int(self._slices[name].start)
+
+    def view(self, array: Any) -> "LayoutView":
+        """The parts of an array (..., size) or of a sequence, by name."""
+        return LayoutView(self, array)
+
+
+class LayoutView:
+    """Parts of one array as attributes; see `Layout.view`."""
+
+    def __init__(self, layout: Layout, array: Any):
+        self.__dict__.update(
+            {
+                name: array[layout[name]] if isinstance(array, list) else array[..., layout[name]]
+                for name in layout.parts
+            }
+        )
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(f"no part '{name}', there are {', '.join(vars(self))}")
+
+
+@dataclass(frozen=True, eq=False)
+class Formula:
+    """f(in_0, in_1, ..., out), straight-line code.
+
+    Attributes:
+        name: Its name.
+        input_count: Number of input arguments.
+        outputs: Output expressions, (m,).
+        layout: Layout of the outputs.
+    """
+
+    name: str
+    input_count: int
+    outputs: Sequence[Scalar]
+    layout: Layout
+
+    @property
+    def argument_kinds(self) -> tuple[ArgumentKind, ...]:
+        """Kinds of the arguments."""
+        return tuple("array" for _ in range(self.input_count + 1))
