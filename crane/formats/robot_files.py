@@ -133,9 +133,7 @@ def open_robots(machine: Machine, chains: Iterable[str] | None = None) -> Iterat
         chains: Names of the chains, all if not given.
     """
     chain_names = None if chains is None else set(chains)
-    with use_load_options(
-        machine.packages, machine.arguments, trust_xacro=machine.trusts_xacro
-    ):
+    with use_load_options(machine.packages, machine.arguments, trust_xacro=machine.trusts_xacro):
         with warnings.catch_warnings():  # they were issued when it was loaded
             warnings.simplefilter("ignore", CraneWarning)
             documents = [

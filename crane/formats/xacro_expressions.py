@@ -13,8 +13,8 @@ import string
 from typing import Any
 
 _NODES = (
-    ast.Expression, ast.Constant, ast.Name, ast.Load, ast.Store, ast.BinOp, ast.UnaryOp, ast.BoolOp,
-    ast.operator, ast.unaryop, ast.boolop, ast.Compare, ast.cmpop, ast.IfExp, ast.Subscript,
+    ast.Expression, ast.Constant, ast.Name, ast.Load, ast.Store, ast.BinOp, ast.UnaryOp,
+    ast.BoolOp, ast.operator, ast.unaryop, ast.boolop, ast.Compare, ast.cmpop, ast.IfExp, ast.Subscript,
     ast.Slice, ast.List, ast.Tuple, ast.Dict, ast.Set, ast.ListComp, ast.SetComp, ast.DictComp,
     ast.GeneratorExp, ast.comprehension, ast.Attribute, ast.Call, ast.keyword, ast.Starred,
     ast.JoinedStr, ast.FormattedValue,

@@ -78,7 +78,7 @@ class _ReadableFolders:
             PermissionError: It is not.
         """
         if not any(Path(file).resolve().is_relative_to(folder) for folder in self._folders):
-            reason = "not in its package, give --packages FOLDER, or --trust-xacro to read all files"
+            reason = "not in its package, give --packages FOLDER or --trust-xacro"
             raise PermissionError(errno.EACCES, reason, str(file))
         return Path(file)
 
