@@ -14,7 +14,8 @@ from typing import Any
 
 _NODES = (
     ast.Expression, ast.Constant, ast.Name, ast.Load, ast.Store, ast.BinOp, ast.UnaryOp,
-    ast.BoolOp, ast.operator, ast.unaryop, ast.boolop, ast.Compare, ast.cmpop, ast.IfExp, ast.Subscript,
+    ast.BoolOp, ast.operator, ast.unaryop, ast.boolop, ast.Compare, ast.cmpop, ast.IfExp,
+    ast.Subscript,
     ast.Slice, ast.List, ast.Tuple, ast.Dict, ast.Set, ast.ListComp, ast.SetComp, ast.DictComp,
     ast.GeneratorExp, ast.comprehension, ast.Attribute, ast.Call, ast.keyword, ast.Starred,
     ast.JoinedStr, ast.FormattedValue,
@@ -29,7 +30,7 @@ class UnsafeExpressionError(ValueError):
     """An expression that could do more than compute with data."""
 
 
-class _Formatter(string.Formatter):
+class _FieldFormatter(string.Formatter):
     """`str.format` whose fields are arguments, without attributes and items of these."""
 
     def get_field(self, field_name: str, args: Any, kwargs: Any) -> Any:
@@ -69,7 +70,7 @@ def restrict_expressions(xacro: Any, substitution: Any) -> None:
         if type(value) not in data or name == "format_map":
             raise UnsafeExpressionError(f"'{name}' of {type(value).__name__} is not allowed")
         if type(value) is str and name == "format":
-            return lambda *args, **kwargs: _Formatter().vformat(value, args, kwargs)
+            return lambda *args, **kwargs: _FieldFormatter().vformat(value, args, kwargs)
         return getattr(value, name)
 
     functions = {name: getattr(builtins, name) for name in _FUNCTIONS}
