@@ -370,6 +370,28 @@ def test_files_outside_of_the_package_are_not_read(tmp_path, how):
             load(path, packages=[secret.parent])
 
 
+def test_neighbours_without_a_manifest_are_packages_but_no_other_folders(tmp_path, monkeypatch):
+    """Any folder has a package's name: one beside the home folder is none."""
+    robot = tmp_path / "home" / "src" / "robot" / "urdf" / "r.xacro"
+    for folder in (robot.parent, tmp_path / "home" / "src" / "parts", tmp_path / "home" / "keys"):
+        folder.mkdir(parents=True)
+        (folder / "names.yaml").write_text("key: inside\n")
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+
+    def key(package):
+        robot.write_text(
+            '<robot name="e" xmlns:xacro="http://www.ros.org/wiki/xacro"><link name="base"/>'
+            f"<link name=\"${{xacro.load_yaml('$(find {package})/names.yaml')['key']}}\"/>"
+            '<joint name="j" type="continuous"><parent link="base"/><child link="inside"/></joint>'
+            "</robot>"
+        )
+        return load(robot)
+
+    assert key("parts").joints == key("urdf").joints == ("j",)
+    with pytest.raises(CraneError, match="not in its package"):
+        key("keys")
+
+
 def test_environment_is_not_read(tmp_path, monkeypatch):
     monkeypatch.setenv("SECRET", "hidden")
     assert load(stranger(tmp_path, "'$(optenv SECRET none)' == 'none'", "if")).joints == ("j",)

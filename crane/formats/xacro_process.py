@@ -20,6 +20,7 @@ from typing import Any
 from xml.dom import expatbuilder
 from xml.parsers.expat import ExpatError
 
+_WORKSPACE_LEVELS = 3  # from the folder of a file to that of its package's neighbours
 MAX_LENGTH = 50_000_000  # characters of an expanded file
 LOCATION_ATTRIBUTE = "crane_place"
 _XACRO_PREFIX = "xacro:"
@@ -63,12 +64,16 @@ class _ReadableFolders:
     def add_package(self, folder: Path) -> None:
         """Add a package, and its source if it is installed by links.
 
-        A folder without a manifest is only added if it contains the first file and is not a home
-        folder or above one: each folder has the name of a package.
+        Any folder has the name of a package, so one without a manifest is added only if it is near
+        the first file: it contains the file, or is in one of the folders that do, at most
+        `_WORKSPACE_LEVELS` above it and below the user's home.
         """
         if self._enclosing_package(folder) == folder:
             self._folders |= {folder.resolve(), (folder / "package.xml").resolve().parent}
-        elif self._file.is_relative_to(folder) and not Path.home().is_relative_to(folder):
+            return
+        nearby = self._file.parents[: _WORKSPACE_LEVELS + 1]
+        workspace = [x for x in nearby if not Path.home().is_relative_to(x)]
+        if {folder.resolve(), folder.resolve().parent} & {*workspace}:
             self._folders.add(folder.resolve())
 
     def check(self, file: str | Path) -> Path:
