@@ -258,6 +258,7 @@ def failing(steps, *arguments, **settings):
     return str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 def test_a_branch_that_is_left_is_left_alike(forwarder, steps):
     free = forwarder.replace(friction={}, end_stops=())

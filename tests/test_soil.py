@@ -158,6 +158,7 @@ def test_beyond_the_bounds_of_the_rake_it_cuts_with_their_wedges():
     assert almost == pytest.approx(flat, rel=1e-2, abs=1.0)
 
 
+@pytest.mark.slow
 def test_it_never_drives_the_edge_and_is_always_a_number():
     random = np.random.default_rng(0)
     some = 0

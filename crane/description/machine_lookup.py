@@ -86,7 +86,7 @@ def command_line_arguments(
         words += [x for key, value in (values or {}).items() for x in (option, f"{key}={value!r}")]
     for option, joints in {"--active": active, "--free": free}.items():
         words += [] if joints is None else [option, ",".join(joints)]
-    words += ["--floating"] * options.floating_root
+    words += ["--floating"] * options.floating_root + ["--trust-xacro"] * options.trust_xacro
     words += [x for folder in options.packages for x in ("--packages", folder)]
     words += [x for key, value in options.arguments.items() for x in ("--arg", f"{key}:={value}")]
     return shlex.join(words)

@@ -124,6 +124,7 @@ def _check_written_home(path: Path, expected: Machine) -> None:
             free=expected.chosen_joints.get("free"),
             packages=expected.packages,
             arguments=_without_lenience(expected).arguments,
+            trust_xacro=expected.trusts_xacro,
         )
     except CraneError as error:
         raise OutputError(f"{path}: home cannot be written into it ({error})") from None

@@ -51,6 +51,7 @@ def load(
     packages: Sequence[str | Path] = (),
     arguments: Mapping[str, object] | None = None,
     strict: bool = False,
+    trust_xacro: bool = False,
 ) -> Machine:
     """Load a machine, optionally with changed parameters or locked joints.
 
@@ -78,6 +79,8 @@ def load(
             home that is far from the home of the file.
         strict: Whether to refuse, as `check` does, formal errors such as infeasible inertias, see
             `crane.machine.machine_checks`.
+        trust_xacro: Whether a xacro file may run Python in its expressions and read all files and
+            environment variables, as by xacro itself; by default as `docs/security.md` says.
 
     Returns:
         The machine, closed at home.
@@ -89,7 +92,10 @@ def load(
     """
     package_paths, values = check_package_folders(packages), check_argument_values(arguments)
     floating = floating if isinstance(floating, bool) else check_freedoms(floating)
-    with summarize_warnings(), use_load_options(package_paths, values, bool(floating), strict):
+    with (
+        summarize_warnings(),
+        use_load_options(package_paths, values, bool(floating), strict, trust_xacro or None),
+    ):
         chosen_joints = _check_chosen_joints(active=active, free=free)
         spec = _read_spec(name, chosen_joints, floating)
         return _assemble_machine(spec, changes, lock, chosen_joints, floating)
@@ -170,6 +176,7 @@ class MachineVariants:
             check_package_folders(original.packages),
             check_argument_values(original.arguments),
             bool(original.floating_base),
+            trust_xacro=original.trusts_xacro,
         )
 
 
@@ -233,6 +240,7 @@ def _assemble_machine(
         floating_base=floating,
         packages=load_options().packages,
         arguments=MappingProxyType(load_options().arguments),
+        trusts_xacro=load_options().trust_xacro,
         parameter_changes=MappingProxyType(
             {name: float(value) for name, value in (changes or {}).items()}
         ),
@@ -273,7 +281,7 @@ def _check_chosen_joints(**chosen_joints: Sequence[str] | None) -> dict[str, tup
 
 
 def load_from_expression(expression: str) -> Machine:
-    """Load a machine from the text of `Machine.load_expression`.
+    """Load a machine from the text of `Machine.load_expression`, without trust in xacro files.
 
     Raises:
         InputError: The text is malformed; otherwise as `load`.
@@ -284,7 +292,8 @@ def load_from_expression(expression: str) -> Machine:
         if CHANGES_SEPARATOR not in expression:
             raise
     else:
-        return load(expression)  # a path may hold anything
+        with use_load_options(trust_xacro=False):
+            return load(expression)  # a path may hold anything
     name, _, text = expression.partition(CHANGES_SEPARATOR)
     try:
         options = json.loads(text)
@@ -306,4 +315,5 @@ def load_from_expression(expression: str) -> Machine:
         raise InputError(
             f"'{expression}' names no machine, write NAME{CHANGES_SEPARATOR}{example}"
         )
-    return load(name, changes, lock, active, free, floating, packages, arguments)
+    with use_load_options(trust_xacro=False):
+        return load(name, changes, lock, active, free, floating, packages, arguments)

@@ -28,7 +28,7 @@ def _expand_xacro(xml: XmlFile) -> XmlFile:
     """Return a file with its macros expanded and the source locations of its elements.
 
     xacro itself processes includes by `$(find PACKAGE)`, `package://` and paths, arguments,
-    conditions, properties and YAML.
+    conditions, properties and YAML, with the restrictions of `crane.formats.xacro_process`.
 
     Raises:
         DescriptionError: xacro is not installed, or refuses the file.
@@ -69,7 +69,7 @@ def _run_xacro_process(file: Path) -> dict[str, Any]:
     options = load_options()
     request = {
         "file": str(file), "root": str(_PACKAGE_ROOT), "packages": list(options.packages),
-        "arguments": dict(options.arguments),
+        "arguments": dict(options.arguments), "trust": options.trust_xacro,
     }  # fmt: skip
     program = [sys.executable, "-P", xacro_process.__file__]  # without its folder in sys.path
     try:
@@ -135,7 +135,7 @@ def open_robots(machine: Machine, chains: Iterable[str] | None = None) -> Iterat
         chains: Names of the chains, all if not given.
     """
     chain_names = None if chains is None else set(chains)
-    with use_load_options(machine.packages, machine.arguments):
+    with use_load_options(machine.packages, machine.arguments, trust_xacro=machine.trusts_xacro):
         with warnings.catch_warnings():  # they were issued when it was loaded
             warnings.simplefilter("ignore", CraneWarning)
             documents = [

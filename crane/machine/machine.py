@@ -85,6 +85,7 @@ class Machine(OneLineRepr):
         floating_base: Whether its root was made a floating base, or with which degrees of freedom.
         packages: Folders in which packages were searched for.
         arguments: Values of its file's arguments.
+        trusts_xacro: Whether its xacro files may run Python and read all files.
     """
 
     name: str
@@ -119,6 +120,7 @@ class Machine(OneLineRepr):
     floating_base: bool | tuple[str, ...]
     packages: tuple[str, ...]
     arguments: Mapping[str, str]
+    trusts_xacro: bool = False
 
     def _one_line(self) -> str:
         words = [
@@ -210,6 +212,7 @@ class Machine(OneLineRepr):
         """Text from which this machine can be loaded again, with its changes and locks.
 
         For example 'patu655 with {"changes": {"payload.mass": 200.0}, "lock": {"slew": 0.0}}'.
+        Trust in its xacro files is not part of it.
         """
         given = {
             "changes": dict(self.parameter_changes),
@@ -226,7 +229,12 @@ class Machine(OneLineRepr):
     @property
     def command_line_arguments(self) -> str:
         """Command line arguments that load this machine again, quoted for a shell."""
-        load_options = LoadOptions(self.packages, self.arguments, bool(self.floating_base))
+        load_options = LoadOptions(
+            self.packages,
+            self.arguments,
+            bool(self.floating_base),
+            trust_xacro=self.trusts_xacro,
+        )
         active, free = map(self.chosen_joints.get, ("active", "free"))
         changed = self.parameter_changes, self.locked_joints
         return command_line_arguments(self.load_name, active, free, *changed, load_options)

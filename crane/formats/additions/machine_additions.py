@@ -317,7 +317,7 @@ def add_loops(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
         loaded = load(machine, packages=packages, arguments=arguments)
-        with use_load_options(loaded.packages, loaded.arguments):
+        with use_load_options(loaded.packages, loaded.arguments, trust_xacro=loaded.trusts_xacro):
             spec = read_machine_spec(machine)
     proposed_loops = propose_loops(spec, loaded.model, loaded.home)
     if not proposed_loops:
