@@ -16,6 +16,6 @@ noise = np.random.default_rng(0).normal(size=run.tau.shape)
 recording = replace(run, tau=run.tau + 0.1 * noise)  # noise of force sensors: 0.1 N, 0.1 N m
 
 found = crane.identification.identify_payload(empty, recording)
-low, high = found.interval()[0]
+low, high = found.confidence_interval()[0]
 print(f"it carries {1e3 * found.mass:.0f} g, 95 % between {1e3 * low:.0f} and {1e3 * high:.0f} g")
 assert low < LOG < high and high - low < 0.02

@@ -46,7 +46,7 @@ def main() -> None:
         truth = result.base.values(
             IdentificationModel(virtual.plant, given(virtual.plant)).nominal
         )
-        low, high = result.interval().T
+        low, high = result.confidence_interval().T
         covered = (low <= truth) & (truth <= high)
         z = (result.values - truth) / result.std
         for name, *pair in zip(result.names, z.tolist(), covered.tolist(), strict=True):

@@ -80,7 +80,7 @@ def main() -> None:
         truth = result.base.values(
             IdentificationModel(virtual.plant, terms(virtual.plant)).nominal
         )
-        low, high = result.interval().T
+        low, high = result.confidence_interval().T
         covered.append(float(np.mean((low <= truth) & (truth <= high))))
         model = identify(machine, one, other, prior=PRIOR, **settings)
         # the floor: what the true parameters leave of the same recording

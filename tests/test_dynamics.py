@@ -371,7 +371,7 @@ def test_power_of_the_drives_is_the_rate_of_energy_plus_dissipation(loaded):
     dynamics = crane.Dynamics(loaded)
     q_a, v_a, _, tau = states(40, seed=14)
     q_a[:, 1:] = np.clip(q_a[:, 1:], 1e-3, STROKE - 1e-3)  # clear of the end stops
-    here = list(dynamics.forces.sticking)
+    here = list(dynamics.forces.stick_slip_columns)
     for q, v, force in zip(q_a, v_a, tau, strict=True):
         a = dynamics.forward(q, v, force, friction=True)
         # along q + v t + a t^2 / 2; strokes move by micrometres

@@ -32,7 +32,7 @@ def test_ordinary_least_squares_of_white_noise():
     assert found.scaled_condition < 1.3
     textbook = np.sqrt(squares / 796 * np.diag(np.linalg.inv(W.T @ W)))
     np.testing.assert_allclose(found.std, textbook, rtol=0.15)
-    half = np.diff(found.interval(0.9))[:, 0] / 2
+    half = np.diff(found.confidence_interval(0.9))[:, 0] / 2
     np.testing.assert_allclose(half, t.ppf(0.95, found.degrees_of_freedom) * found.std)
 
 
@@ -142,7 +142,9 @@ def test_intervals_cover_the_truth(estimator, kind, strength, gaps, count):
         W[..., 1] = 1 + 0.1 * W[..., 1]
         y = W @ truth + draw(kind, strength, rng, count, joints)
         kept = np.abs(W[..., 2]) > 0.1 * gaps
-        low, high = estimator(W[kept], y[kept], groups[kept], samples[kept]).interval().T
+        low, high = (
+            estimator(W[kept], y[kept], groups[kept], samples[kept]).confidence_interval().T
+        )
         covered.append((low < truth) & (truth < high))
     assert 0.90 <= np.mean(covered) <= 0.99
 

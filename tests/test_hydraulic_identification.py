@@ -266,7 +266,7 @@ def test_noise_like_the_paper_s(machine, slow, method):
     run = recorded(data, 1.0, rng, bits=BITS)
     found = identify_orifices(machine, run, "boom", method, period=40.0)
     np.testing.assert_allclose(found.values[1:], X[1:], rtol=0.05)
-    low, high = found.interval().T
+    low, high = found.confidence_interval().T
     assert ((low < X) & (high > X)).all()
     judged = found.predict(recorded([c[:count] for c in slow]))
     assert judged.relative_error < 0.01
@@ -281,7 +281,7 @@ def test_intervals_cover_and_nothing_is_biased(machine, quick, method):
     errors, inside = np.empty((draws, 5)), np.empty((draws, 5))
     for i in range(draws):
         found = identify_orifices(machine, recorded(data, 1.0, rng), "boom", method)
-        low, high = found.interval().T
+        low, high = found.confidence_interval().T
         errors[i], inside[i] = found.values / X - 1, (low < X) & (high > X)
     cover = inside.mean(axis=0)
     assert (cover >= 0.88).all() and (cover <= 0.995).all(), cover
@@ -765,7 +765,9 @@ def test_friction_intervals_cover(machine):
     inside = np.zeros(5)
     for _ in range(draws):
         run = strokes(SPEEDS, 60.0, rng, step=2e-2)
-        low, high = identify_cylinder_friction(machine, run, "boom", stribeck=True).interval().T
+        low, high = (
+            identify_cylinder_friction(machine, run, "boom", stribeck=True).confidence_interval().T
+        )
         truth = np.array(list(LAW.values()))
         inside += (low < truth) & (truth < high)
     assert (inside >= 0.88 * draws).all() and (inside <= 0.995 * draws).all(), inside

@@ -32,7 +32,7 @@ def worst(X):
 
 
 def inside(X, level=0.95):
-    low, high = X.interval(level).T
+    low, high = X.confidence_interval(level).T
     return (low < circuit.TRUE) & (high > circuit.TRUE)
 
 

@@ -268,7 +268,9 @@ def test_the_parameters_as_a_table(found, tmp_path):
     assert [row["parameter"] for row in rows] == list(found.names)
     np.testing.assert_array_equal([float(row["value"]) for row in rows], found.values)
     assert [row["mark"] for row in rows] == list(found.marks)
-    np.testing.assert_array_equal([float(row["lower"]) for row in rows], found.interval()[:, 0])
+    np.testing.assert_array_equal(
+        [float(row["lower"]) for row in rows], found.confidence_interval()[:, 0]
+    )
 
 
 # --- report ----------------------------------------------------------------------------------
@@ -319,7 +321,7 @@ def test_the_intervals_of_a_load_cover_it(mini):
     loaded = mini.with_payload(LOAD)
     covered = []
     for seed in range(12):
-        low, high = identify_payload(mini, motion(loaded, seed)).interval().T
+        low, high = identify_payload(mini, motion(loaded, seed)).confidence_interval().T
         covered.append((low <= TRUTH) & (high >= TRUTH))
     assert np.mean(covered) > 0.88  # of 48
     estimate = identify_payload(mini, motion(loaded, 1))
@@ -404,7 +406,7 @@ def test_friction_that_is_not_as_described_is_no_load(mini):
     """Twice the Coulomb friction, motion both ways: the load is the load."""
     rough = rougher(mini, 2.0)
     estimate = identify_payload(mini, motion(rough.with_payload(LOAD), 1))
-    low, high = estimate.interval()[0]
+    low, high = estimate.confidence_interval()[0]
     assert low < 0.2 < high and high - low < 0.02
     for i, joint in enumerate(mini.active):
         wanted = mini.friction[joint].coulomb
@@ -425,7 +427,7 @@ def test_motion_one_way_does_not_tell_friction_from_weight(mini):
     # a long way tells a load by its levers, whatever the friction
     for factor in (1.0, 3.0):
         right = identify_payload(mini, one_way(rougher(mini, factor).with_payload(LOAD), 0.02))
-        low, high = right.interval()[0]
+        low, high = right.confidence_interval()[0]
         assert low < 0.2 < high and high - low < 0.05
     assert right.friction_corrections == {}
 
@@ -444,7 +446,7 @@ def test_one_speed_each_way_tells_friction_and_a_load_as_a_point(mini):
     tau = crane.Dynamics(rough).inverse(q, v, a, friction=True)
     tau += NOISE * np.random.default_rng(0).normal(size=tau.shape)
     estimate = identify_payload(mini, Motion(step * np.arange(len(v)), q, v, a, tau))
-    low, high = estimate.interval()[0]
+    low, high = estimate.confidence_interval()[0]
     assert np.isnan(estimate.com).all() and low < 0.2 < high and high - low < 0.05
     wanted = 2 * mini.friction["X1"].coulomb
     assert estimate.friction_corrections["X1"] == pytest.approx(wanted, rel=0.1)
@@ -456,7 +458,7 @@ def test_a_lift_that_was_recorded_is_weighed():
     """211.4 kg are said to hang there; it goes one way, nothing tells the centre."""
     machine = crane.load("patu655", lock={"slew": 0.0, "X_ext": 0.0})
     estimate = identify_payload(machine, read_run(RAW, machine, COLUMNS))
-    low, high = estimate.interval()[0]
+    low, high = estimate.confidence_interval()[0]
     mass, band = estimate.static_mass
     assert low < 211.4 < high and low < mass < high and high - low < 250
     assert np.isnan(estimate.com).all() and estimate.friction_corrections == {}
@@ -470,7 +472,7 @@ def test_a_machine_that_is_not_as_described_widens_the_interval(mini):
     changes = {f"{name}.mass": 1.5 * mass for name, mass in (("link2", 0.1833), ("link5", 0.028))}
     heavy = crane.load("mini_forwarder", changes)
     right, wrong = (
-        identify_payload(mini, motion(machine.with_payload(LOAD), 1)).interval()[0]
+        identify_payload(mini, motion(machine.with_payload(LOAD), 1)).confidence_interval()[0]
         for machine in (mini, heavy)
     )
     assert np.ptp(wrong) > 4 * np.ptp(right)

@@ -78,7 +78,7 @@ def test_intervals_cover_the_truth(mini, method):
     for seed in range(8):
         result = identify(mini, noisy(given, seed), method=method, bandwidth=30.0)
         truth = result.base.values(model.nominal)
-        low, high = result.interval().T
+        low, high = result.confidence_interval().T
         covered.append(np.mean((low <= truth) & (truth <= high)))
     assert 0.90 < np.mean(covered) < 0.99
 
@@ -98,7 +98,7 @@ def test_intervals_cover_the_truth_of_rigs_as_users_identify_them():
         rig = Rig(machine, seed, Tolerances(pins=0.0), sensors)
         result = identify(machine, rig.run(path))
         truth = result.base.values(IdentificationModel(rig.plant).nominal)
-        low, high = result.interval().T
+        low, high = result.confidence_interval().T
         covered.append((low <= truth) & (truth <= high))
     assert 0.90 < np.mean(covered) < 0.99
     assert np.mean(covered, axis=0).min() >= 0.6  # of 95 % fewer than 8 in 12: one in 5000

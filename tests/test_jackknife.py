@@ -53,6 +53,6 @@ def test_intervals_where_noise_depends_on_the_motion(estimator):
     covered = []
     for _ in range(100):
         y = W @ [2.0, 1.0] + (0.05 + np.abs(column) ** 3) * rng.standard_normal(1500)
-        low, high = estimator(W, y, np.zeros(1500, int)).interval().T
+        low, high = estimator(W, y, np.zeros(1500, int)).confidence_interval().T
         covered.append((low < [2, 1]) & (high > [2, 1]))
     assert (np.mean(covered, axis=0) > 0.89).all(), np.mean(covered, axis=0)

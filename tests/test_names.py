@@ -16,7 +16,7 @@ Accumulator Batch Breakout Buckling Calibration Capacity Chain Chart Closure Clu
 Contact Controller Coordinates Coupling Cylinder Derivatives Design Dimension Drive Dynamics
 Engine Estimate Excitation Finding Findings Flow Formula Friction Gearbox Gradient Ground
 Hydraulics Identification Inertial Jackknife Joint Key Kinematics Layout Limits Link Machine
-Misfit Mode Motion Oil Payload Phase Playback Program Reactions Readout Recording Regressor
+Mode Motion Oil Payload Phase Playback Program Reactions Readout Recording Regressor
 Remedy Result Rope Routine Rule Scene Sensitivities Sensor Session Soil Spool Strokes Study
 Supply Sway Table Tape Task Torques Trajectory Transmission Tree Unknown Valve Visual Workspace
 Wrench _Line _Stream _Subtree

@@ -24,7 +24,7 @@ from crane.identification.mechanics.identification_model import IdentificationMo
 from crane.identification.mechanics.identify import build_equations, identify
 from crane.identification.mechanics.model_terms import PreslidingFriction
 from crane.identification.mechanics.regression_equations import (
-    ProjectedRegressor,
+    CombinedRegressor,
     RegressionEquations,
 )
 from crane.identification.signals import kalman_smoother
@@ -145,7 +145,7 @@ def test_what_is_held_does_not_grow_with_the_recording(mini, monkeypatch):
         rows, base = build_equations(
             IdentificationModel(mini), [Motion(time, *parts)], bandwidth=100.0
         )
-        columns = ProjectedRegressor(rows, rows.column_selection(base))
+        columns = CombinedRegressor(rows, rows.column_selection(base))
         assert len(list(columns.blocks())) >= copies
         assert max(sizes) < 1.5 * (1 << 21)  # with what the filter needs around
         assert sum(W.nbytes for W in rows._block_cache.values()) <= 1 << 20

@@ -198,7 +198,7 @@ def test_feasible_intervals_cover_machines_that_are_not_as_described(mini, prior
         truth[10 * len(model.bodies) :] *= np.exp(0.3 * rng.normal(size=len(truth) - i - 10))
         recorded = noisy(dataclasses.replace(given, tau=W @ truth + offset), seed)
         found = identify(mini, recorded, prior=prior, feasible=True, bandwidth=30.0)
-        low, high = found.interval().T
+        low, high = found.confidence_interval().T
         wanted = found.base.values(truth)
         covered.append(np.mean((low <= wanted) & (wanted <= high)))
     assert 0.90 < np.mean(covered) <= 0.99

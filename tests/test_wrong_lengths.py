@@ -117,8 +117,8 @@ def test_the_line_names_the_gap_and_the_length(tmp_path):
     assert report.status == 2
     assert line == (
         "the loops close only far from the home of the file: lift is 2.88 rad off, loop 'lift' "
-        "the other way round; with home as said loop 'link' is 236 mm open, and would close with "
-        "bell.x 1.573 m (now 1.337); correct home or the frames; if what was found is meant, keep "
+        "the other way round; at the home of the file loop 'link' is 236 mm open, and would close "
+        "with bell.x 1.573 m (now 1.337); correct home or the frames; if what was found is meant, keep "
         "it with crane check --write-home, or take it with --arg nearest_assembly:=true "
         "(arguments={'nearest_assembly': True} in Python)"
     )

@@ -66,8 +66,8 @@ class HomeSearchResult:
         moved_columns: Columns of joints whose coordinate differs from the guess.
         largest_deviation: Column of the joint farthest from the guess, and its distance [m],
             [rad].
-        off_said: Column of the joint farthest from the file's value, and its scaled distance; see
-            `MultiStartSearch.largest_specified_deviation`.
+        specified_deviation: Column of the joint farthest from the file's value, and its scaled
+            distance; see `MultiStartSearch.largest_specified_deviation`.
         reversed: Names of loops in the other assembly mode than the guess.
     """
 
@@ -75,13 +75,13 @@ class HomeSearchResult:
     configuration_count: int
     moved_columns: Indices
     largest_deviation: tuple[int, float]
-    off_said: tuple[int, float]
+    specified_deviation: tuple[int, float]
     reversed: tuple[str, ...]
 
     @property
     def is_far(self) -> bool:
         """Whether home is far from the configuration that the file specifies."""
-        return self.off_said[1] > FAR
+        return self.specified_deviation[1] > FAR
 
 
 def find_home(

@@ -96,7 +96,7 @@ def use_load_options(
         _load_options.reset(token)
 
 
-def asked(name: str) -> bool:
+def own_argument(name: str) -> bool:
     """Whether one of the package's own arguments is true, see `OWN_ARGUMENTS`.
 
     Raises:

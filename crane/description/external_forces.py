@@ -65,7 +65,7 @@ class ExternalForce(OneLineRepr):
         """Return the sorted times (k,) [s] at which `references` or their derivatives jump."""
         return np.zeros(0)
 
-    def event_lengths(self, motion: FrameMotion) -> Sequence[Scalar]:
+    def event_distances(self, motion: FrameMotion) -> Sequence[Scalar]:
         """Return lengths [m] whose sign changes end a step; none by default."""
         return ()
 
@@ -172,7 +172,7 @@ class PhasedWrench(Wrench):
 
     Attributes:
         clock: Function from times (N,) [s] to phases (N,); None until a run sets it, see
-            `with_clock`.
+            `with_phase_function`.
     """
 
     clock: Callable[[Array], Array] | None = None
@@ -188,7 +188,7 @@ class PhasedWrench(Wrench):
     ):
         super().__init__(frame, force, moment, phases, axes, name)
 
-    def with_clock(self, clock: Callable[[Array], Array]) -> "PhasedWrench":
+    def with_phase_function(self, clock: Callable[[Array], Array]) -> "PhasedWrench":
         """Return the same wrench with the clock of a run."""
         result = copy(self)
         result.clock = clock

@@ -141,7 +141,7 @@ class Contact(ExternalForce):
         if self.lateral_damping and not self.lateral_stiffness:
             raise InputError(f"the lateral damping {label} has no lateral stiffness, give both")
 
-    def event_lengths(self, motion: FrameMotion) -> list[Scalar]:
+    def event_distances(self, motion: FrameMotion) -> list[Scalar]:
         """See `ExternalForce`: the gap."""
         return [self.ground.distance_and_normal(motion.position)[0] - self.radius]
 

@@ -223,7 +223,7 @@ class SoilCutting(ExternalForce):
         self.blade: list[float] = blade_direction.tolist()
         self.cutting: list[float] = (face_normal / np.linalg.norm(face_normal)).tolist()
 
-    def event_lengths(self, motion: FrameMotion) -> list[Scalar]:
+    def event_distances(self, motion: FrameMotion) -> list[Scalar]:
         """See `ExternalForce`: the gap, and the height of the blade above the soil."""
         height = self.ground.distance_and_normal(motion.position)[0]
         return [height, height + self.length * self._rake_and_directions(motion)[0]]

@@ -33,7 +33,7 @@ class ExternalForceFormulas(NamedTuple):
     Attributes:
         active_forces: gamma^T J^T w (n,) of all forces together.
         powers: (k,) power of each [W].
-        event_lengths: Lengths [m] whose sign changes are events.
+        event_distances: Lengths [m] whose sign changes are events.
         outputs: (s,) wrench in the world's axes and channels of each.
         state_rates: Time derivatives of their states, concatenated.
         callback_inputs: Inputs of the Python functions among them, see `ExternalForceCallback`.
@@ -41,7 +41,7 @@ class ExternalForceFormulas(NamedTuple):
 
     active_forces: Vector
     powers: Vector
-    event_lengths: Vector
+    event_distances: Vector
     outputs: Vector
     state_rates: Vector
     callback_inputs: Vector
@@ -96,7 +96,7 @@ def formula_key(machine: Machine) -> Hashable:
             [x.index if isinstance(x, SymbolicExpression) else float(x) for x in part]
             for part in (
                 *force.wrench(here),
-                force.event_lengths(here),
+                force.event_distances(here),
                 force.outputs(here),
                 force.state_rates(here),
             )  # fmt: skip
@@ -127,7 +127,7 @@ def trace_external_forces(
     kinematics, geometry = formulas.kinematics, formulas.kinematics.geometry
     active_forces: Vector = [0.0] * len(machine.active)
     powers: Vector = []
-    event_lengths: Vector = []
+    event_distances: Vector = []
     outputs: Vector = []
     state_rates: Vector = []
     callback_inputs: Vector = []
@@ -176,7 +176,7 @@ def trace_external_forces(
                 *here.velocity,
                 *here.angular_velocity,
             ]
-        event_lengths += force.event_lengths(here)
+        event_distances += force.event_distances(here)
         wrench = [list(part) for part in force.wrench(here)]
         outputs += [*wrench[0], *wrench[1], *force.outputs(here)]
         push, moment = (matvec(kinematics.rotation[0], part) for part in wrench)
@@ -189,7 +189,7 @@ def trace_external_forces(
                 scale_vector(dot(push, linear) + dot(about, angular), formulas.gamma[i]),
             )
     return ExternalForceFormulas(
-        active_forces, powers, event_lengths, outputs, state_rates, callback_inputs
+        active_forces, powers, event_distances, outputs, state_rates, callback_inputs
     )
 
 

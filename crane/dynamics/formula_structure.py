@@ -135,7 +135,7 @@ class FormulaStructure:
             carrier_bodies(machine, formulation),
             plan,
             tuple(spans),
-            forces.sticking,
+            forces.stick_slip_columns,
             forces.circuit_friction_columns,
             tip,
         )

@@ -50,7 +50,7 @@ class JointForces:
 
     Attributes:
         lengths: The m distances that force elements act along.
-        sticking: Columns of the joints with stick-slip friction.
+        stick_slip_columns: Columns of the joints with stick-slip friction.
         circuit_friction_columns: Columns of the joints with circuit friction.
         circuit_friction: (nv,) current circuit friction [N], [N m]; see `set_circuit_friction`.
         moving_factor: 0 where friction holds the whole machine at rest, else 1; see
@@ -68,7 +68,7 @@ class JointForces:
         rows, pairs = _table_rows(machine)
         self._joint_count, self.lengths = machine.model.nv, FrameDistances(machine, pairs)
         law_table = self.table = np.zeros((self._joint_count + len(pairs), LAW_SIZE))
-        self.sticking, self.moving_factor = find_stick_slip_columns(machine), 1.0
+        self.stick_slip_columns, self.moving_factor = find_stick_slip_columns(machine), 1.0
         self.circuit_friction_columns, self.circuit_friction = (
             find_circuit_friction_columns(machine),
             np.zeros(self._joint_count),
@@ -77,7 +77,9 @@ class JointForces:
             dict.fromkeys(machine.joints, Friction()) | dict(machine.friction)
         ).items():
             column = machine.column(joint)
-            only_circuit_friction = column in self.sticking and not friction.has_stick_slip
+            only_circuit_friction = (
+                column in self.stick_slip_columns and not friction.has_stick_slip
+            )
             law_table[column, :7] = (
                 MIN_COULOMB_FRICTION if only_circuit_friction else friction.coulomb,
                 friction.coulomb_offset,
@@ -134,12 +136,12 @@ class JointForces:
     @property
     def breakaway(self) -> Array:
         """(k,) largest friction of the stick-slip joints at rest, relative to its offset."""
-        return self._joint_breakaway + self.circuit_friction[list(self.sticking)]
+        return self._joint_breakaway + self.circuit_friction[list(self.stick_slip_columns)]
 
     @property
     def _joint_breakaway(self) -> Array:
         """The same without circuit friction."""
-        law = self.table[list(self.sticking)]
+        law = self.table[list(self.stick_slip_columns)]
         return np.asarray(
             law[:, _LAW_FIELDS.index("coulomb")] + law[:, _LAW_FIELDS.index("stiction")]
         )
@@ -147,14 +149,16 @@ class JointForces:
     def friction_at_rest(self, limit_share: Array) -> Array:
         """(k,) friction of stick-slip joints at rest, from shares (k,) of its limit."""
         return (
-            self.table[list(self.sticking), _LAW_FIELDS.index("coulomb_offset")]
+            self.table[list(self.stick_slip_columns), _LAW_FIELDS.index("coulomb_offset")]
             + limit_share * self.breakaway
         )
 
     @property
     def stick_slip_modes(self) -> tuple[Array, Array, Array]:
         """(k,) each, the arguments of `set_stick_slip_modes`."""
-        slip_sign, is_held, inverse_velocity = self.table[list(self.sticking), _MODE_FIELDS].T
+        slip_sign, is_held, inverse_velocity = self.table[
+            list(self.stick_slip_columns), _MODE_FIELDS
+        ].T
         return slip_sign, is_held, inverse_velocity
 
     def set_stick_slip_modes(
@@ -169,7 +173,7 @@ class JointForces:
             is_moving: Whether anything moves.
         """
         self.moving_factor = float(is_moving)
-        self.table[list(self.sticking), _MODE_FIELDS] = np.column_stack(
+        self.table[list(self.stick_slip_columns), _MODE_FIELDS] = np.column_stack(
             [slip_sign, is_held, inverse_velocity]
         )
 
@@ -197,7 +201,7 @@ class JointForces:
         )
         sign = np.tanh(v * sharpness)
         if use_modes:
-            stick_slip = list(self.sticking)
+            stick_slip = list(self.stick_slip_columns)
             sign[stick_slip] = self.table[stick_slip, SLIP_INDEX]
             coulomb = coulomb + self.circuit_friction
         stick_slip_columns = stiction * np.exp(-((v * stribeck) ** 2))
@@ -218,7 +222,7 @@ class JointForces:
             (nv,) or (N, nv) in addition to `friction_forces`, (F_C + F_S) sign(a) where v = 0 [N],
             [N m].
         """
-        stick_slip = list(self.sticking)
+        stick_slip = list(self.stick_slip_columns)
         out = np.zeros_like(v)
         starts = (v[..., stick_slip] == 0) & (np.abs(a[..., stick_slip]) > REST_ACCELERATION)
         out[..., stick_slip] = np.where(

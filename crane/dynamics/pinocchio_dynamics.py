@@ -158,7 +158,7 @@ class PinocchioDynamics:
                     state, x
                 )
                 stick_slip, (slip_sign, is_held, inverse_velocity) = (
-                    list(self._joint_forces.sticking),
+                    list(self._joint_forces.stick_slip_columns),
                     self._joint_forces.stick_slip_modes,
                 )
                 is_at_rest = (np.abs(slip_sign) < 1) | (
@@ -177,7 +177,7 @@ class PinocchioDynamics:
                     ]
                 )
             case "resting":
-                stick_slip = list(self._joint_forces.sticking)
+                stick_slip = list(self._joint_forces.stick_slip_columns)
                 joint_friction = gamma.T @ self._joint_forces.friction_forces(v, use_modes=True)
                 net = x - self._inverse_dynamics(state, state.drift, False) - joint_friction
                 parts = self._mass_matrix(state), gamma[stick_slip], state.drift[stick_slip], net
@@ -214,7 +214,7 @@ class PinocchioDynamics:
 
         See `DynamicsFormulas.accelerations_with_stick_slip`.
         """
-        forces, stick_slip = self._joint_forces, list(self._joint_forces.sticking)
+        forces, stick_slip = self._joint_forces, list(self._joint_forces.stick_slip_columns)
         slip_sign, is_held, inverse_velocity = forces.stick_slip_modes
         joint_friction = forces.friction_forces(state.v, use_modes=True)
         bias = self._inverse_dynamics(state, state.drift, False) + state.gamma.T @ joint_friction

@@ -12,14 +12,14 @@ from crane.closure.constraint_structure import OpenLoopError
 from crane.closure.constraint_tolerances import CLOSED_TOLERANCE
 from crane.closure.home_search import HomeSearchResult
 from crane.common.errors import CraneWarning, MechanismError
-from crane.common.package_search import NEAREST_ASSEMBLY, asked
+from crane.common.package_search import NEAREST_ASSEMBLY, own_argument
 from crane.common.samples import Array
 from crane.description.findings import report_error
 from crane.description.specification import MachineSpec
 from crane.formats.robot_files import is_robot_file, is_sdf_file, is_simulator_file
+from crane.machine.closure_diagnosis import diagnose_closure
 from crane.machine.drive_selection import select_free_joints
 from crane.machine.machine import Machine
-from crane.machine.misfit import misfit
 
 _MAX_LISTED = 4  # loops and joints in a message
 
@@ -46,7 +46,7 @@ def check_home(
     search = closure.home_search
     if search is not None:
         is_rejected = search.is_far and (not is_modified or bool(search.reversed))
-        if is_rejected and not asked(NEAREST_ASSEMBLY):
+        if is_rejected and not own_argument(NEAREST_ASSEMBLY):
             problem = _different_home_text(spec, closure, search, initial_guess)
             report_error(
                 MechanismError(
@@ -70,26 +70,24 @@ def add_remedy(
         initial_guess: (nq,) home of the file.
         error: The original error.
     """
-    geometry_misfit = misfit(spec, model, initial_guess)
-    if geometry_misfit is None or not geometry_misfit.remedies:
+    diagnosis = diagnose_closure(spec, model, initial_guess)
+    if diagnosis is None or not diagnosis.remedies:
         return error
     return OpenLoopError(
-        f"{error}: it would close with {geometry_misfit.listed}", error.subject, error.reason
+        f"{error}: it would close with {diagnosis.remedies_text}", error.subject, error.reason
     )
 
 
 def _different_home_text(
     spec: MachineSpec, closure: Closure, search: HomeSearchResult, initial_guess: Array
 ) -> str:
-    joint, deviation = search.off_said
+    joint, deviation = search.specified_deviation
     deviation_text = _coordinate_text(closure, joint, deviation * closure.units[joint], " is")
     loops = _list_names([f"'{loop}'" for loop in search.reversed])
     reversed_loops_text = f", loop {loops} the other way round" if loops else ""
-    geometry_misfit = misfit(spec, closure.model, initial_guess)
+    diagnosis = diagnose_closure(spec, closure.model, initial_guess)
     cause_text = (
-        f"{geometry_misfit}; correct home or the frames"
-        if geometry_misfit
-        else "correct home or the frames"
+        f"{diagnosis}; correct home or the frames" if diagnosis else "correct home or the frames"
     )
     argument_hint = (
         f"--arg {NEAREST_ASSEMBLY}:=true (arguments={{'{NEAREST_ASSEMBLY}': True}} in Python)"

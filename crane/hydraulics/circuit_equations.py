@@ -206,7 +206,7 @@ class CircuitValues:
             cylinder.chamber_values(side, hose_flows[node], balance.net_inflows[node])
             for side, node in enumerate(nodes)
         )
-        self.state_rates += [a.pressure_state_rate, b.pressure_state_rate]
+        self.state_rates += [a.chamber_pressure_rates, b.chamber_pressure_rates]
         self.state_rates += [*cylinder.spring_rate, *spool_rates]
         for node, chamber in zip(nodes, (a, b), strict=True):
             self._store(node, chamber.pressure * chamber.net_inflow, chamber.net_inflow)

@@ -42,14 +42,14 @@ class ChamberValues:
         volume: Volume [m3].
         hose_flow: Flow through its hose into the chamber [m3/s].
         net_inflow: Inflow less the rate of the volume [m3/s].
-        pressure_state_rate: Rate of the state of the pressure [Pa/s].
+        chamber_pressure_rates: Rate of the state of the pressure [Pa/s].
     """
 
     pressure: Scalar
     volume: Scalar
     hose_flow: Scalar
     net_inflow: Scalar
-    pressure_state_rate: Scalar
+    chamber_pressure_rates: Scalar
 
 
 class ValveCylinderEquations:

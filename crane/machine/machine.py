@@ -424,7 +424,7 @@ class Machine(OneLineRepr):
                 raise InputError(f"two loads are called '{force.name}', give them names")
         return dataclasses.replace(self, external_forces=every)
 
-    def with_clock(self, clock: Callable[[Array], Array] | None) -> "Machine":
+    def with_phase_function(self, clock: Callable[[Array], Array] | None) -> "Machine":
         """A copy whose phased external forces use the clock of a simulation.
 
         Args:
@@ -439,7 +439,7 @@ class Machine(OneLineRepr):
         if clock is None:
             hint = "simulate it with the task of levers that has them"
             raise InputError(f"the load '{phased[0].name}' counts phases, {hint}")
-        every = (x.with_clock(clock) if x in phased else x for x in self.external_forces)
+        every = (x.with_phase_function(clock) if x in phased else x for x in self.external_forces)
         return dataclasses.replace(self, external_forces=tuple(every))
 
     def with_payload(self, payload: Payload) -> "Machine":

@@ -80,7 +80,7 @@ def machine_under_control(machine: Machine, control: Controller) -> Machine:
     Raises:
         InputError: A load depends on phases, and the controller has none.
     """
-    machine = machine.with_clock(
+    machine = machine.with_phase_function(
         control.command.clock if isinstance(control, ValveDrive) else None
     )
     hydraulics = machine.hydraulics

@@ -60,7 +60,7 @@ def requirements(found: Results) -> list[tuple[str, str, str, bool]]:
     text = ", ".join(f"{x:.4g}" for x in values)
     what = "friction without noise: 210 N, 300 N, 330 N s/m, 5 mm/s"
     out.append((what, "1 %", text, gap < 0.01))
-    names, ends = found.friction.names, found.friction.interval()
+    names, ends = found.friction.names, found.friction.confidence_interval()
     truth = dict(zip(("coulomb", "coulomb_offset", "viscous", "stiction", "stribeck"),
                      (210.0, 0.0, 330.0, 90.0, 5e-3), strict=True))  # fmt: skip
     held = [a < truth[x] < b for x, (a, b) in zip(names, ends, strict=True)]

@@ -72,7 +72,7 @@ def orifices(found: Results) -> str:
     values = [
         [name, f"{true:.4g}", f"{x:.4g}", span(a, b, 4)]
         for name, true, x, (a, b) in zip(
-            PARAMETER_NAMES, TRUE, X.values, X.interval(), strict=True
+            PARAMETER_NAMES, TRUE, X.values, X.confidence_interval(), strict=True
         )
     ]
     both = ", ".join(f"{name} {percent(x)}" for name, x in found.all_joints.items())
@@ -112,7 +112,7 @@ def modulus(found: Results) -> str:
     """Which beta it is."""
     (low_a, high_a), (low_b, high_b) = found.softness
     X = found.noisy["orifices"]["chambers"]
-    low, high = X.interval()[0]
+    low, high = X.confidence_interval()[0]
     rows = [
         ["oil alone", f"{1 / OIL:.3g}", f"{OIL / 1e9:.2f}"],
         ["chamber A", span(low_a, high_a), span(1e-9 / high_a, 1e-9 / low_a)],
@@ -121,7 +121,7 @@ def modulus(found: Results) -> str:
          f"{1e-9 / X.values[0]:.2f} ({span(1e-9 / high, 1e-9 / low)})"],
     ]  # fmt: skip
     rigid = found.noisy["rigid"]["chambers"]
-    a, b = rigid.interval()[0]
+    a, b = rigid.confidence_interval()[0]
     return "\n\n".join(
         [
             "### Which beta",
@@ -212,7 +212,7 @@ def friction(found: Results) -> str:
     for i, (name, text) in enumerate(truth.items()):
         row = [name.replace("_", " "), text, f"{found.still.values[i]:.4g}"]
         if name in found.friction.names:
-            low, high = found.friction.interval()[i]
+            low, high = found.friction.confidence_interval()[i]
             row.append(f"{found.friction.values[i]:.4g} ({span(low, high)})")
         else:
             row.append("not determined")

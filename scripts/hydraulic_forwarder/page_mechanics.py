@@ -57,7 +57,7 @@ def parameters(found: Results) -> str:
     for i, words in enumerate(mechanics.THETA):
         row = [f"theta_{i + 1} = {words}", f"{plain.nominal[i]:.4g}"]
         for one in (plain, known):
-            low, high = one.interval()[i]
+            low, high = one.confidence_interval()[i]
             value = f"{one.values[i]:.4g}"
             good = low < one.nominal[i] < high
             row += [value if good else f"**{value}**", span(low, high, 4)]
@@ -122,7 +122,7 @@ def parameters(found: Results) -> str:
 
 def closed_base(one: Identification) -> str:
     """How well the package's base parameters of the closed chain are told."""
-    low, high = one.interval().T
+    low, high = one.confidence_interval().T
     covered = int(((low < one.nominal) & (high > one.nominal)).sum())
     sharp = np.abs(one.std / one.values) < 0.1
     rows = []

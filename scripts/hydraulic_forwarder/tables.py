@@ -29,7 +29,7 @@ def span(low: float, high: float, digits: int = 3) -> str:
 
 def errors(X: OrificeCoefficients) -> list[str]:
     """Relative errors of X against `TRUE`, bold outside of the 95 % interval."""
-    low, high = X.interval().T
+    low, high = X.confidence_interval().T
     out = []
     for x, true, a, b in zip(X.values, TRUE, low, high, strict=True):
         text = f"{100 * (x / true - 1):+.2f} %"
@@ -39,5 +39,5 @@ def errors(X: OrificeCoefficients) -> list[str]:
 
 def inside(X: OrificeCoefficients, level: float = 0.95) -> np.ndarray:
     """Which of the intervals (5,) hold the truth."""
-    low, high = X.interval(level).T
+    low, high = X.confidence_interval(level).T
     return (low < TRUE) & (high > TRUE)

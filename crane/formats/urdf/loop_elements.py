@@ -26,7 +26,7 @@ import numpy as np
 from lxml import etree
 
 from crane.common.errors import CraneError, suggest_names
-from crane.common.package_search import URDF_CONSTRAINT, asked
+from crane.common.package_search import URDF_CONSTRAINT, own_argument
 from crane.description.findings import FollowUpError, error_recovery, report_error
 from crane.description.kinematic_tree import MULTI_FREEDOM_TYPES, Joint, joint_freedoms
 from crane.description.specification import Coupling, LoopSpec
@@ -199,7 +199,7 @@ def read_constraints(xml: XmlFile) -> None:
         DescriptionError: A constraint is malformed, or of a type that no `<loop>` has.
         InputError: The load argument is neither true nor false.
     """
-    if not asked(URDF_CONSTRAINT):
+    if not own_argument(URDF_CONSTRAINT):
         return
     for element in xml.root.findall("constraint"):
         with error_recovery():

@@ -49,7 +49,7 @@ class EstimatedValues(OneLineRepr):
         """Standard deviations (p,)."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))  # negative by rounding only
 
-    def interval(self, level: float = 0.95) -> Array:
+    def confidence_interval(self, level: float = 0.95) -> Array:
         """Confidence intervals (p, 2) of a level, 0 to 1: values -+ t std with Student's t."""
         from scipy.stats import t
 

@@ -86,7 +86,9 @@ class CylinderFriction(EstimatedValues, Result):
             f"{self.noise:.3g} {force} about the fit",
             f"{'':<16}{'value':>12}{'std':>10}   95 % interval",
         ]
-        rows = zip(self.names, self.values, self.std, self.interval(), units, strict=False)
+        rows = zip(
+            self.names, self.values, self.std, self.confidence_interval(), units, strict=False
+        )
         for name, value, std, (low, high), text in rows:
             lines.append(f"{name:<16}{value:>12.5g}{std:>10.2g}   {low:.5g} to {high:.5g} {text}")
         return "\n".join([*lines, *([self.note] if self.note else [])]) + "\n"

@@ -114,7 +114,12 @@ class OrificeCoefficients(EstimatedValues, Result):
             f"{'parameter':<10}{'value':>12}{'std':>10}{'rel. std':>10}   95 % interval",
         ]
         for name, unit, value, std, (low, high) in zip(
-            PARAMETER_NAMES, PARAMETER_UNITS, self.values, self.std, self.interval(), strict=True
+            PARAMETER_NAMES,
+            PARAMETER_UNITS,
+            self.values,
+            self.std,
+            self.confidence_interval(),
+            strict=True,
         ):
             share = f"{100 * std / abs(value):.2g} %"
             lines.append(

@@ -22,7 +22,7 @@ from crane.identification.estimation.estimators import Estimate, Prior, Regressi
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.regression_equations import (
-    ProjectedRegressor,
+    CombinedRegressor,
     RegressionEquations,
 )
 
@@ -310,7 +310,7 @@ def feasible_estimate(
     prior_root[-len(mean) :] = np.diag(np.append(np.sqrt(parameter_weights), 1 / parameter_std))
     # the covariance of weighted least squares for a prior with these rows
     rows = RegressionProblem(
-        ProjectedRegressor(equations, K),
+        CombinedRegressor(equations, K),
         None,
         equations.y,
         equations.groups,

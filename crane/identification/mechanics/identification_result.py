@@ -223,7 +223,7 @@ class Identification(EstimatedValues, Result):
         Raises:
             OutputError: The file cannot be written.
         """
-        columns = [self.values, self.std, *self.interval().T, self.nominal]
+        columns = [self.values, self.std, *self.confidence_interval().T, self.nominal]
         with replace_file(path) as part, part.open("w", encoding="utf-8", newline="") as file:
             table = csv.writer(file, lineterminator="\n")
             table.writerow(

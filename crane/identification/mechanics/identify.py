@@ -44,7 +44,7 @@ from crane.identification.mechanics.identification_model import IdentificationMo
 from crane.identification.mechanics.identification_result import Identification
 from crane.identification.mechanics.model_terms import FrictionTerm, ModelTerm, body_names
 from crane.identification.mechanics.regression_equations import (
-    ProjectedRegressor,
+    CombinedRegressor,
     RegressionEquations,
     is_long_enough,
 )
@@ -137,7 +137,7 @@ def identify(
     if model.bodies:
         _check_forces(model, motions, equations, trust)
     selection = equations.column_selection(identifiable)
-    columns = ProjectedRegressor(equations, selection)
+    columns = CombinedRegressor(equations, selection)
     factors = columns.triangular_factors(equations.y, equations.groups)
     parameter_sizes = parameter_magnitudes(model, identifiable, factors)
     known_prior = _build_prior(model, prior, equations, parameter_sizes, feasible)

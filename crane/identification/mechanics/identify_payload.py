@@ -101,7 +101,7 @@ def identify_payload(
     case = _PayloadCase(machine, frame, motion, method, names, one_way_drives)
     first = case.estimate_body(10 if inertia else 4, trust, progress)
     if first is not None and not case.is_uncertain(first):
-        low, high = first.interval()[0].tolist()
+        low, high = first.confidence_interval()[0].tolist()
         _check_mass(first, trust)
         if low <= 0 <= high:  # not significant
             return first
@@ -262,7 +262,7 @@ class _PayloadCase:
 
     def is_uncertain(self, estimate: PayloadEstimate) -> bool:
         """Whether the interval exceeds the mass and a share of the machine's mass."""
-        low, high = estimate.interval()[0].tolist()
+        low, high = estimate.confidence_interval()[0].tolist()
         machine_mass = sum(inertia.mass for inertia in list(self.machine.model.inertias)[1:])
         return not high - low <= 2 * max(abs(estimate.mass), _MAX_INTERVAL_SHARE * machine_mass)
 
@@ -304,7 +304,7 @@ def _check_mass(estimate: PayloadEstimate, trust: bool) -> None:
     Raises:
         RecordingError: The recording is not trusted.
     """
-    low, high = estimate.interval()[0].tolist()
+    low, high = estimate.confidence_interval()[0].tolist()
     if high < 0:
         text = (
             f"the mass comes out as {low:.3g} to {high:.3g} kg, and no load weighs less than "
@@ -321,7 +321,7 @@ def _raise_unidentifiable(
 ) -> NoReturn:
     if estimate is None:
         raise RecordingError("this motion does not determine the mass, move all joints")
-    low, high = estimate.interval()[0].tolist()
+    low, high = estimate.confidence_interval()[0].tolist()
     text = f"this recording does not determine the mass ({low:.3g} to {high:.3g} kg): "
     if one_way_drives:
         names = ", ".join(f"'{joint}'" for joint in one_way_drives)

@@ -98,7 +98,7 @@ class PayloadEstimate(EstimatedValues):
     @property
     def warning(self) -> str:
         """Warning if the forces at rest contradict the mass, else ""."""
-        low, high = self.interval()[0].tolist()
+        low, high = self.confidence_interval()[0].tolist()
         if self.static_mass is None:
             return ""
         mass, band = self.static_mass
@@ -113,7 +113,7 @@ class PayloadEstimate(EstimatedValues):
         """Table of mass and centre of mass."""
         rows = [["", "value", "std", "95 % interval", ""]]
         names, units = ("mass", "com x", "com y", "com z"), ("kg", "m", "m", "m")
-        table = zip(names, units, self.values, self.std, self.interval(), strict=True)
+        table = zip(names, units, self.values, self.std, self.confidence_interval(), strict=True)
         for name, unit, value, deviation, (low, high) in table:
             if np.isnan(value):
                 rows.append([name, "-", "", "not determined by this motion", ""])
@@ -122,7 +122,7 @@ class PayloadEstimate(EstimatedValues):
             rows.append([name, f"{value:.5g}", f"{deviation:.2g}", interval, ""])
         at = ", taken as a point there" if np.isnan(self.com).all() else ""
         lines = [f"load on {self.frame}{at}", *format_table(rows, (0, 3))]
-        if self.interval()[0, 0] <= 0:
+        if self.confidence_interval()[0, 0] <= 0:
             lines.append("the mass may be zero: do not trust its centre")
         if self.static_mass is not None:
             lines.append(

@@ -335,7 +335,7 @@ class RegressionEquations:
                     values,
                 )
             found = estimator(
-                ProjectedRegressor(equations, T),
+                CombinedRegressor(equations, T),
                 equations.y,
                 equations.groups,
                 equations.samples,
@@ -358,7 +358,7 @@ def is_long_enough(motion: Motion, bandwidth: float) -> bool:
     return bandwidth * float(motion.time[-1] - motion.time[0]) >= _MIN_PERIODS
 
 
-class ProjectedRegressor:
+class CombinedRegressor:
     """Regressor of the used rows with combined columns: a `regressor.Regressor`.
 
     Args:

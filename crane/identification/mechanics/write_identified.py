@@ -241,7 +241,7 @@ def _machine_file_content(
 def _uncertainty_notes(result: Identification, data: Mapping[str, Any]) -> dict[KeyPath, str]:
     """Comments on the uncertainty of friction and rotor inertias that are base parameters."""
     found: dict[KeyPath, str] = {}
-    half = 0.5 * np.diff(result.interval(), axis=1)[:, 0]
+    half = 0.5 * np.diff(result.confidence_interval(), axis=1)[:, 0]
     for i, (name, group) in enumerate(zip(result.names, result.base.groups, strict=True)):
         owner, _, kind = name.rpartition(".")
         key_path = (kind, owner) if kind == "rotor_inertia" else ("friction", owner, kind)

@@ -71,7 +71,7 @@ class Chart:
         return cls(
             dynamics,
             machine.closure.active,
-            StickSlipModes(machine, dynamics.forces.sticking),
+            StickSlipModes(machine, dynamics.forces.stick_slip_columns),
             machine.free,
         )
 

@@ -207,7 +207,7 @@ class ErrorControlledStepper(MachineCodeStepper):
                 closure.units.tolist(), closure.characteristic_length
             )
             event_distances += scale_vector(
-                1.0 / closure.characteristic_length, machine.external_forces.event_lengths
+                1.0 / closure.characteristic_length, machine.external_forces.event_distances
             )
             program.add_formula(
                 "rate" + suffix,

@@ -216,7 +216,9 @@ class LinearizedDrive:
             friction_forces: list[Scalar] = [0.0] * n
             for column, force in zip(forces.circuit_friction_columns, friction, strict=True):
                 i, law = machine.active.index(machine.joints[column]), forces.table[column]
-                sign = friction_sign(law.tolist(), v_a[i], column in forces.sticking, False)
+                sign = friction_sign(
+                    law.tolist(), v_a[i], column in forces.stick_slip_columns, False
+                )
                 friction_forces[i] = force * sign
             tau = subtract_vectors(tau, friction_forces)
         values = [*tau, *rates[:k], *output_units]

@@ -152,7 +152,7 @@ def _base_parameter_section(result: Identification) -> str:
     warning_text = f"<p><b>{escape(result.warning)}</b></p>" if result.warning else ""
     essential_indices = set(essential_parameters(estimate).tolist())
     rows, classes = [], []
-    for i, (lower, upper) in enumerate(result.interval()):
+    for i, (lower, upper) in enumerate(result.confidence_interval()):
         name, value, is_essential = result.names[i], result.values[i], i in essential_indices
         marks = {
             "essential": is_essential,

@@ -29,12 +29,14 @@ from crane.description.specification import LoopSpec, MachineSpec
 from crane.machine.drive_selection import specified_active_joints
 from crane.machine.machine_assembly import assemble_tree
 
-_LOOSE = 1e-6  # weight of the change of a length, and of joints that the file does not specify
-_ITERATIONS, _CHANGES, _EVALUATIONS = 25, 6, 30
-_LEVER = 0.1  # least cosine of a length's derivative and the gap that it closes
-_CLEAR = 0.05  # scaled distance of joints at their specified coordinates
-_ALIKE, _DIGIT = 2.0, 2e-3  # ratio of indecisive distances, and rounding of a home in a file
-_LISTED = 2
+_FREE_WEIGHT = (
+    1e-6  # weight of the change of a length, and of joints that the file does not specify
+)
+_MAX_ITERATIONS, _MAX_CHANGES, _MAX_EVALUATIONS = 25, 6, 30
+_MIN_COSINE = 0.1  # least cosine of a length's derivative and the gap that it closes
+_MAX_DISTANCE = 0.05  # scaled distance of joints at their specified coordinates
+_DISTANCE_RATIO, _ROUNDING = 2.0, 2e-3  # of indecisive distances, and of a home in a file
+_MAX_REMEDIES = 2
 
 
 @dataclass(frozen=True)
@@ -43,22 +45,23 @@ class Remedy:
 
     Attributes:
         name: As in `crane.description.parameters`, or `home JOINT`.
-        now: Its value [m], [rad].
-        then: The value that closes the loops.
-        turns: Whether it is an angle.
+        value: Its value [m], [rad].
+        closing_value: The value that closes the loops.
+        is_angle: Whether it is an angle.
     """
 
     name: str
-    now: float
-    then: float
-    turns: bool
+    value: float
+    closing_value: float
+    is_angle: bool
 
     def __str__(self) -> str:
-        return f"{self.name} {self.then:.4g} {'rad' if self.turns else 'm'} (now {self.now:.4g})"
+        unit = "rad" if self.is_angle else "m"
+        return f"{self.name} {self.closing_value:.4g} {unit} (now {self.value:.4g})"
 
 
 @dataclass(frozen=True)
-class Misfit:
+class ClosureDiagnosis:
     """A machine that does not close at the home configuration of its file.
 
     Attributes:
@@ -73,16 +76,17 @@ class Misfit:
 
     def __str__(self) -> str:
         gap = f"{self.gap:.3g} m" if self.gap >= 1 else f"{1e3 * self.gap:.3g} mm"
-        close = self.listed or "no other length alone"
-        return f"with home as said loop '{self.loop}' is {gap} open, and would close with {close}"
+        close = self.remedies_text or "no other length alone"
+        loop = f"at the home of the file loop '{self.loop}' is {gap} open"
+        return f"{loop}, and would close with {close}"
 
     @property
-    def listed(self) -> str:
+    def remedies_text(self) -> str:
         """The remedies as text."""
         return " or ".join(map(str, self.remedies))
 
 
-def misfit(spec: MachineSpec, model: pin.Model, guess: Array) -> Misfit | None:
+def diagnose_closure(spec: MachineSpec, model: pin.Model, guess: Array) -> ClosureDiagnosis | None:
     """Find what keeps a machine from closing at the home configuration of its file.
 
     Args:
@@ -99,11 +103,11 @@ def misfit(spec: MachineSpec, model: pin.Model, guess: Array) -> Misfit | None:
     active = [names.index(name) for name in specified_active_joints(spec, model)]
     passive = np.setdiff1d(np.arange(model.nv), active)
     in_loops = (equations.sign != 0).any(axis=0)[passive]
-    said = np.isin(names, list(spec.home))[passive]
+    specified = np.isin(names, list(spec.home))[passive]
     guess = _nearest(
         equations,
         guess,
-        passive[in_loops & ~said],
+        passive[in_loops & ~specified],
         lambda q, _: (*equations.evaluate_scaled(q), guess),
     )
     phi, size = equations.evaluate(guess)[0], equations.characteristic_length
@@ -117,38 +121,42 @@ def misfit(spec: MachineSpec, model: pin.Model, guess: Array) -> Misfit | None:
         loop for loop, gap in zip(spec.loops, gaps, strict=True) if gap > FILE_PRECISION * size
     ]
     tried = []
-    for name, now, unit, turns, changed in _numbers(spec, equations, open_loops, guess, active):
-        if (in_loops & said).any():
-            found = _change(equations, guess, passive, said, changed)
+    for name, value, unit, is_angle, changed in _parameters_in_loops(
+        spec, equations, open_loops, guess, active
+    ):
+        if (in_loops & specified).any():
+            found = _closing_change(equations, guess, passive, specified, changed)
         else:
-            found = _least(equations, guess, passive, changed)
-        if found is not None and (turns or now * (now + found[0] * unit) > 0):
-            tried.append((found[1], Remedy(name, now, now + found[0] * unit, turns)))
-    tried.sort(key=lambda one: (one[0], abs(one[1].then - one[1].now)))
-    most = max(_ALIKE * tried[0][0], _DIGIT) if tried else 0.0
-    if (in_loops & said).any():
-        most = min(most, _CLEAR)
+            found = _smallest_closing_change(equations, guess, passive, changed)
+        if found is not None and (is_angle or value * (value + found[0] * unit) > 0):
+            tried.append((found[1], Remedy(name, value, value + found[0] * unit, is_angle)))
+    tried.sort(key=lambda one: (one[0], abs(one[1].closing_value - one[1].value)))
+    most = max(_DISTANCE_RATIO * tried[0][0], _ROUNDING) if tried else 0.0
+    if (in_loops & specified).any():
+        most = min(most, _MAX_DISTANCE)
     alike = [one for distance, one in tried if distance <= most]
     worst = int(gaps.argmax())
-    return Misfit(spec.loops[worst].name, float(gaps[worst]), tuple(alike[:_LISTED]))
+    return ClosureDiagnosis(
+        spec.loops[worst].name, float(gaps[worst]), tuple(alike[:_MAX_REMEDIES])
+    )
 
 
 # from q (nq,) and the scaled change of a parameter: phi (m,), dphi/dq, dphi/dp, all scaled
-Changed = Callable[[Array, float], tuple[Array, Array, Array]]
+ChangedResidual = Callable[[Array, float], tuple[Array, Array, Array]]
 
 
-def _numbers(
+def _parameters_in_loops(
     spec: MachineSpec,
     equations: LoopEquations,
     loops: Sequence[LoopSpec],
     guess: Array,
     active: Sequence[int],
-) -> Iterator[tuple[str, float, float, bool, Changed]]:
+) -> Iterator[tuple[str, float, float, bool, ChangedResidual]]:
     """Lengths in loops and driven joints: name, value, unit, is angle, residual function."""
     joints = {joint for loop in loops for joint in _joints(spec, loop)}
     size = equations.characteristic_length
 
-    def length(other: LoopEquations) -> Changed:
+    def length(other: LoopEquations) -> ChangedResidual:
         def changed(q: Array, change: float) -> tuple[Array, Array, Array]:
             (phi, jacobian), (other_phi, other_jacobian) = equations.evaluate(q), other.evaluate(q)
             units = equations.residual_units
@@ -161,100 +169,102 @@ def _numbers(
 
         return changed
 
-    def drive(column: int) -> Changed:
+    def drive(column: int) -> ChangedResidual:
         def changed(q: Array, change: float) -> tuple[Array, Array, Array]:
-            there = q.copy()
-            there[column] += change * equations.coordinate_units[column]
-            phi, jacobian = equations.evaluate_scaled(there)
+            moved = q.copy()
+            moved[column] += change * equations.coordinate_units[column]
+            phi, jacobian = equations.evaluate_scaled(moved)
             return phi, jacobian, jacobian[:, column]
 
         return changed
 
-    for name, part, way in tree_parameters(spec.tree, spec.chains):
-        if way[0] != "xyz" or part.name not in joints or not (now := value_at(part, way)):
+    for name, part, path in tree_parameters(spec.tree, spec.chains):
+        if path[0] != "xyz" or part.name not in joints or not (value := value_at(part, path)):
             continue
         joint = spec.tree.joints[part.name]
-        x, y, z = (value + size * (i == way[1]) for i, value in enumerate(joint.xyz))
+        x, y, z = (x + size * (i == path[1]) for i, x in enumerate(joint.xyz))
         joint = dataclasses.replace(joint, xyz=(x, y, z))
         moved = assemble_tree(dataclasses.replace(spec, tree=spec.tree.with_parts(joint)))
-        yield name, now, size, False, length(LoopEquations(moved, spec.loops, spec.couplings))
+        yield name, value, size, False, length(LoopEquations(moved, spec.loops, spec.couplings))
     for column in active:
         name = equations.coordinates.names[column]
         if name in joints and name in spec.home:
-            unit, turns = (
-                float(equations.coordinate_units[column]),
-                not equations.coordinates.is_translation[column],
-            )
-            yield f"home {name}", float(guess[column]), unit, bool(turns), drive(column)
+            unit = float(equations.coordinate_units[column])
+            is_angle = not equations.coordinates.is_translation[column]
+            yield f"home {name}", float(guess[column]), unit, is_angle, drive(column)
 
 
 def _joints(spec: MachineSpec, loop: LoopSpec) -> set[str]:
     """Joints of the tree in a loop, including fixed ones."""
     above = {joint.child: joint for joint in spec.tree.joints.values()}
-    ways = []
+    paths = []
     for link in (loop.predecessor, loop.successor):
-        way = set()
+        path = set()
         while link in above:
-            way.add(above[link].name)
+            path.add(above[link].name)
             link = above[link].parent
-        ways.append(way)
-    return ways[0] ^ ways[1]
+        paths.append(path)
+    return paths[0] ^ paths[1]
 
 
-def _change(
+def _closing_change(
     equations: LoopEquations,
     guess: Array,
     passive: Indices,
-    said: NDArray[np.bool_],
-    changed: Changed,
+    specified: NDArray[np.bool_],
+    changed: ChangedResidual,
 ) -> tuple[float, float] | None:
     """The scaled change of a parameter that closes the loops with least joint motion."""
     x, units = np.zeros(len(passive) + 1), equations.coordinate_units[passive]
-    weights = np.append(np.where(said, 1.0, _LOOSE), _LOOSE)
-    for _ in range(_ITERATIONS):
+    weights = np.append(np.where(specified, 1.0, _FREE_WEIGHT), _FREE_WEIGHT)
+    for _ in range(_MAX_ITERATIONS):
         q = guess.copy()
         q[passive] += x[:-1] * units
         gap, jacobian, derivative = changed(q, float(x[-1]))
         matrix = np.column_stack([jacobian[:, passive], derivative])
-        wanted = np.linalg.lstsq(matrix / weights, matrix @ x - gap, rcond=1e-12)[0] / weights
-        step = np.abs(wanted - x).max()
+        solution = np.linalg.lstsq(matrix / weights, matrix @ x - gap, rcond=1e-12)[0] / weights
+        step = np.abs(solution - x).max()
         if not step < 1.0:  # also NaN
             return None
-        x = wanted
+        x = solution
         if step < 1e-9:
             break
     if not np.abs(gap).max() < FILE_PRECISION:
         return None
-    return float(x[-1]), float(np.abs(x[:-1][said]).max(initial=0.0))
+    return float(x[-1]), float(np.abs(x[:-1][specified]).max(initial=0.0))
 
 
-def _least(
-    equations: LoopEquations, guess: Array, passive: Indices, changed: Changed
+def _smallest_closing_change(
+    equations: LoopEquations, guess: Array, passive: Indices, changed: ChangedResidual
 ) -> tuple[float, float] | None:
     """The least scaled change of a parameter that closes the loops, and its magnitude.
 
     At the nearest approach the derivative of the gap |phi| is phi . (dphi/dp) / |phi|.
     """
     q, change = guess.copy(), 0.0
-    for _ in range(_CHANGES):
+    for _ in range(_MAX_CHANGES):
         q = _nearest(equations, q, passive, changed, change)
         phi, _, derivative = changed(q, change)
         if np.abs(phi).max() < FILE_PRECISION:
             return change, abs(change)
         lever = float(phi @ derivative)
-        if abs(lever) < _LEVER * float(np.linalg.norm(phi) * np.linalg.norm(derivative)):
+        if abs(lever) < _MIN_COSINE * float(np.linalg.norm(phi) * np.linalg.norm(derivative)):
             return None
         change -= float(phi @ phi) / lever
     return None
 
 
 def _nearest(
-    equations: LoopEquations, q: Array, free: Indices, changed: Changed, change: float = 0.0
+    equations: LoopEquations,
+    q: Array,
+    free: Indices,
+    changed: ChangedResidual,
+    change: float = 0.0,
 ) -> Array:
     """The configuration of least squared residuals, from one nearby."""
     from scipy.optimize import least_squares  # slow to import, only needed for open loops
 
-    def there(x: Array) -> Array:
+    def configuration(x: Array) -> Array:
         out = q.copy()
         out[free] += x * equations.coordinate_units[free]
         return out
@@ -263,9 +273,11 @@ def _nearest(
         return q
 
     def gap(x: Array) -> Array:
-        return changed(there(x), change)[0]
+        return changed(configuration(x), change)[0]
 
     def jacobian(x: Array) -> Array:
-        return changed(there(x), change)[1][:, free]
+        return changed(configuration(x), change)[1][:, free]
 
-    return there(least_squares(gap, np.zeros(len(free)), jacobian, max_nfev=_EVALUATIONS).x)
+    return configuration(
+        least_squares(gap, np.zeros(len(free)), jacobian, max_nfev=_MAX_EVALUATIONS).x
+    )
