@@ -32,13 +32,13 @@ _HELP = """\
 Simulate, identify, rate and design machines with closed kinematic chains.
 
   crane info patu655                            describe a bundled machine
-  crane simulate mini_forwarder --task lift     simulate a task of it
-  crane view simulate                           show the run in a browser
+  crane simulate mini_forwarder --task lift     simulate a task of a machine
+  crane view simulate                           show this run in a browser
 
 {commands}
 
 crane COMMAND --help shows arguments and options. --version shows the version.
-All commands take --strict (refuse inertias that no body has) and --debug.
+All commands take --strict (reject physically impossible inertias) and --debug.
 """
 
 
