@@ -116,8 +116,8 @@ def excite(
         list[str] | None,
         typer.Option(
             metavar="NAME=VALUE",
-            help="Standard deviation of the noise of a joint's force, by default 1 % of its limit, "
-            "or with --fit of a column; may be repeated.",
+            help="Standard deviation of the noise of a joint's force, by default 1 % of its "
+            "limit, or with --fit of a column; may be repeated.",
         ),
     ] = None,
     step: Annotated[
@@ -366,8 +366,8 @@ def circuit(
         typer.Option(
             metavar="METHOD",
             help="Method for orifices: weak (the default; force equation, integrated over "
-            "windows), chambers (pressure equations of both chambers, integrated likewise) or ls (force "
-            "equation at every sample, by least squares).",
+            "windows), chambers (pressure equations of both chambers, integrated likewise) or ls "
+            "(force equation at every sample, by least squares).",
         ),
     ] = None,
     period: Annotated[
