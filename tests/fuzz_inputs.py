@@ -31,7 +31,7 @@ from crane.control import joystick, make_controller  # noqa: E402
 from crane.formats.checks import check  # noqa: E402
 from crane.identification.mechanics.identify import identify  # noqa: E402
 from crane.motion.task_trajectories import task_trajectory  # noqa: E402
-from crane.recordings.run_folder import read_run  # noqa: E402
+from crane.recordings.measured_recordings import read_run  # noqa: E402
 from crane.simulation.recording_replay import replay  # noqa: E402
 from crane.view.page import report  # noqa: E402
 from crane.view.result_files import plot_result  # noqa: E402

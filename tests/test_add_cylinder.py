@@ -199,6 +199,7 @@ def test_without_weight_it_is_the_open_machine(tmp_path):
     assert two.mass_matrix(q_a) == pytest.approx(one.mass_matrix(q_a), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_in_space_the_barrel_has_a_universal_joint(tmp_path):
     """Mounting points beside the boom's plane, and between bodies that turn about two axes."""
     given = [
@@ -359,6 +360,7 @@ def test_its_ends_are_dead_centres_where_these_come_first(tmp_path, along):
     assert f"with a dead centre at {dead:.4g}: its" in told[0]
 
 
+@pytest.mark.slow
 def test_its_ends_are_where_the_machine_closes(tmp_path):
     """The stroke of a slider ends where its crank and rod are in line."""
     data = Path(__file__).parent / "data"

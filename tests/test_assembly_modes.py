@@ -133,6 +133,7 @@ def test_limits_decide(tmp_path):
         assert all("keep this one (outside of limits)" in what for what in eye)
 
 
+@pytest.mark.slow
 def test_nearby_homes_never_differ_silently(tmp_path):
     """Holds for any orientation of the frames at zero, and for all strokes."""
     random = np.random.default_rng(0)

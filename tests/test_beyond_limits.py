@@ -203,6 +203,7 @@ def unstopped():
     return machine.replace(end_stops=())
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 def test_a_piston_that_leaves_its_cylinder_ends_the_run(unstopped):
     """Valves push X_lift past its end, until its chamber and hose have no volume left."""

@@ -354,6 +354,7 @@ NARROW = {
 }
 
 
+@pytest.mark.slow
 def test_no_narrow_peak_is_missed(excavator):
     """Postures that carry up to 39 % more than a peak beside; alone, and in a chart."""
     chart = crane.capacity(excavator, step=0.5, slews=[0.0])

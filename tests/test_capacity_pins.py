@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from test_capacity import G, cells
 
 import crane
-from crane.description.parameter_units import parameter_unit
+from crane.description.machine_parameters import parameter_unit
 
 PINS = {"boom": 260e3, "boom_eye": 250e3, "X_arm": 30e3}
 

@@ -207,6 +207,7 @@ def test_labels_of_contours_are_not_upon_one_another(turns):
         assert not any(one.intersects_path(other, filled=True) for other in boxes[:i])
 
 
+@pytest.mark.slow
 def test_names_are_drawn_as_they_are(chart, tmp_path):
     """No mathematics, no HTML."""
     odd = dataclasses.replace(chart.machine, name=r"$\bad$ <b>_crane", supports=())

@@ -99,6 +99,7 @@ def compare(
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensing", [0.0, 0.5])
 def test_load_sensing_with_response(tmp_path, sensing):
     supply = {
@@ -161,6 +162,7 @@ def test_accumulator_with_heat_under_a_load(tmp_path):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_engine_with_two_pumps_of_summed_power(tmp_path):
     engine = {"speed": 190.0, "torque": 40.0, "inertia": 0.5, "speed_droop": 12.0}
     pump = {
@@ -209,6 +211,7 @@ def test_engine_with_two_pumps_of_summed_power(tmp_path):
     assert power.max() > 0.7 * sum(powers)
 
 
+@pytest.mark.slow
 def test_flow_sharing_of_two_cylinders(tmp_path):
     supply = {
         "control": "load-sensing", "pressure": 25e6, "flow": 4e-4, "margin": 2e6, "droop": 5e5,
@@ -246,6 +249,7 @@ def test_flow_sharing_of_two_cylinders(tmp_path):
     assert run.channels["share_supply"].max() == 1.0  # it had too little
 
 
+@pytest.mark.slow
 def test_open_centre_with_negative_control(tmp_path):
     supply = {
         "control": "negative", "pressure": 25e6, "relief": 27e6, "flow": 1e-3, "signal": 2e6,

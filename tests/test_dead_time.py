@@ -123,6 +123,7 @@ def test_a_law_is_asked_each_millisecond_and_held(tmp_path):
         crane.simulate(machine, crane.ValvePD(machine, reference), step=2e-3)
 
 
+@pytest.mark.slow
 def test_a_loop_with_too_much_dead_time_swings(tmp_path):
     """x' = k e(t - d) is stable for k d < pi / 2 alone: a quick valve, a rigid drive."""
     swings = {}

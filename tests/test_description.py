@@ -29,7 +29,7 @@ from crane.common.errors import (
     suggest_names,
 )
 from crane.description import Friction, bundled_machines, example_robots
-from crane.description.inertia_feasibility import inertia_problem
+from crane.description.kinematic_tree import inertia_problem
 from crane.description.machine_lookup import find_machine_file
 from crane.description.specification import LOOP_TYPES
 

@@ -11,7 +11,7 @@ from crane.identification.mechanics import force_comparison
 from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.identify_payload import identify_payload
 from crane.recordings import Recording
-from crane.recordings.run_folder import read_run
+from crane.recordings.measured_recordings import read_run
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 ASIDE = 2000  # samples at random postures for the base parameters, and at home, about

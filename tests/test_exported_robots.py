@@ -68,6 +68,7 @@ def test_computed_torque_holds_home(name):
     assert np.abs(run.q - run.q[0])[:, driven].max() < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EVERY)
 def test_they_fall_without_gain_or_loss(name):
     machine = robot(name)

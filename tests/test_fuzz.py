@@ -20,6 +20,7 @@ def run(kind, first, count, program="fuzz.py"):
     assert judge(program, kind, first, count) == count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", FORMATS)
 def test_some_changed_files(kind):
     run(kind, 0, 12)

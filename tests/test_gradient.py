@@ -11,7 +11,6 @@ from crane.formats.machine_loading import MachineVariants
 from crane.simulation.sensitivity import adjoint_integration, variational_integration
 from crane.simulation.sensitivity.motion_gradient import _largest_changes
 from crane.simulation.sensitivity.motion_sensitivities import SensitivityProblem
-from crane.simulation.sensitivity.simulated_motion import SimulatedMotion
 from crane.simulation.sensitivity.simulation_constants import SimulationConstants
 
 ORDER_8 = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
@@ -115,20 +114,16 @@ def hydraulic():
 def both(machine, controller, initial, duration, by, outputs, accuracy):
     """Sums of random weights of what `follow` gives, and the gradients of these."""
     asked = SensitivityProblem.from_arguments(
-        machine, controller, initial, duration, 1e-3, outputs, None, None
+        machine, controller, initial, duration, 1e-3, outputs, by, None, None, None
     )
-    track, several = SimulatedMotion(asked.simulation, None), 2
+    track, several = asked.motion, 2
     directions = asked.directions.derivatives(by, track.time)
     base = asked.directions.nominal_constants(track.time)
     sizes = {name: asked.directions.typical_change(name) for name in by}
     stacked = SimulationConstants(*map(np.array, zip(*directions.values(), strict=True)))
-    _, forward = variational_integration.integrate_sensitivities(
-        asked.simulation,
-        outputs,
-        lambda _: (base, stacked),
-        np.array(list(sizes.values())),
-        accuracy,
-    )
+    forward = variational_integration.VariationalIntegrator(
+        track, outputs, base, stacked, np.array(list(sizes.values())), accuracy
+    ).integrate()
     weights = np.random.default_rng(0).normal(size=(several, *forward.shape[:2]))
     gatherer = adjoint_integration.AdjointIntegrator(
         track, outputs, base, _largest_changes(directions, sizes), accuracy
@@ -225,9 +220,9 @@ def test_it_takes_no_more_for_more_numbers():
     """The way back, counted in lines."""
     machine, controller, initial, _, _, outputs = forwarder()
     asked = SensitivityProblem.from_arguments(
-        machine, controller, initial, 0.05, 1e-3, outputs, None, None
+        machine, controller, initial, 0.05, 1e-3, outputs, (), None, None, None
     )
-    track = SimulatedMotion(asked.simulation, None)
+    track = asked.motion
     base, names = asked.directions.nominal_constants(track.time), ["link3.mass", "link7.mass"]
     names += [f"link{i}.com.{axis}" for i in (3, 4, 5, 6, 7) for axis in "xyz"]
     every = asked.directions.derivatives(names, track.time)

@@ -9,21 +9,19 @@ from scipy.integrate import solve_ivp
 import crane
 from crane.common.errors import InputError, RecordingError
 from crane.hydraulics.components import CounterbalanceValve, Valve
-from crane.identification.hydraulics.cylinder_friction import (
-    identify_cylinder_friction,
-)
-from crane.identification.hydraulics.cylinder_signals import (
+from crane.identification.hydraulics.cylinder_equations import (
+    OrificeEquations,
+    WeakFormWindows,
+    chamber_terms,
     cylinder_signals,
     noise_std,
     spool_position,
     valve_opening,
 )
-from crane.identification.hydraulics.orifice_coefficients import identify_orifices
-from crane.identification.hydraulics.orifice_equations import (
-    OrificeEquations,
-    WeakFormWindows,
-    chamber_terms,
+from crane.identification.hydraulics.cylinder_friction import (
+    identify_cylinder_friction,
 )
+from crane.identification.hydraulics.orifice_coefficients import identify_orifices
 from crane.identification.hydraulics.valve_curve import identify_valve
 from crane.identification.signals.signal_quality import steady_means, steady_samples
 

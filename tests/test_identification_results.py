@@ -29,7 +29,7 @@ from crane.identification.mechanics.model_terms import (
     friction_term,
 )
 from crane.identification.signals.signal_processing import Motion
-from crane.recordings.run_folder import read_run
+from crane.recordings.measured_recordings import read_run
 
 HERE = Path(__file__).parents[1]
 RAW = HERE / ".." / "shared" / "data" / "patu655" / "lifting_first_half.csv"

@@ -9,7 +9,7 @@ from oracles import COMPLEX_STEP, GRAVITY, angle
 from scipy.signal import butter, sosfiltfilt
 
 import crane
-from crane.description.estimation_settings import EstimationSettings
+from crane.description.specification import EstimationSettings
 from crane.recordings.logs import read_log
 
 RECORDINGS = Path(__file__).parents[1] / ".." / "shared" / "data"

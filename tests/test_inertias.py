@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import crane
 from crane.common.errors import CraneWarning, DescriptionError
-from crane.description.inertia_feasibility import inertia_problem, nearest_inertia
+from crane.description.kinematic_tree import inertia_problem, nearest_inertia
 from crane.formats.checks import check
 
 GRBDA = Path(__file__).parents[2] / "shared" / "data" / "third_party" / "grbda"

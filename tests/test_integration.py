@@ -58,36 +58,22 @@ class InPython:
         return self._control(time, q_a, v_a, state)
 
 
-class Push:
-    """Constant forces, traced along."""
+class Push(crane.control.ControlLaw):
+    """Constant forces."""
 
-    reference = None
-    columns = 0
-
-    def __init__(self, *forces):
+    def __init__(self, machine, *forces):
+        super().__init__(machine)
         self.settings = np.array(forces, dtype=np.float64)
 
-    def start(self, q_a):
-        return np.zeros(0)
-
-    def __call__(self, time, q_a, v_a, state):
-        return self.settings, state
-
-    def references(self, times):
-        return np.zeros((len(times), 0))
-
-    def trace(self, at):
-        return list(at.settings), at.state
+    def law(self, inputs):
+        return inputs.settings, ()
 
 
 @pytest.fixture
 def steps(monkeypatch):
     """How many steps were done in machine code and how many in Python."""
     done = {"compiled": 0, "python": 0}
-    run, advance = (
-        RungeKuttaStepper.run,
-        PythonStepper.advance,
-    )
+    run, advance = RungeKuttaStepper.run, PythonStepper.advance
 
     def counted_run(self, *rest):
         count = run(self, *rest)
@@ -123,7 +109,7 @@ CONTROLS = {
     "pi falling": lambda machine, path: crane.PI(machine, path, integral=np.zeros(3)),
     "computed torque": lambda machine, path: crane.ComputedTorque(machine, path),
     "free": lambda machine, path: None,
-    "push": lambda machine, path: Push(0.2, 12.0, -5.0),
+    "push": lambda machine, path: Push(machine, 0.2, 12.0, -5.0),
 }
 
 
@@ -272,15 +258,16 @@ def failing(steps, *arguments, **settings):
     return str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 def test_a_branch_that_is_left_is_left_alike(forwarder, steps):
     free = forwarder.replace(friction={}, end_stops=())
     runs = [
         simulate(free, control, duration=0.1, step=2e-4, backend=backend)
         for control, backend in (
-            (Push(0.0, 200.0, 0.0), "compiled"),
-            (InPython(Push(0.0, 200.0, 0.0)), "compiled"),
-            (Push(0.0, 200.0, 0.0), "pinocchio"),
+            (Push(free, 0.0, 200.0, 0.0), "compiled"),
+            (InPython(Push(free, 0.0, 200.0, 0.0)), "compiled"),
+            (Push(free, 0.0, 200.0, 0.0), "pinocchio"),
         )
     ]
     assert steps["compiled"] > 5 and steps["python"] > 10

@@ -5,7 +5,7 @@ import inspect
 from functools import cache
 from pathlib import Path
 
-PACKAGE = Path(__file__).parents[1] / "crane"
+from package_source import PACKAGE, nodes
 
 # A room may import those before it. Within a room, modules may not form a circle either.
 ORDER = [
@@ -33,14 +33,13 @@ def imports(path: Path) -> tuple[str, ...]:
 
 
 def _imports(path):
-    tree = ast.parse(path.read_text())
     skipped = {
         id(inner)
-        for node in ast.walk(tree)
+        for node in nodes(path)
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
         for inner in ast.walk(node)
     }
-    for node in ast.walk(tree):
+    for node in nodes(path):
         if id(node) in skipped:
             continue
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("crane."):

@@ -11,8 +11,8 @@ from command_line import typed
 
 import crane
 from crane.common import scratch_arrays
+from crane.recordings.measured_recordings import read_run
 from crane.recordings.recording import Recording
-from crane.recordings.run_folder import read_run
 
 MEASURED = """
 import json, resource, sys

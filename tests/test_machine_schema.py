@@ -16,7 +16,7 @@ from crane.description.key_types import SectionKey, SectionSchema
 from crane.description.machine_schema import MACHINE
 from crane.formats.machine_file.json_schema import SCHEMA_PATH, schema_text
 from crane.formats.machine_file.machine_reader import read_plain_data
-from crane.formats.machine_file.yaml_parser import parse_yaml_file
+from crane.formats.machine_file.yaml_text import parse_yaml_file
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT / "tests" / "data"

@@ -15,9 +15,8 @@ from command_line import typed
 import crane
 from crane.common.errors import CraneError, CraneWarning, RecordingError
 from crane.recordings import measured_configurations
-from crane.recordings.measured_recordings import check_pressures, read_measured
+from crane.recordings.measured_recordings import check_pressures, read_measured, read_run
 from crane.recordings.recording import Recording
-from crane.recordings.run_folder import read_run
 from crane.recordings.timeseries import Table
 
 AREA_A, AREA_B = 3.14e-4, 2.01e-4  # [m2] of both cylinders

@@ -139,6 +139,7 @@ def test_a_recording_without_its_machine_still_shows_its_plots(run, machine):
     assert len(found.addresses) == 1 and "peak speed" in found.text
 
 
+@pytest.mark.slow
 def test_names_stay_text(mini, run):
     task = next(iter(mini.tasks.values()))
     evil = dataclasses.replace(

@@ -143,6 +143,7 @@ def kernel(request, monkeypatch):
     return request.param
 
 
+@pytest.mark.slow
 def test_a_folder_is_wholly_old_or_wholly_new_wherever_a_run_is_killed(tmp_path, kernel):
     target, call, seen = tmp_path / "run", 0, set()
     fill(target, OLD)

@@ -10,8 +10,8 @@ from hydraulic_rig import COMPENSATED, rig
 
 import crane
 from crane.common.errors import CraneWarning
+from crane.description.machine_parameters import parameter_unit
 from crane.description.parameter_changes import parameters
-from crane.description.parameter_units import parameter_unit
 from crane.formats.machine_file.yaml_text import format_yaml
 from crane.formats.machine_loading import MachineVariants
 

@@ -122,6 +122,7 @@ def driven(path):
     return machine
 
 
+@pytest.mark.slow
 @settings(max_examples=20)
 @given(plans())
 def test_random_linkages_move_as_constraint_dynamics_says(plan):

@@ -85,6 +85,7 @@ def humming(recording, column, amplitude):
     return dataclasses.replace(recording, tau=tau)
 
 
+@pytest.mark.slow
 def test_a_clean_recording_is_told_nothing_of(mini, clean):
     lines = told(lambda: identify(mini, clean, bandwidth=20.0))
     assert lines == []

@@ -7,10 +7,10 @@ from writing_commands import read
 import crane
 from crane.common.errors import OutputError
 from crane.common.result import Result
+from crane.identification.hydraulics.cylinder_equations import EquationSides
 from crane.identification.hydraulics.orifice_coefficients import OrificeCoefficients
-from crane.identification.hydraulics.orifice_equations import EquationSides
 from crane.identification.hydraulics.valve_curve import ValveCurve
-from crane.recordings.run_folder import read_run
+from crane.recordings.measured_recordings import read_run
 from crane.simulation.linear.linearization import linear_models
 from crane.view.result_files import RESULT_FILES, plot_result, result_summary
 
@@ -163,7 +163,9 @@ def test_every_result_has_a_case():
         return {x for one in of.__subclasses__() for x in {one, *subclasses(one)}}
 
     for name in crane.__all__:
-        getattr(crane, name)  # which imports its module
+        found = getattr(crane, name)  # which imports its module
+        for inner in getattr(found, "__all__", ()):
+            getattr(found, inner)
     results = {x.__name__ for x in subclasses(Result) if not x.__name__.startswith("Rating")}
     assert results == set(RESULT_FILES) == set(CASES)
 

@@ -14,9 +14,9 @@ from crane.common.atomic_output import (
     replace_folder,
 )
 from crane.common.errors import OutputError
+from crane.recordings.measured_recordings import read_run
 from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import recorded_machine_name, result_title
-from crane.recordings.run_folder import read_run
 
 
 @pytest.fixture

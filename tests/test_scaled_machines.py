@@ -215,7 +215,7 @@ def test_masses_beyond_what_counts_are_told_in_a_line(folder):
 
 @pytest.mark.parametrize(("mass", "told"), [(1e-12, ""), (1.0, ""), (1e9, "")])
 def test_inertias_are_judged_by_their_mass(mass, told):
-    from crane.description.inertia_feasibility import inertia_problem
+    from crane.description.kinematic_tree import inertia_problem
 
     size = 1e-6  # [m]
     assert str(inertia_problem(mass, mass * size**2 * np.eye(3)) or "") == told

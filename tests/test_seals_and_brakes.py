@@ -12,7 +12,7 @@ import crane
 from crane.codegen import Tape
 from crane.codegen.symbolic import required_operations
 from crane.common.errors import CraneError
-from crane.description.parameter_units import parameter_unit
+from crane.description.machine_parameters import parameter_unit
 from crane.dynamics import Dynamics
 from crane.dynamics.joint_forces import MIN_COULOMB_FRICTION, find_stick_slip_columns
 from crane.formats.machine_loading import MachineVariants

@@ -129,6 +129,7 @@ def test_no_words_overlap_or_lie_on_lines_at_home(at_home):
         assert crossed(figure) == [], machine.name
 
 
+@pytest.mark.slow
 def test_no_words_overlap_anywhere_on_the_cranes(machines):
     for machine in machines[:3]:
         for q_a in random_postures(machine, 3, seed=1):

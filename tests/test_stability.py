@@ -175,6 +175,7 @@ def test_a_payload_tips_it_by_its_inertia_earlier(folder, standing):
     assert found.static_mass == pytest.approx(alone[0], rel=0.2)
 
 
+@pytest.mark.slow
 def test_what_is_fixed_is_what_stands_on_stiff_contacts(folder):
     """At rest both press the ground alike; supports of equal stiffness share alike."""
     path = folder / "floats.yaml"

@@ -135,6 +135,7 @@ def test_a_stick_slip_oscillator(tmp_path, method, tolerance):
     assert found.channels["rest_x"][rests] == pytest.approx(force[rests], abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_many_joints_that_stick_give_way_together(tmp_path, method):
     """A four-bar breaks away at the force of virtual work, sum F_k |Gamma_k|: three, one way.
@@ -198,6 +199,7 @@ def test_a_loaded_crane_stands_still_for_an_hour(mini):
         assert found.channels[f"rest_{joint}"] == pytest.approx(-weight[i], abs=1e-9)
 
 
+@pytest.mark.slow
 def test_methods_and_backends_agree(mini):
     """The lift with friction that sticks: machine code, Python and Pinocchio."""
 

@@ -100,6 +100,7 @@ def still(machine, **changes):
     return crane.load(machine.path, lock={"slew": 0.2, "lift": 0.3}, changes=changes)
 
 
+@pytest.mark.slow
 def test_sway_alone_tells_ratios(machine):
     """Where all drives stand still: lengths of the pendulum, whatever the mass is said to be."""
     stands = still(machine)
@@ -134,6 +135,7 @@ def test_sway_tells_a_load(machine):
         assert found.mass == pytest.approx(120.0, rel=share)
 
 
+@pytest.mark.slow
 def test_files_need_no_column_of_force(machine, driven, tmp_path):
     """A log without forces of free joints, read for the machine; one that names them channels."""
     path, table = tmp_path / "log.csv", noisy(driven, 0.0)

@@ -137,6 +137,7 @@ def held(machine):
     return machine.replace(forces=(*machine.forces, spring))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["compiled", "pinocchio"])
 @pytest.mark.parametrize("ask", [singly, stacked])
 def test_dynamics(mini, backend, ask):

@@ -53,6 +53,7 @@ def by_pinocchio(text, state):
     return model, data, q
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 @pytest.mark.parametrize("name", [*BUNDLED, FLOATING, *THEIRS], ids=lambda name: Path(name).stem)
 def test_other_readers_place_every_link_of_the_tree_where_the_machine_has_it(name, tmp_path):

@@ -10,7 +10,7 @@ import crane.view.page.scene
 from crane.common.errors import CraneWarning
 from crane.formats import write_urdf_plus
 from crane.formats.checks import check
-from crane.formats.visuals.mesh_files import find_mesh_file
+from crane.formats.visuals.urdf_shapes import find_mesh_file
 
 COUPLER = '    <parent link="crank_arm"/>\n'
 LIMIT = '<limit lower="-1" upper="1" effort="10" velocity="5"/>'

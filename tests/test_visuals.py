@@ -15,7 +15,7 @@ import crane
 from crane.common.errors import CraneWarning
 from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.formats.checks import check
-from crane.formats.visuals import mesh_files, mesh_process
+from crane.formats.visuals import mesh_process, urdf_shapes
 from crane.formats.visuals.urdf_shapes import (
     DEFAULT_COLOUR,
     BoxShape,
@@ -212,7 +212,7 @@ def test_damaged_meshes_are_boxes_with_one_line(tmp_path):
 def test_too_large_a_mesh_is_not_opened(tmp_path):
     with (tmp_path / "large.stl").open("wb") as file:
         file.truncate(10**12)  # which takes no space
-    assert mesh_files.read_meshes([tmp_path / "large.stl"]) == {
+    assert urdf_shapes.read_meshes([tmp_path / "large.stl"]) == {
         tmp_path / "large.stl": "1000000 MB, more than 200"
     }
 
@@ -247,7 +247,7 @@ def test_a_small_file_that_repeats_its_parts_is_drawn_up_to_a_bound(tmp_path):
     """Instances of millions of triangles are refused, repeated screws are not."""
     (tmp_path / "bomb.glb").write_bytes(instanced(10_000, 399))
     (tmp_path / "screws.glb").write_bytes(instanced(100, 900))
-    bomb, screws = mesh_files.read_meshes(
+    bomb, screws = urdf_shapes.read_meshes(
         [tmp_path / "bomb.glb", tmp_path / "screws.glb"]
     ).values()
     assert bomb == "it repeats its 10000 triangles to more than 100000"
@@ -262,17 +262,17 @@ def test_what_a_mesh_holds_is_kept_by_its_content(tmp_path, place, monkeypatch):
     triangle = "usemtl red\nv 0 0 0\nv 1 0 0\nv 0 2 0\nf 1 2 3\n"
     (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + triangle)
     (tmp_path / "a.mtl").write_text("newmtl red\nKd 1 0 0\n")
-    asked, ask = [], mesh_files._run_mesh_process
+    asked, ask = [], urdf_shapes._run_mesh_process
 
     def told(names):
         asked.clear()
-        return list(mesh_files.read_meshes(tmp_path / name for name in names).values())
+        return list(urdf_shapes.read_meshes(tmp_path / name for name in names).values())
 
     def counted(files, triangles):
         asked.append([file.name for file in files])
         return ask(files, triangles)
 
-    monkeypatch.setattr(mesh_files, "_run_mesh_process", counted)
+    monkeypatch.setattr(urdf_shapes, "_run_mesh_process", counted)
     names = ["a.stl", "a.off", "a.obj"]
     (first,), wrong, (red,) = told(names)
     assert asked == [names] and isinstance(wrong, str) and red.colour == (1, 0, 0, 1)
@@ -296,9 +296,9 @@ def test_what_a_mesh_holds_is_kept_by_its_content(tmp_path, place, monkeypatch):
 def test_kept_meshes_count_as_triangles_to_draw(tmp_path, place, monkeypatch):
     for faces in (30, 20):
         (tmp_path / f"{faces}.stl").write_bytes(stl(faces, faces))
-    assert not isinstance(mesh_files.read_meshes([tmp_path / "30.stl"])[tmp_path / "30.stl"], str)
+    assert not isinstance(urdf_shapes.read_meshes([tmp_path / "30.stl"])[tmp_path / "30.stl"], str)
     monkeypatch.setattr(mesh_process, "MAX_TRIANGLES", 49)
-    kept, wrong = mesh_files.read_meshes([tmp_path / "30.stl", tmp_path / "20.stl"]).values()
+    kept, wrong = urdf_shapes.read_meshes([tmp_path / "30.stl", tmp_path / "20.stl"]).values()
     assert len(kept[0].faces) == 30 and wrong.startswith("with it there are more than")
 
 
@@ -323,7 +323,7 @@ def test_a_reader_that_ends_costs_one_mesh(tmp_path, place, monkeypatch):
     def read(*names):
         for name in names:
             (tmp_path / name).write_bytes(stl(1))
-        return list(mesh_files.read_meshes(tmp_path / name for name in names).values())
+        return list(urdf_shapes.read_meshes(tmp_path / name for name in names).values())
 
     first, second, third, fourth, fifth = read("1.stl", "end.stl", "2.stl", "long.stl", "3.stl")
     assert second == "damaged" and fourth == "reading it takes more than 20 s"

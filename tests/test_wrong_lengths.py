@@ -65,6 +65,7 @@ def test_right_lengths_close_as_said_without_a_word(name, tmp_path):
     assert sides(places(machine, linkage)) == drawn(linkage)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SOME_SLOW)
 def test_no_wrong_length_turns_a_linkage_over(name, tmp_path):
     """The assembly mode of the specified home, or an error with the gap and the length."""
@@ -129,6 +130,7 @@ def test_the_line_names_the_gap_and_the_length(tmp_path):
         assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_what_was_found_is_taken_only_where_that_is_said(tmp_path):
     linkage = LINKAGES["loader"]
     path = linkage.write(tmp_path, wrong={"bell.x": 0.85 * linkage.lengths()["bell.x"]})

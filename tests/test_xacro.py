@@ -1,6 +1,8 @@
 """xacro files expand as with xacro itself, with packages found by this program's rules."""
 
+import importlib
 import shutil
+import sys
 import warnings
 from pathlib import Path
 
@@ -11,6 +13,7 @@ from command_line import typed
 import crane
 from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.formats import robot_files
+from crane.formats.xacro_expressions import UnsafeExpressionError, restrict_expressions
 
 xacro = pytest.importorskip("xacro")
 
@@ -221,3 +224,176 @@ def test_excavator_as_it_comes():
     machine = load(SHARED)
     assert machine.joints[:4] == ("swing_joint", "boom_joint", "arm_joint", "bucket_joint")
     assert typed("check", SHARED).returncode == 1
+
+
+# --- files of strangers ----------------------------------------------------------------------
+
+ESCAPES = {
+    "subclasses through a lambda": "(lambda: [c for c in ().__class__.__base__.__subclasses__() "
+    "if c.__name__ == '_wrap_close'][0].__init__.__globals__['system']('touch {mark}'))()",
+    "attributes of a comprehension": "[x.__class__ for x in [1]]",
+    "a name": "__import__('os').system('touch {mark}')",
+    "vars": "python.vars(python.vars(1).__class__)",
+    "attributes by vars": "python.vars(python)['x']",
+    "classes by type": "python.type('X', (str,), dict())",
+    "the frame of a generator": "(x for x in [1]).gi_frame.f_back.f_globals",
+    "format of attributes": "'{{0.__class__}}'.format(1)",
+    "format of items": "'{{0[a]}}'.format(dict(a=1))",
+    "format_map": "'{{0.__class__}}'.format_map(dict())",
+    "a function's attributes": "xacro.load_yaml.func_globals",
+    "methods of classes": "dict.fromkeys([1])",
+    "an assignment": "[y := 1, y][0]",
+    "f-string": "f'{{(1).__class__}}'",
+    "names in full width": "().＿＿class＿＿",
+}
+
+
+def stranger(folder, expression, element):
+    """A file that evaluates an expression."""
+    text = {
+        "property": f'<xacro:property name="x" value="${{{expression}}}"/><link name="${{x}}"/>',
+        "eval": f'<xacro:property name="x" value="$(eval {expression})"/><link name="${{x}}"/>',
+        "if": f'<xacro:if value="${{{expression}}}"><link name="a"/></xacro:if>',
+    }[element]
+    path = folder / "evil.urdf"
+    path.write_text(
+        '<robot name="e" xmlns:xacro="http://www.ros.org/wiki/xacro"><link name="base"/>'
+        f'{text}<joint name="j" type="continuous"><parent link="base"/><child link="a"/></joint>'
+        "</robot>"
+    )
+    return path
+
+
+@pytest.mark.parametrize("element", ["property", "eval", "if"])
+def test_expressions_of_a_file_do_not_run_programs(tmp_path, element):
+    mark = tmp_path / "mark"
+    path = stranger(tmp_path, ESCAPES["subclasses through a lambda"].format(mark=mark), element)
+    with pytest.raises(CraneError) as caught:
+        load(path)
+    assert "evil.urdf: xacro refuses it" in str(caught.value) and "\n" not in str(caught.value)
+    assert not mark.exists()
+
+
+@pytest.fixture
+def restricted_xacro():
+    """A copy of xacro with restricted expressions; the module itself stays as it is."""
+    names = [name for name in sys.modules if name.partition(".")[0] == "xacro"]
+    originals = {name: sys.modules.pop(name) for name in names}
+    copy = importlib.import_module("xacro")
+    substitution = importlib.import_module("xacro.substitution_args")
+    restrict_expressions(copy, substitution)
+    yield copy
+    sys.modules |= originals
+
+
+@pytest.mark.parametrize("name", ESCAPES)
+def test_expressions_compute_with_data_alone(restricted_xacro, tmp_path, name):
+    expression = ESCAPES[name].format(mark=tmp_path / "mark")
+    symbols = restricted_xacro.Table(restricted_xacro._global_symbols)
+    with pytest.raises((UnsafeExpressionError, NameError, SyntaxError)):
+        restricted_xacro.safe_eval(expression, symbols)
+    with pytest.raises(restricted_xacro.XacroException):
+        restricted_xacro.eval_text(f"$(eval {expression})", symbols)
+    assert not (tmp_path / "mark").exists()
+
+
+EXPRESSIONS = {
+    "2 * pi + math.sin(0.5) ** 2": 2 * np.pi + np.sin(0.5) ** 2,
+    "'{:.3f} {a}'.format(1 / 3, a='b')": "0.333 b",
+    "f'{1 / 3:.2f}'": "0.33",
+    "' a b '.split()[-1].upper()": "B",
+    "dict(a=[1, 2]).get('a', [])[1]": 2,
+    "xacro.dotify(dict(a=dict(b=3))).a.b": 3,
+    "sum": None,
+    "python.sum([x * y for x in range(4) for y in [1, 2] if x != y])": 13,
+    "max(*[1, 5], 3) if not (1 < 2 <= 2 and 'a' in 'abc') else -1": -1,
+    "{'a': 1, **{'b': 2}}['b'] << 2": 8,
+    "python.sorted({3, 1, 2})[::-1]": [3, 2, 1],
+    "[scale * x for x in list(map(float, '1 2'.split()))]": [2.0, 4.0],
+}
+
+
+@pytest.mark.parametrize("text", EXPRESSIONS)
+def test_expressions_have_the_values_of_xacro(restricted_xacro, text):
+    results = []
+    for module in (xacro, restricted_xacro):
+        symbols = module.Table(module._global_symbols)
+        symbols["scale"] = 2
+        try:
+            results.append(module.safe_eval(text, symbols))
+        except NameError as error:
+            results.append(str(error))
+    assert results[0] == results[1]
+    assert results[0] == EXPRESSIONS[text] or EXPRESSIONS[text] is None
+
+
+def test_trusted_files_run_as_by_xacro(tmp_path):
+    """Only where the user says so, and never for a recording that names the file."""
+    mark = tmp_path / "mark"
+    run = ESCAPES["subclasses through a lambda"].format(mark=mark)
+    path = stranger(tmp_path, f"'ab'[{run}]", "property")
+    machine = load(path, trust_xacro=True)
+    assert mark.exists() and machine.joints == ("j",)
+    mark.unlink()
+    with pytest.raises(CraneError, match="xacro refuses it"):
+        crane.formats.load_from_expression(machine.load_expression)
+    assert "--trust-xacro" in machine.command_line_arguments
+    recording = tmp_path / "run.csv"
+    recording.write_text(f"# machine: {path}\n# crane samples: 2\ntime [s],q_j [rad]\n0,0\n1,0\n")
+    for words in ((), ("--trust-xacro",)):
+        result = typed("view", recording, "--out", tmp_path / "page", *words)
+        assert result.returncode == 2 and "xacro refuses it" in result.stderr
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize("how", ["load_yaml", "include", "find"])
+def test_files_outside_of_the_package_are_not_read(tmp_path, how):
+    secret = tmp_path / "secret" / "keys.yaml"
+    secret.parent.mkdir()
+    secret.write_text("key: hidden\n")
+    (tmp_path / "robot").mkdir()
+    file = {"load_yaml": str(secret), "include": str(secret), "find": "../secret/keys.yaml"}[how]
+    element = (
+        f'<xacro:include filename="{file}"/>'
+        if how == "include"
+        else f"<link name=\"${{xacro.load_yaml('{file}')['key']}}\"/>"
+    )
+    path = tmp_path / "robot" / "r.xacro"
+    path.write_text(
+        f'<robot name="e" xmlns:xacro="http://www.ros.org/wiki/xacro">{element}</robot>'
+    )
+    with pytest.raises(CraneError) as caught:
+        load(path)
+    assert "--packages FOLDER" in str(caught.value) and "hidden" not in str(caught.value)
+    if how != "include":
+        with pytest.raises(CraneError, match="no joint moves"):
+            load(path, packages=[secret.parent])
+
+
+def test_neighbours_without_a_manifest_are_packages_but_no_other_folders(tmp_path, monkeypatch):
+    """Any folder has a package's name: one beside the home folder is none."""
+    robot = tmp_path / "home" / "src" / "robot" / "urdf" / "r.xacro"
+    for folder in (robot.parent, tmp_path / "home" / "src" / "parts", tmp_path / "home" / "keys"):
+        folder.mkdir(parents=True)
+        (folder / "names.yaml").write_text("key: inside\n")
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+
+    def key(package):
+        robot.write_text(
+            '<robot name="e" xmlns:xacro="http://www.ros.org/wiki/xacro"><link name="base"/>'
+            f"<link name=\"${{xacro.load_yaml('$(find {package})/names.yaml')['key']}}\"/>"
+            '<joint name="j" type="continuous"><parent link="base"/><child link="inside"/></joint>'
+            "</robot>"
+        )
+        return load(robot)
+
+    assert key("parts").joints == key("urdf").joints == ("j",)
+    with pytest.raises(CraneError, match="not in its package"):
+        key("keys")
+
+
+def test_environment_is_not_read(tmp_path, monkeypatch):
+    monkeypatch.setenv("SECRET", "hidden")
+    assert load(stranger(tmp_path, "'$(optenv SECRET none)' == 'none'", "if")).joints == ("j",)
+    with pytest.raises(CraneError, match="variable 'SECRET' is not set"):
+        load(stranger(tmp_path, "'$(env SECRET)'", "property"))

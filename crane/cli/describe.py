@@ -78,7 +78,7 @@ def info(
 
 
 def _print_names(machine: str, assembly: AssemblyOptions, pattern: str | None) -> None:
-    from crane.description.name_search import names_by_kind, search_names
+    from crane.description.machine_parameters import names_by_kind, search_names
 
     files = assembly.package_values()
     with use_load_options(check_package_folders(files["packages"]), files["arguments"]):

@@ -28,6 +28,7 @@ GROUPS = {  # modules of this room and their commands, in the order of use
     "show": "view plot sketch live",
     "exchange": "convert import schema",
 }
+_FLAGS = ("--debug", "--strict", "--trust-xacro")  # that all commands take
 _HELP = """\
 Simulate, identify, rate and design machines with closed kinematic chains.
 
@@ -38,7 +39,8 @@ Simulate, identify, rate and design machines with closed kinematic chains.
 {commands}
 
 crane COMMAND --help shows arguments and options. --version shows the version.
-All commands take --strict (reject physically impossible inertias) and --debug.
+All commands take --strict (reject physically impossible inertias), --trust-xacro
+(allow xacro files to run Python) and --debug.
 """
 
 
@@ -68,15 +70,18 @@ def program(command: str = "") -> typer.Typer:
 def main() -> None:
     """Run the command line: errors are one line, exit status 2."""
     gc.set_threshold(_GC_THRESHOLD)
-    arguments = [word for word in sys.argv[1:] if word not in ("--debug", "--strict")]
-    debug, strict = (word in sys.argv[1:] for word in ("--debug", "--strict"))
+    arguments = [word for word in sys.argv[1:] if word not in _FLAGS]
+    debug, strict, trust = (word in sys.argv[1:] for word in _FLAGS)
     if isinstance(sys.stdout, io.TextIOWrapper):  # names of files may be no text
         sys.stdout.reconfigure(errors="backslashreplace")
     warnings.showwarning = _show_warning
     warnings.simplefilter("once", CraneWarning)
     try:
         run = program(*arguments[:1])
-        with activity_line(" ".join(["crane", *arguments[:1]])), use_load_options(strict=strict):
+        with (
+            activity_line(" ".join(["crane", *arguments[:1]])),
+            use_load_options(strict=strict, trust_xacro=trust),
+        ):
             status = run(args=arguments or ["--help"], standalone_mode=False, prog_name="crane")
         if status == INTERRUPTED:  # what the parser makes of KeyboardInterrupt
             raise KeyboardInterrupt

@@ -383,7 +383,7 @@ def circuit(
 
     The recordings contain valve signals and pressures. The model orifices includes bulk modulus.
     """
-    from crane.identification.hydraulics.cylinder_signals import required_channels
+    from crane.identification.hydraulics.cylinder_equations import required_channels
 
     check_name(model, _CIRCUIT_MODELS, f"model '{model}' is unknown")
     if model != "orifices":
@@ -428,7 +428,7 @@ def calibrate(
     sensors: ComparedColumns = None,
 ) -> None:
     """Fit parameters by simulation of recorded valve signals."""
-    from crane.recordings.run_folder import recording_file
+    from crane.recordings.measured_recordings import recording_file
 
     fits, window = parse_fits(fit), parse_window(train)
     loaded = options.load(machine)

@@ -13,7 +13,7 @@ from crane.cli.command import OptionBlock
 from crane.cli.parsing import parse_arguments, parse_names, parse_values
 from crane.cli.terminal import status
 from crane.common.atomic_output import check_file_is_writable, check_folder_is_writable
-from crane.common.errors import InputError, OutputError
+from crane.common.errors import OutputError
 from crane.common.result import Result
 
 # Arguments and options of several commands that are not part of a block.
@@ -142,14 +142,6 @@ UserMeasures = Annotated[
     ),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
-_Changes = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="NAME=VALUE",
-        help="New value of a parameter, e.g. payload.mass=200; may be repeated.",
-    ),
-]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +149,14 @@ class ChangeOptions(OptionBlock):
     """Changed parameters of a machine."""
 
     panel = "Machine options"
-    changes: _Changes = None
+    changes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="New value of a parameter, e.g. payload.mass=200; may be repeated.",
+        ),
+    ] = None
 
     def changed_values(self) -> dict[str, float]:
         """Values of the changed parameters."""
@@ -262,20 +261,9 @@ class TimeOptions(OptionBlock):
 
     @property
     def span(self) -> tuple[float, float]:
-        """Start and end [s] of the part to read.
-
-        Raises:
-            InputError: It is empty.
-        """
+        """Start and end [s] of the part to read."""
         start = -inf if self.since is None else self.since
-        end = inf if self.until is None else self.until
-        if not start < end:
-            raise InputError(f"nothing lies from {start:g} to {end:g} s, give a later --until")
-        return start, end
-
-    def check(self) -> None:
-        """Raise an error if the part to read is empty."""
-        _ = self.span
+        return start, inf if self.until is None else self.until
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -292,8 +280,8 @@ class RecordingOptions(TimeOptions):
     def read(
         self, path: Path, machine: "crane.Machine | None" = None, needs: Any = ()
     ) -> "crane.Recording":
-        """Read a recording, see `crane.recordings.run_folder.read_run`."""
-        from crane.recordings.run_folder import read_run
+        """Read a recording, see `crane.recordings.measured_recordings.read_run`."""
+        from crane.recordings.measured_recordings import read_run
 
         return read_run(path, machine, self.columns, self.span, needs)
 

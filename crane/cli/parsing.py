@@ -11,7 +11,7 @@ from crane.common.errors import InputError, check_name
 
 if TYPE_CHECKING:
     from crane.common.samples import Array
-    from crane.description.estimation_settings import ParameterPrior, TermValues
+    from crane.description.specification import ParameterPrior, TermValues
 
 CONFIGURATION_FORM = "JOINT=VALUE,..., as in q1=0.1,X1=0.02"
 _VALUE_FORM = "JOINT=VALUE, as in X1=0.5"
@@ -188,7 +188,7 @@ def parse_priors(texts: Sequence[str] | None) -> "dict[str, ParameterPrior] | No
     Raises:
         InputError: A text has another form, or a name is given twice.
     """
-    from crane.description.estimation_settings import ParameterPrior
+    from crane.description.specification import ParameterPrior
 
     if texts and list(texts) == ["none"]:
         return None
@@ -212,7 +212,7 @@ def parse_trials(texts: Sequence[str] | None) -> "dict[str, list[float | Paramet
     Raises:
         InputError: A text has another form, or a name is given twice.
     """
-    from crane.description.estimation_settings import ParameterPrior
+    from crane.description.specification import ParameterPrior
 
     def parse(name: str, values: str | None) -> "list[float | ParameterPrior]":
         words = (values or "").split(",")
@@ -323,15 +323,12 @@ def _read_wrenches(path: Path) -> "tuple[Array, Array, Array]":
     from crane.recordings.table_reader import read_table
 
     table = read_table(path)
-    names = list(table.units)
-    if "time" not in names:
-        raise InputError(f"{path}: has no column 'time', add it")
-    for name in names:
-        if name != "time":
-            check_name(name, WRENCH_COMPONENTS, f"{path}: '{name}' is no part of a wrench")
-    if len(names) < 2:
+    columns = dict(zip(table.units, table.values.T, strict=True))
+    times = columns.pop("time")
+    for name in columns:
+        check_name(name, WRENCH_COMPONENTS, f"{path}: '{name}' is no part of a wrench")
+    if not columns:
         raise InputError(f"{path}: has no force, add columns such as force_z")
-    columns = dict(zip(names, table.values.T, strict=True))
     zero = np.zeros(len(table.values))
     wrenches = np.stack([columns.get(part, zero) for part in WRENCH_COMPONENTS], axis=1)
-    return columns["time"], wrenches[:, :3], wrenches[:, 3:]
+    return times, wrenches[:, :3], wrenches[:, 3:]

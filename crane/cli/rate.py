@@ -287,7 +287,7 @@ def power(
     It distributes the power of the pumps over losses of components, loads and stored energy.
     """
     from crane.control.valve_commands import require_circuit
-    from crane.recordings.run_folder import recorded_machine
+    from crane.recordings.measured_recordings import recorded_machine
 
     if not beside:
         refuse_options(

@@ -222,7 +222,7 @@ def _load(
     run: Path | None = None,
 ) -> "tuple[crane.Machine, crane.Recording | None]":
     """The machine, and the recording of what is a run, or of a run of the machine."""
-    from crane.recordings.run_folder import recorded_machine
+    from crane.recordings.measured_recordings import recorded_machine
 
     if not _is_run(what):
         loaded = options.load(what)

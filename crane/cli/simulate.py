@@ -139,12 +139,6 @@ class MotionOptions(OptionBlock):
             duration = math.ceil(reference.duration / step - 1e-9) * step  # whole steps
         return tracking_control(machine, reference, self.controller, self.sway), duration
 
-    def label(self, machine: "crane.Machine", control: "Control | None") -> str:
-        """Name of the motion in the recording."""
-        uncontrolled = "free motion" if machine.hydraulics is None else "valves at rest"
-        path = None if self.path is None else self.path.stem
-        return self.task or path or ("hold" if control else uncontrolled)
-
 
 @dataclass(frozen=True, kw_only=True)
 class IntegrationOptions(OptionBlock):
@@ -217,7 +211,9 @@ def simulate(
     else:
         reading.refuse("is for --inputs, leave it out")
         control, duration = motion.control(loaded, step)
-        label = motion.label(loaded, control)
+        uncontrolled = "free motion" if loaded.hydraulics is None else "valves at rest"
+        path = None if motion.path is None else motion.path.stem
+        label = motion.task or path or ("hold" if control else uncontrolled)
         with _write_stopped_run(output, npz), progress_bar("simulating") as progress:
             result = crane.simulate(
                 loaded, control, duration=duration, step=step, label=label,

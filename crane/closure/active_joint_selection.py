@@ -97,7 +97,6 @@ def select_columns(
     Returns:
         (n,) columns in ascending order; None if no selection drives the machine.
     """
-    count = basis.shape[1]
     free = [i for i in candidates if i not in required]
     rows = basis[free]
     if len(required):
@@ -107,7 +106,7 @@ def select_columns(
         rows = (
             rows @ right[len(required) :].T
         )  # motions that are left with the required joints held
-    missing = count - len(required)
+    missing = basis.shape[1] - len(required)
     if len(free) < missing:
         return None
     chosen = list(required)

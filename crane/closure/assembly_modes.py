@@ -85,7 +85,7 @@ def _find_alternatives(search: "_AssemblyModeSearch", max_starts: int) -> list[A
     found: list[AssemblyMode] = []
     for index, (_, columns) in enumerate(closure.structure.blocks):
         block = closure.passive[columns]
-        home_within_limits = search.are_within_limits(closure.home, block)
+        home_within_limits = within_limits(closure.equations, closure.home)[block].all()
         if (
             home_within_limits
             and search.distance_from_guess(closure.home, search.specified_among(block))
@@ -153,15 +153,11 @@ class _AssemblyModeSearch:
         specified = columns[np.isin(columns, self.specified_columns)]
         return specified if len(specified) else columns
 
-    def are_within_limits(self, q: Array, columns: Indices) -> bool:
-        """Whether some joints are within their limits."""
-        return bool(within_limits(self.equations, q)[columns].all())
-
     def find_block_solutions(self, block: int, max_starts: int) -> list[Array]:
         """Solutions of a block other than home's, with the blocks before it as at home."""
         rows, columns = self._block_indices(block)
         found = [self.home]
-        sign = self._determinant_sign(self.home, rows, columns)
+        sign = np.linalg.slogdet(self.equations.evaluate(self.home)[1][np.ix_(rows, columns)])[0]
         # circles or lines that intersect: translations of one loop only
         one_loop = len(set(self.equations.loop_of_row[rows].tolist())) == 1
         two_solutions = (
@@ -178,7 +174,8 @@ class _AssemblyModeSearch:
             ):
                 continue
             found.append(q)
-            if two_solutions and self._determinant_sign(q, rows, columns) != sign:
+            jacobian = self.equations.evaluate(q)[1][np.ix_(rows, columns)]
+            if two_solutions and np.linalg.slogdet(jacobian)[0] != sign:
                 break  # mirror images: there are no others
         return found[1:]
 
@@ -290,9 +287,6 @@ class _AssemblyModeSearch:
         q[angles] = np.remainder(q[angles] + np.pi, 2 * np.pi) - np.pi
         return q
 
-    def _determinant_sign(self, q: Array, rows: Indices, columns: Indices) -> float:
-        return float(np.linalg.slogdet(self.equations.evaluate(q)[1][np.ix_(rows, columns)])[0])
-
     def assess_block_solution(self, q: Array, block: int) -> AssemblyMode | None:
         """The assembly mode with another solution of a block, or None."""
         for later_block in range(block + 1, len(self.blocks)):
@@ -317,9 +311,8 @@ class _AssemblyModeSearch:
             > self.closure.structure.redundancy.tolerance
         ):
             return None
-        if self.equations.find_opposed_loop(q) is not None or not self.are_within_limits(
-            q, passive
-        ):
+        is_inside = within_limits(self.equations, q)[passive].all()
+        if self.equations.find_opposed_loop(q) is not None or not is_inside:
             return None
         columns = np.flatnonzero(
             self.coordinate_differences(q, self.home) > _SAME_CONFIGURATION_TOLERANCE
@@ -331,7 +324,7 @@ class _AssemblyModeSearch:
             self.distance_from_guess(q, compared),
             self.distance_from_guess(self.home, compared),
         )
-        home_outside_limits = not self.are_within_limits(self.home, passive)
+        home_outside_limits = not within_limits(self.equations, self.home)[passive].all()
         is_decisive = (
             home_distance < _LARGE_DEVIATION and np.isin(compared, self.specified_columns).all()
         )

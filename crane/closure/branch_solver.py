@@ -137,7 +137,7 @@ class BranchSolver:
 
         run_with_fallback(
             len(targets),
-            lambda i, _: compiled.follow_targets(cursor, sorted_targets[i:], closed[i:]),
+            lambda i: compiled.follow_targets(cursor, sorted_targets[i:], closed[i:]),
             continue_from_home,
         )
         if order is not None:
@@ -194,7 +194,7 @@ class BranchSolver:
 
         run_with_fallback(
             len(q),
-            None if compiled is None else lambda i, _: compiled.evaluate_gamma(q[i:], out[i:]),
+            None if compiled is None else lambda i: compiled.evaluate_gamma(q[i:], out[i:]),
             check_singularity,
         )
         return out

@@ -9,7 +9,6 @@ import copy
 import dataclasses
 from collections.abc import Collection, Sequence
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -91,7 +90,6 @@ class Closure(BranchSolver, OneLineRepr):
         coordinates = self.equations.coordinates
         self.active = np.array([coordinates.column(name) for name in active], dtype=np.intp)
         self.passive = np.delete(np.arange(model.nv), self.active)
-        self._names = coordinates.names
 
         def columns(names: Collection[str]) -> list[int]:
             return [coordinates.column(name) for name in names]
@@ -131,11 +129,6 @@ class Closure(BranchSolver, OneLineRepr):
     def units(self) -> Array:
         """(nv,) units that make coordinates comparable: 1 rad, and the characteristic length."""
         return self.equations.coordinate_units
-
-    @property
-    def cache_key(self) -> tuple[Any, ...]:
-        """Everything that the equations depend on, see `crane.codegen.cached_result`."""
-        return self.equations.cache_key
 
     def _one_line(self) -> str:
         loops = ", ".join(loop.name for loop in self.equations.loops) or "no loops"
@@ -181,9 +174,10 @@ class Closure(BranchSolver, OneLineRepr):
         other = copy.copy(self)
         other.model, other.equations = model, equations
         other._start_solver(with_machine_code=False)
-        rows = self.structure.independent_rows, self.structure.redundant_rows
         constraints = other._constraints
-        lock, _ = constraints.assess_redundancy(other.home, *rows, self.active)
+        lock, _ = constraints.assess_redundancy(
+            other.home, self.structure.independent_rows, self.structure.redundant_rows, self.active
+        )
         if not constraints.is_closed(other.home) or lock:
             raise MechanismError("the loops do not close there, or lock up")
         return other
@@ -251,9 +245,9 @@ class Closure(BranchSolver, OneLineRepr):
         targets = as_samples(q_a, len(self.active), "q_a", self.active_names)
         if targets.size == 0:
             raise InputError("q_a is an empty stack, give at least one sample")
-        guess = None
+        guess, names = None, self.equations.coordinates.names
         if initial_guess is not None:
-            guess = as_samples(initial_guess, self.model.nv, "guess", self._names)
+            guess = as_samples(initial_guess, self.model.nv, "guess", names)
             if guess.ndim != 1:
                 raise InputError(f"guess has the shape {guess.shape}, give one ({self.model.nv},)")
         out = np.empty((*targets.shape[:-1], self.model.nv))
@@ -301,7 +295,7 @@ class Closure(BranchSolver, OneLineRepr):
             InputError: Wrong shape or not finite.
             SingularConfigurationError: The passive joints are not determined there.
         """
-        q = as_samples(q, self.model.nv, "q", self._names)
+        q = as_samples(q, self.model.nv, "q", self.equations.coordinates.names)
         if q.size == 0:
             raise InputError("q is an empty stack, give at least one sample")
         out = self._gamma_stack(np.atleast_2d(np.ascontiguousarray(q)), q.ndim == 2)
@@ -321,8 +315,8 @@ class Closure(BranchSolver, OneLineRepr):
             InputError: Wrong shape or not finite.
             SingularConfigurationError: The passive joints are not determined there.
         """
-        q = as_samples(q, self.model.nv, "q", self._names)
-        v = as_samples(v, self.model.nv, "v", self._names)
+        q = as_samples(q, self.model.nv, "q", self.equations.coordinates.names)
+        v = as_samples(v, self.model.nv, "v", self.equations.coordinates.names)
         return apply_per_sample(self.continuation.drift, q, v)
 
     def residual(self, q: ArrayLike) -> Array:
@@ -334,7 +328,7 @@ class Closure(BranchSolver, OneLineRepr):
         Returns:
             () or (N,) [m] for translations, [rad] for small rotations.
         """
-        q = as_samples(q, self.model.nv, "q", self._names)
+        q = as_samples(q, self.model.nv, "q", self.equations.coordinates.names)
         return apply_per_sample(
             lambda one: np.abs(self.equations.evaluate(one)[0]).max(initial=0.0), q
         )

@@ -92,8 +92,9 @@ def _add_follow(program: Program, nq: int, n: int) -> None:
 def _add_loops_over_configurations(program: Program, nq: int, n: int) -> None:
     """Add "close_each", which closes configurations in place, and "gamma_each"."""
     newton = program.formula_outputs("newton")
-    arrays = ("constants", "q", "tolerances")
-    with program.add_routine("close_each", counts=("count",), arrays=arrays) as r:
+    with program.add_routine(
+        "close_each", counts=("count",), arrays=("constants", "q", "tolerances")
+    ) as r:
         result = r.local_array("result", newton)
         with r.loop(r.count) as i:
             closed = r.call("close", r.constants, r.q.row_pointer(i, nq), result, r.tolerances)

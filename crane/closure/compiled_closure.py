@@ -227,8 +227,15 @@ class CompiledClosure:
             Number of closed samples.
         """
         targets = np.ascontiguousarray(targets)
-        arrays = (self.geometry.constants, targets, cursor.state, out, self.tolerances)
-        return self._closure_program.call("follow", len(targets), *arrays)
+        return self._closure_program.call(
+            "follow",
+            len(targets),
+            self.geometry.constants,
+            targets,
+            cursor.state,
+            out,
+            self.tolerances,
+        )
 
     def close_in_place(self, q: Array) -> int:
         """Close the loops of configurations (N, nq) in place until one does not converge.
@@ -271,11 +278,16 @@ class CompiledClosure:
         kinematics = PositionKinematics(
             self.geometry, FormulaConstants(tape, geometry_argument, numbers), coordinates
         )
-        columns = self._active_columns, self._passive_columns
         return (
             coordinates,
             kinematics,
-            LoopFormulas(self._equations, self._structure, *columns, kinematics),
+            LoopFormulas(
+                self._equations,
+                self._structure,
+                self._active_columns,
+                self._passive_columns,
+                kinematics,
+            ),
         )
 
     def add_newton_formula(self, program: Program, signs: Array) -> None:
@@ -297,7 +309,7 @@ class CompiledClosure:
             loops.largest_residual(redundant=True) - self._structure.redundancy.tolerance,
         )
         least_determinant: Scalar = 1.0
-        for sign, determinant in zip(signs, loops.determinants, strict=True):
+        for sign, determinant in zip(signs, loops.gamma_and_determinants[1], strict=True):
             least_determinant = minimum(least_determinant, float(sign) * determinant)
         worst = maximum(worst, -1.0 * least_determinant)
         for alignment in loops.alignments:
@@ -344,10 +356,8 @@ class CompiledClosure:
         rows: list[list[Scalar]] = [[0.0] * n for _ in range(self._nq)]
         for k, column in enumerate(self._active_columns):
             rows[column][k] = 1.0
-        for row, column in enumerate(self._passive_columns):
-            for k in range(n):
-                if (row, k) in at:
-                    rows[column][k] = tape.load(0, at[row, k])
+        for (row, k), index in sorted(at.items()):
+            rows[self._passive_columns[row]][k] = tape.load(0, index)
         program.add_formula("gamma", 1, [entry for row in rows for entry in row])
 
     def _determinant_signs(self, home: ClosedConfiguration) -> Array:

@@ -31,6 +31,9 @@ _SINGULAR_TOLERANCE = 1e-5
 _ZERO_TOLERANCE = 1e-9
 
 
+_DEGREES = "degree of freedom", "degrees of freedom"
+
+
 class HomeError(MechanismError):
     """The loops do not close from the initial guess, or not at a valid home configuration.
 
@@ -336,9 +339,8 @@ class _ConstraintAnalysis:
                 f"the loops leave {names or 'all joints'} no freedom to move: check the types "
                 "and axes of the loops, and the axes of the joints"
             )
-        text = (
-            f"{format_count(count, 'active joint')} ({names}) for {_format_mobility(mobility)}: "
-        )
+        degrees = format_count(mobility, *_DEGREES)
+        text = f"{format_count(count, 'active joint')} ({names}) for {degrees}: "
         if mobility < count:
             return text + f"name only {mobility} of them"
         missing = mobility - count
@@ -359,11 +361,7 @@ def _format_proposals(prefix: str, selections: Sequence[ActiveJointSelection]) -
 
 def _missing_active_joints_text(mobility: int) -> str:
     count = "one" if mobility == 1 else mobility
-    return f"{_format_mobility(mobility)} and no active joints, name {count}: "
-
-
-def _format_mobility(mobility: int) -> str:
-    return format_count(mobility, "degree of freedom", "degrees of freedom")
+    return f"{format_count(mobility, *_DEGREES)} and no active joints, name {count}: "
 
 
 def block_triangular_form(incidence: NDArray[np.bool_]) -> list[Block] | None:

@@ -89,7 +89,6 @@ def redundant_gaps_along_motions(
     Returns:
         (k,), and whether each active joint moves at all.
     """
-    model = equations.model
     unit = equations.coordinate_units[active]
     turns = ~equations.coordinates.is_translation[active]
     distances_to_limits = [
@@ -102,7 +101,7 @@ def redundant_gaps_along_motions(
     ]
     largest_gaps = np.abs(equations.evaluate_scaled(home)[0][redundant_rows])
     moves = np.zeros(len(active), dtype=bool)
-    for active_columns, direction in _active_directions(model.nv, active):
+    for active_columns, direction in _active_directions(equations.model.nv, active):
         for side, distance in zip((-1.0, 1.0), ranges, strict=True):
             q = home
             for _ in range(_STEPS_TO_LIMIT):
@@ -193,14 +192,10 @@ class ExactConstraints:
         closed_tolerances: (m,) largest residuals of closed loops [m], [rad].
     """
 
-    closed_tolerances: Array
-
     def __init__(self, equations: LoopEquations):
         self._equations = equations
-        self._residual_units, self._coordinate_units = (
-            equations.residual_units,
-            equations.coordinate_units,
-        )
+        self._residual_units = equations.residual_units
+        self._coordinate_units = equations.coordinate_units
         self.closed_tolerances = CLOSED_TOLERANCE * self._residual_units
 
     def is_closed(self, q: Array) -> bool:

@@ -98,8 +98,7 @@ class Coordinates:
         limit of a prismatic joint, else 1 m.
         """
         joints = (place.translation for place in list(self.model.jointPlacements)[1:])
-        links = (frame.placement.translation for frame in self.model.frames)
-        for places in (joints, links):
+        for places in (joints, (frame.placement.translation for frame in self.model.frames)):
             if distance := float(np.abs(list(places)).max(initial=0.0)):
                 return distance
         limits = np.abs(np.stack([self.lower, self.upper]))[:, self.is_translation]
@@ -134,7 +133,10 @@ class Coordinates:
         out[..., self._configuration_indices] = q
         for column in self.floating_base_columns:
             at = self._configuration_indices[column]
-            out[..., at + 3 : at + 7] = _quaternion(q[..., column + 3 : column + 6])
+            r = q[..., column + 3 : column + 6]
+            half = 0.5 * np.linalg.norm(r, axis=-1, keepdims=True)
+            out[..., at + 3 : at + 6] = 0.5 * np.sinc(half / np.pi) * r
+            out[..., at + 6 : at + 7] = np.cos(half)
         return out
 
     def coordinate_derivatives(self, q: Array, v: Array) -> Array:
@@ -176,9 +178,3 @@ class Coordinates:
         for column in self.floating_base_columns:
             out[column : column + 6] = unlimited
         return out
-
-
-def _quaternion(r: Array) -> Array:
-    """Quaternions (x, y, z, w) of rotation vectors (..., 3)."""
-    half = 0.5 * np.linalg.norm(r, axis=-1, keepdims=True)
-    return np.concatenate([0.5 * np.sinc(half / np.pi) * r, np.cos(half)], axis=-1)

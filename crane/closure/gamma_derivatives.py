@@ -241,7 +241,7 @@ class GammaDerivatives:
         for r in loop_rows:
             row = self._loops.rows[r]
             one, two = row.bodies
-            rate = row.wrench_rate(_motion_of(twist_k, one), _motion_of(twist_k, two))
+            rate = row.wrench_rate(twist_k.get(one, ZERO_VECTOR), twist_k.get(two, ZERO_VECTOR))
             relative_power = _power_between_bodies(
                 row.wrench, twist_changes, row
             ) + _power_between_bodies(rate, self.twists[j], row)
@@ -257,8 +257,8 @@ def _wrench_time_derivatives(
 ) -> tuple[SpatialVector, SpatialVector]:
     """First and second time derivative w' and w'' of a row's wrench."""
     one, two = row.bodies
-    first, second = _motion_of(velocities, one), _motion_of(velocities, two)
-    (_, e1), (a2, e2) = _motion_of(accelerations, one), _motion_of(accelerations, two)
+    first, second = velocities.get(one, ZERO_VECTOR), velocities.get(two, ZERO_VECTOR)
+    (_, e1), (a2, e2) = accelerations.get(one, ZERO_VECTOR), accelerations.get(two, ZERO_VECTOR)
     axis_rate, arm_rate = row.axis_and_arm_rates(first, second)
     axis = add_vectors(cross(e1, row.axis), cross(first[1], axis_rate))
     arm = add_vectors(cross(e2, row.arm), cross(second[1], arm_rate))
@@ -278,10 +278,5 @@ def _power_between_bodies(
     """Power of a wrench on the relative motion of the two bodies of a row."""
     one, two = row.bodies
     return spatial_dot(
-        wrench, subtract_spatial(_motion_of(motions, two), _motion_of(motions, one))
+        wrench, subtract_spatial(motions.get(two, ZERO_VECTOR), motions.get(one, ZERO_VECTOR))
     )
-
-
-def _motion_of(motions: BodyMotions, body: int) -> SpatialVector:
-    """Motion of a body; zero for bodies that no joint of the cluster moves."""
-    return motions.get(body, ZERO_VECTOR)

@@ -279,9 +279,14 @@ def _analyse_to_file_precision(
     others = np.array(
         [names.index(joint) for joint in active_joint_error.selections[0].joints], dtype=np.intp
     )
-    rest = np.setdiff1d(np.arange(equations.model.nv), others)
     try:
-        analyse_constraints(equations, others, rest, initial_guess, rounded)
+        analyse_constraints(
+            equations,
+            others,
+            np.setdiff1d(np.arange(equations.model.nv), others),
+            initial_guess,
+            rounded,
+        )
     except MechanismError:
         raise exact_error from None
     raise active_joint_error

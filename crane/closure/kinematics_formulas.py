@@ -325,11 +325,10 @@ class PositionKinematics:
 
     def joint_axis(self, i: int) -> Vector:
         """Axis of joint i."""
-        flyers = self.geometry.floating_bases
         axis_index = (
             2
             if i not in self.geometry.floating_bodies
-            else (i - max(j for j in flyers if j <= i)) % 3
+            else (i - max(j for j in self.geometry.floating_bases if j <= i)) % 3
         )
         return [row[axis_index] for row in self.rotation[i]]
 
@@ -376,7 +375,6 @@ def largest_scaled_value(
         is_length: Which of them are lengths.
         inverse_length: One over the characteristic length.
     """
-    angles = [value for value, is_long in zip(values, is_length, strict=True) if not is_long]
     lengths = [value for value, is_long in zip(values, is_length, strict=True) if is_long]
-    most = max_abs(angles)
+    most = max_abs(x for x, is_long in zip(values, is_length, strict=True) if not is_long)
     return maximum(most, inverse_length * max_abs(lengths)) if lengths else most

@@ -93,8 +93,9 @@ class LoopEquations:
                 frame = model.frames[frame_id(model, name)]
                 self.frames.append((frame.parentJoint, frame.placement * rotation))
                 supports = [model.joints[i] for i in model.supports[frame.parentJoint] if i > 0]
-                columns = [i for x in supports for i in range(x.idx_v, x.idx_v + x.nv)]
-                joint_signs[index, columns] += side
+                joint_signs[
+                    index, [i for x in supports for i in range(x.idx_v, x.idx_v + x.nv)]
+                ] += side
             locked = LOOP_TYPES[loop.type]
             rows += [(index, True, i, 0) for i in range(3) if locked[i]]
             free = [k for k in range(3) if not locked[3 + k]]
@@ -349,8 +350,7 @@ def find_clusters(equations: LoopEquations) -> list[Cluster]:
         if not tied:
             continue
         paths = [_path_to_world(parents, parents[joint]) for joint in tied]
-        common = paths[0].intersection(*paths[1:])
-        first, *rest = sorted({*tied, *set().union(*paths)} - common)
+        first, *rest = sorted({*tied, *set().union(*paths)} - paths[0].intersection(*paths[1:]))
         for joint in rest:
             one, two = sorted((root_of(first), root_of(joint)))
             representative[two] = one

@@ -150,9 +150,15 @@ class LoopFormulas:
             and locks_all_translations
             and self._structure.redundancy.tolerance <= CLOSED_TOLERANCE
         )
-        pair = bodies[one], bodies[one + 1]
         return LoopEquationFormula(
-            pair, is_translation, has_fixed_axis, axis, arm, wrench, phi, jacobian
+            (bodies[one], bodies[one + 1]),
+            is_translation,
+            has_fixed_axis,
+            axis,
+            arm,
+            wrench,
+            phi,
+            jacobian,
         )
 
     def solve_passive(
@@ -189,25 +195,18 @@ class LoopFormulas:
         return side
 
     @cached_property
-    def _gamma_and_determinants(self) -> tuple[dict[int, Vector], list[Scalar]]:
+    def gamma_and_determinants(self) -> tuple[dict[int, Vector], list[Scalar]]:
+        """Rows of gamma (n,) by joint, and determinants of the blocks in their order."""
         n = len(self.active_joints)
-        return self.solve_passive(
-            {
-                joint: [float(i == k) for k in range(n)]
-                for i, joint in enumerate(self.active_joints)
-            },
-            [[0.0] * n for _ in self.rows],
-        )
+        known: dict[int, Vector] = {
+            joint: [float(i == k) for k in range(n)] for i, joint in enumerate(self.active_joints)
+        }
+        return self.solve_passive(known, [[0.0] * n for _ in self.rows])
 
     @property
     def gamma(self) -> dict[int, Vector]:
         """Rows of gamma (n,) by joint."""
-        return self._gamma_and_determinants[0]
-
-    @property
-    def determinants(self) -> list[Scalar]:
-        """Determinants of the blocks, in their order."""
-        return self._gamma_and_determinants[1]
+        return self.gamma_and_determinants[0]
 
     @cached_property
     def newton_step(self) -> dict[int, Scalar]:

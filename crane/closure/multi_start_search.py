@@ -190,18 +190,15 @@ class MultiStartSearch:
             else extra_starts
         )
         self._residual, self.initial_guess = ClosureResidual(equations), initial_guess
-        self._coordinate_units = equations.coordinate_units
-        self._lower_limits, self._upper_limits = (
-            equations.coordinates.lower,
-            equations.coordinates.upper,
+        self._coordinates, self._coordinate_units = (
+            equations.coordinates,
+            equations.coordinate_units,
         )
         self.said, self._extra_starts = specified, extra_starts
-        self._coordinate_derivatives = equations.coordinates.coordinate_derivatives
         self._in_loops = (equations.sign != 0).any(axis=0)
-        self._turns = ~equations.coordinates.is_translation
         self._periodic = periodic_coordinates(equations)
         self._unlimited_periodic = (
-            self._periodic & np.isinf(self._upper_limits) & np.isinf(self._lower_limits)
+            self._periodic & np.isinf(self._coordinates.upper) & np.isinf(self._coordinates.lower)
         )
 
     def find_configurations(
@@ -243,10 +240,14 @@ class MultiStartSearch:
             q, residual = self.minimize_residual(start, movable, without_limits)
             limited = np.setdiff1d(movable, unlimited)
             slack = _RESIDUAL_TOLERANCE * self._coordinate_units
-            within_limits = (q >= self._lower_limits - slack) & (q <= self._upper_limits + slack)
+            within_limits = (q >= self._coordinates.lower - slack) & (
+                q <= self._coordinates.upper + slack
+            )
             if residual <= tolerance and within_limits[limited].all():
                 return q
-            if not np.isfinite([self._lower_limits[limited], self._upper_limits[limited]]).any():
+            if not np.isfinite(
+                [self._coordinates.lower[limited], self._coordinates.upper[limited]]
+            ).any():
                 return None
         return None
 
@@ -276,7 +277,11 @@ class MultiStartSearch:
             return 0, 0.0
         off = (q - self.initial_guess) / self._coordinate_units
         differences = np.abs(
-            np.where(self._turns, np.remainder(off + np.pi, 2 * np.pi) - np.pi, off)
+            np.where(
+                ~self._coordinates.is_translation,
+                np.remainder(off + np.pi, 2 * np.pi) - np.pi,
+                off,
+            )
         )[joints]
         return int(joints[differences.argmax()]), float(differences.max())
 
@@ -323,7 +328,7 @@ class MultiStartSearch:
         Returns:
             The configuration, see `remove_revolutions`, and its largest residual.
         """
-        lower, upper = self._lower_limits.copy(), self._upper_limits.copy()
+        lower, upper = self._coordinates.lower.copy(), self._coordinates.upper.copy()
         lower[unlimited], upper[unlimited] = -np.inf, np.inf
         q = q.copy()
         q[movable] = np.clip(q, lower, upper)[movable]
@@ -350,7 +355,7 @@ class MultiStartSearch:
                 )
                 * self._coordinate_units[free_columns]
             )
-            step = self._coordinate_derivatives(q, step)
+            step = self._coordinates.coordinate_derivatives(q, step)
             accepted = self._line_search(q, step, cost, lambda way: np.clip(way, lower, upper))
             if accepted is None:
                 break
@@ -359,7 +364,7 @@ class MultiStartSearch:
         periodic = self._periodic.copy()
         periodic[np.setdiff1d(np.arange(len(q)), movable)] = False
         q = remove_revolutions(
-            q, self.initial_guess, periodic, self._lower_limits, self._upper_limits
+            q, self.initial_guess, periodic, self._coordinates.lower, self._coordinates.upper
         )
         return q, float(np.abs(residual).max(initial=0.0))
 

@@ -65,10 +65,8 @@ class NewtonContinuation:
         self._equations, self._structure = equations, structure
         self._active_columns, self._passive_columns, self._active_ranges = active, passive, ranges
         self._blocks = structure.blocks_by_size()
-        self._coordinate_units, self._is_translation = (
-            equations.coordinate_units,
-            equations.coordinates.is_translation,
-        )
+        units = self._coordinate_units = equations.coordinate_units
+        self._gamma_units = units[passive, None] / units[active]
         model = equations.model
         places = [*model.jointPlacements, *(frame.placement for frame in model.frames)]
         self._largest_dimension = max(float(np.abs(place.translation).max()) for place in places)
@@ -82,7 +80,11 @@ class NewtonContinuation:
         """Factor on rounding errors at a configuration (nq,): its largest scaled dimension."""
         return max(
             1.0,
-            float(np.abs(q[self._is_translation]).max(initial=self._largest_dimension))
+            float(
+                np.abs(q[self._equations.coordinates.is_translation]).max(
+                    initial=self._largest_dimension
+                )
+            )
             / self._equations.characteristic_length,
         )
 
@@ -110,11 +112,7 @@ class NewtonContinuation:
                     gamma = solve_linear(
                         jacobian[:, self._passive_columns], -jacobian[:, self._active_columns]
                     )
-                    units = (
-                        self._coordinate_units[self._passive_columns, None]
-                        / self._coordinate_units[self._active_columns]
-                    )
-                    return ClosedConfiguration(q, q_a, jacobian, gamma * units)
+                    return ClosedConfiguration(q, q_a, jacobian, gamma * self._gamma_units)
                 step = solve_linear(jacobian[:, self._passive_columns], -phi)
             except np.linalg.LinAlgError:
                 return None
@@ -319,13 +317,8 @@ class NewtonContinuation:
 
     def _check_solution(self, solution: ClosedConfiguration, sample: str) -> None:
         """Raise unless every equation holds and the passive joints are determined."""
-        units = (
-            self._coordinate_units[self._passive_columns, None]
-            / self._coordinate_units[self._active_columns]
-        )
-        self.check_singularity(
-            solution.jacobian, solution.passive_gamma / units, solution.q_a, sample
-        )
+        scaled_gamma = solution.passive_gamma / self._gamma_units
+        self.check_singularity(solution.jacobian, scaled_gamma, solution.q_a, sample)
         if len(self._structure.redundant_rows):
             phi, _ = self._equations.evaluate_scaled(solution.q)
             redundant_residuals = np.abs(phi[self._structure.redundant_rows])
@@ -358,8 +351,7 @@ class NewtonContinuation:
             return evaluate(passive)[1]
 
         start = q[self._passive_columns] / units
-        nearest = least_squares(residual, start, jacobian, xtol=1e-12)
-        phi = evaluate(nearest.x)[0]
+        phi = evaluate(least_squares(residual, start, jacobian, xtol=1e-12).x)[0]
         worst = int(np.abs(phi).argmax())
         place, last = self._format_values(target), self._format_values(last_reached.q_a)
         if np.abs(phi[worst]) < 10 * _CLOSED_TOLERANCE * self.rounding_scale(q):

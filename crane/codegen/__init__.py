@@ -2,7 +2,6 @@
 
 from crane.codegen.llvm.routine_builder import ArrayPointer, Routine, RoutineValue, select
 from crane.codegen.program import (
-    BoundFunction,
     FormulaTooLongError,
     Program,
     PythonCallback,
@@ -14,7 +13,6 @@ from crane.codegen.vector_layout import Layout, LayoutView
 
 __all__ = [
     "ArrayPointer",
-    "BoundFunction",
     "PythonCallback",
     "SymbolicExpression",
     "Layout",

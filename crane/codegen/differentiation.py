@@ -104,12 +104,12 @@ def weighted_gradient(
     for output, weight in zip(outputs, weights, strict=True):
         accumulate(output.index if isinstance(output, SymbolicExpression) else None, weight)
     for index in sorted(dependent - variable_indices, reverse=True):
-        if index in gradient:
-            kind, *operands = tape.operations[index]
-            for operand, change in zip(
-                operands, _reverse_rule(tape, index, kind, operands, gradient[index]), strict=True
-            ):
-                accumulate(operand, change)
+        if index not in gradient:
+            continue
+        kind, *operands = tape.operations[index]
+        adjoints = _reverse_rule(tape, index, kind, operands, gradient[index])
+        for operand, change in zip(operands, adjoints, strict=True):
+            accumulate(operand, change)
     return [gradient.get(variable.index, 0.0) for variable in variables]
 
 

@@ -116,7 +116,7 @@ class Program:
         self.max_formula_length = max(self.max_formula_length, operations)
         layout = Layout(**{part: len(values) for part, values in parts.items()})
         formula = self.functions[name] = Formula(name, input_count, flat, layout)
-        self._signatures[name] = FunctionSignature(formula.argument_kinds, layout)
+        self._signatures[name] = len(formula.argument_kinds), layout
         return layout
 
     @contextmanager
@@ -133,11 +133,11 @@ class Program:
         routine = Routine(name, self.functions, counts, functions, named)
         yield routine
         self.functions[name] = routine
-        self._signatures[name] = FunctionSignature(routine.argument_kinds, None)
+        self._signatures[name] = len(routine.argument_kinds), None
 
     def formula_outputs(self, name: str) -> Layout:
         """Layout of the outputs of a formula."""
-        layout = self._signatures[name].outputs
+        _, layout = self._signatures[name]
         assert layout is not None
         return layout
 
@@ -159,45 +159,28 @@ class Program:
         Returns:
             The integer that a routine returns, 0 for a formula.
         """
-        result: int = self._entry_point(name, arguments)(_pack_addresses(arguments))
+        result: int = self._entry_point(name, arguments)(
+            pack(f"{len(arguments)}q", *map(_argument_address, arguments))
+        )
         return result
 
-    def bind(self, name: str, *arguments: "int | np.ndarray") -> "BoundFunction":
-        """A function with its arguments bound, for many fast calls."""
-        return BoundFunction(self, self._entry_point(name, arguments), arguments)
+    def bind(self, name: str, *arguments: "int | np.ndarray") -> partial[int]:
+        """A function with its arguments bound, for many fast calls; see `call`.
+
+        Passing one pointer from Python is much faster than passing a dozen.
+        """
+        addresses = np.frombuffer(
+            pack(f"{len(arguments)}q", *map(_argument_address, arguments)), dtype=np.int64
+        )
+        bound = partial(self._entry_point(name, arguments), addresses.ctypes.data)
+        vars(bound)["references"] = self, addresses, arguments  # are kept alive
+        return bound
 
     def _entry_point(self, name: str, arguments: Sequence["int | np.ndarray"]) -> Any:
-        expected = len(self._signatures[name].argument_kinds)
+        expected, _ = self._signatures[name]
         if len(arguments) != expected:
             raise TypeError(f"'{name}' takes {expected} arguments, not {len(arguments)}")
         return self._machine_code.entry_point(name)
-
-
-class BoundFunction(partial[int]):
-    """A compiled function with bound arguments, which it keeps alive; see `Program.call`.
-
-    Passing one pointer from Python is much faster than passing a dozen.
-
-    Args:
-        program: Program of the function, kept alive.
-        entry: Function that takes the address of the arguments' addresses.
-        arguments: See `Program.call`.
-    """
-
-    _references: tuple[Any, ...]
-
-    def __new__(
-        cls, program: Program, entry: Any, arguments: Sequence["int | np.ndarray"]
-    ) -> "BoundFunction":
-        """Bind the arguments."""
-        addresses = np.frombuffer(_pack_addresses(arguments), dtype=np.int64)
-        self = super().__new__(cls, entry, addresses.ctypes.data)
-        self._references = program, addresses, arguments
-        return self
-
-
-def _pack_addresses(arguments: Sequence["int | np.ndarray"]) -> bytes:
-    return pack(f"{len(arguments)}q", *map(_argument_address, arguments))
 
 
 def _argument_address(argument: "int | np.ndarray") -> int:
@@ -261,10 +244,8 @@ class PythonCallback:
 
 def run_with_fallback(
     count: int,
-    run_compiled: Callable[[int, int], int] | None,
+    run_compiled: Callable[[int], int] | None,
     run_fallback: Callable[[int], None],
-    max_chunk: int | None = None,
-    progress: Callable[[int], None] | None = None,
 ) -> None:
     """Process items one after another by machine code, with a fallback where that stops.
 
@@ -273,19 +254,14 @@ def run_with_fallback(
 
     Args:
         count: Number of items.
-        run_compiled: (first, end) -> number of completed items from the first on; None if there is
-            no machine code.
+        run_compiled: Processes the items from one on and returns how many it completed; None if
+            there is no machine code.
         run_fallback: Processes one item.
-        max_chunk: Largest number of items per call of `run_compiled`.
-        progress: Called with the number of completed items.
     """
     done = 0
     while done < count:
-        chunk_end = min(done + (max_chunk or count), count)
         if run_compiled is not None:
-            done += run_compiled(done, chunk_end)
-        if done < chunk_end:
+            done += run_compiled(done)
+        if done < count:
             run_fallback(done)
             done += 1
-        if progress is not None:
-            progress(done)

@@ -20,7 +20,7 @@ import numpy as np
 
 import crane
 from crane.codegen.llvm.machine_code import compiler_settings
-from crane.codegen.vector_layout import ArgumentKind, Layout
+from crane.codegen.vector_layout import Layout
 from crane.common import file_cache
 from crane.common.serialization import deserialize, serialize
 
@@ -142,17 +142,8 @@ def _package_files() -> list[str]:
     return sorted(found)
 
 
-@dataclass(frozen=True)
-class FunctionSignature:
-    """Signature of a compiled function.
-
-    Attributes:
-        argument_kinds: Kinds of its arguments.
-        outputs: Layout of a formula's outputs, None for a routine.
-    """
-
-    argument_kinds: tuple[ArgumentKind, ...]
-    outputs: Layout | None
+# number of a function's arguments, and layout of a formula's outputs; None for a routine
+FunctionSignature = tuple[int, Layout | None]
 
 
 def cache_entry_name(dependencies: Any, kind: str = "note") -> str | None:
@@ -201,8 +192,8 @@ class ProgramRecord:
             return None
         stored = json.loads(text)
         functions = {
-            name: FunctionSignature(tuple(kinds), None if parts is None else Layout(**parts))
-            for name, (kinds, parts) in stored["functions"].items()
+            name: (count, None if parts is None else Layout(**parts))
+            for name, (count, parts) in stored["functions"].items()
         }
         return cls(stored["code"], stored["longest"], functions)
 
@@ -211,11 +202,8 @@ class ProgramRecord:
         if entry_name is None or package_files_changed():
             return
         functions = {
-            name: (
-                function.argument_kinds,
-                None if function.outputs is None else function.outputs.parts,
-            )
-            for name, function in self.signatures.items()
+            name: (count, None if outputs is None else outputs.parts)
+            for name, (count, outputs) in self.signatures.items()
         }
         stored = {
             "code": self.code_name,

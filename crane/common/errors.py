@@ -195,8 +195,7 @@ def message_kind(message: str) -> str:
 @contextmanager
 def summarize_warnings() -> Iterator[None]:
     """Context that delays warnings to its end: one per kind, and at most `MAX_WARNINGS`."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", CraneWarning)
+    with warnings.catch_warnings(record=True, action="always", category=CraneWarning) as caught:
         yield
     by_kind: dict[str, dict[str, None]] = {}  # different messages, in order
     for one in caught:

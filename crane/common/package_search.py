@@ -44,6 +44,7 @@ class LoadOptions:
         arguments: Values of the file's arguments by name.
         floating_root: Whether the root is a floating base.
         strict: Whether elements that are only formally wrong are errors, see `crane.load`.
+        trust_xacro: Whether xacro files may run Python and read all files, see `crane.load`.
         found_packages: Packages that were searched for, by name and referring folder.
     """
 
@@ -51,6 +52,7 @@ class LoadOptions:
     arguments: Mapping[str, str] = field(default_factory=dict)
     floating_root: bool = False
     strict: bool = False
+    trust_xacro: bool = False
     found_packages: dict[tuple[str, Path], Path | None] = field(default_factory=dict, repr=False)
 
 
@@ -68,6 +70,7 @@ def use_load_options(
     arguments: Mapping[str, object] | None = None,
     floating: bool = False,
     strict: bool = False,
+    trust_xacro: bool | None = None,
 ) -> Iterator[LoadOptions]:
     """Context in which files are read with some options.
 
@@ -77,12 +80,15 @@ def use_load_options(
         floating: Whether the root is a floating base.
         strict: Whether elements that are only formally wrong are errors, here and in nested
             contexts.
+        trust_xacro: Whether xacro files may run Python; by default as in the context around.
     """
+    around = load_options()
     values = {
         str(name): str(value).lower() if isinstance(value, bool) else str(value)
         for name, value in (arguments or {}).items()
     }
-    options = LoadOptions(tuple(packages), values, floating, strict or load_options().strict)
+    trust = around.trust_xacro if trust_xacro is None else trust_xacro
+    options = LoadOptions(tuple(packages), values, floating, strict or around.strict, trust)
     token = _load_options.set(options)
     try:
         yield options
@@ -146,22 +152,16 @@ def find_file(name: str, folder: Path) -> Path | None:
     parts = [part for part in Path(rest if separated else name).parts if part != "/"]
     in_package = bool(separated) and scheme in ("package", "model") and bool(parts)
     try:
-        if in_package and (package := find_package(parts[0], folder)) is not None:
-            inside = package.joinpath(*parts[1:])
-            if inside.exists():
-                return inside
-        return _search_upwards(Path(rest if separated else name), parts, folder, in_package)
+        package = find_package(parts[0], folder) if in_package else None
+        if package is not None and package.joinpath(*parts[1:]).exists():
+            return package.joinpath(*parts[1:])
+        ends = [Path(rest if separated else name)]
+        if in_package:  # also without the name of the package
+            ends = [Path(*parts[1:]), Path(*parts)] if len(parts) > 1 else [Path(*parts)]
+        places = (above / end for end in ends for above in (folder, *folder.absolute().parents))
+        return next(filter(Path.is_file, places), None)
     except (OSError, ValueError):  # not a valid file name
         return None
-
-
-def _search_upwards(path: Path, parts: list[str], folder: Path, in_package: bool) -> Path | None:
-    """A path relative to a folder or one above it, in packages also without their name."""
-    ends = [path]
-    if in_package:
-        ends = [Path(*parts[1:]), Path(*parts)] if len(parts) > 1 else [Path(*parts)]
-    places = (above / end for end in ends for above in (folder, *folder.absolute().parents))
-    return next(filter(Path.is_file, places), None)
 
 
 def find_package(name: str, folder: Path) -> Path | None:
@@ -185,9 +185,7 @@ def _search_package(name: str, folder: Path, packages: Sequence[str]) -> Path | 
         for place in (above, above / name):
             if _is_package(place, name):
                 return place
-    own_package = next(
-        (above for above in (folder, *folder.parents) if _package_name(above)), None
-    )
+    own_package = enclosing_package(folder)
     for top in () if own_package is None else (own_package, own_package.parent):
         if (found := _search_below(name, top, 2)) is not None:
             return found
@@ -197,6 +195,11 @@ def _search_package(name: str, folder: Path, packages: Sequence[str]) -> Path | 
                 return found
     same_named = (x for above in (folder, *folder.parents) for x in (above, above / name))
     return next((x for x in same_named if x.name == name and x.is_dir()), None)
+
+
+def enclosing_package(folder: Path) -> Path | None:
+    """The nearest folder with a manifest at or above a folder, None if there is none."""
+    return next((above for above in (folder, *folder.parents) if _package_name(above)), None)
 
 
 def _is_package(folder: Path, name: str) -> bool:

@@ -82,8 +82,7 @@ def deserialize(data: bytes, classes: Sequence[type]) -> Any:
             count = int(np.prod(shape, dtype=np.intp))
             found = np.frombuffer(data, np.dtype(kind), count, start + offset).copy()
             return found.reshape(shape)[()]
-        item = named[plain["of"]]
-        out: Any = object.__new__(item)
+        out: Any = object.__new__(named[plain["of"]])
         vars(out).update({key: value_of(x) for key, x in plain["state"].items()})
         return out
 

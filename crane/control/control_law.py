@@ -300,18 +300,11 @@ class ComputedTorque(ControlLaw):
         super().__init__(machine)
         self.reference: Trajectory = add_free_joints(machine, reference)
         self.settings = np.array([as_number(bandwidth, "the bandwidth", "rad/s", greater_than=0)])
-        if machine.undriven_joints:
-            warnings.warn(self._undriven_joints_text(machine), CraneWarning, stacklevel=2)
-
-    def _undriven_joints_text(self, machine: Machine) -> str:
-        """Warning about joints that are controlled although they have no drive."""
-        reference = self.reference
+        if not machine.undriven_joints:
+            return
+        motion = self.reference(np.linspace(0.0, self.reference.duration, 201))
         try:
-            peaks = np.abs(
-                self._dynamics.inverse(
-                    *reference(np.linspace(0.0, reference.duration, 201)), friction=True
-                )
-            ).max(axis=0)
+            peaks = np.abs(self._dynamics.inverse(*motion, friction=True)).max(axis=0)
         except ClosureError:  # the simulation reports where
             peaks = np.full(len(machine.active), np.nan)
         words = []
@@ -319,10 +312,12 @@ class ComputedTorque(ControlLaw):
             peak = peaks[machine.active.index(joint)]
             unit = "N" if machine.unit(joint) == "m" else "N m"
             words.append(f"'{joint}'" + (f" (up to {peak:.3g} {unit})" if peak == peak else ""))
-        return (
+        warnings.warn(
             f"nothing is said to drive {', '.join(words)} of '{machine.name}', computed torque "
-            "does so all the same: write an effort above 0 into the <limit> of what is driven, or "
-            "describe its cylinder or gains, and lock what is not"
+            "does so all the same: write an effort above 0 into the <limit> of what is driven, "
+            "or describe its cylinder or gains, and lock what is not",
+            CraneWarning,
+            stacklevel=2,
         )
 
     def references(self, times: Array) -> Array:
@@ -351,5 +346,4 @@ class ComputedTorque(ControlLaw):
 
 
 def _gains_example(joint: str) -> str:
-    """Example of the argument `gains`."""
     return f"gains={{'{joint}': crane.description.PIGains(kp, ki)}}"

@@ -74,13 +74,8 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
         self.initial_coordinates = start
         q = machine.home[machine.closure.active] if start is None else start
         start_positions: dict[str, float] = dict(zip(machine.active, q.tolist(), strict=True))
-        limits = dict(
-            zip(
-                machine.active,
-                zip(machine.lower.tolist(), machine.upper.tolist(), strict=True),
-                strict=True,
-            )
-        )
+        pairs = zip(machine.lower.tolist(), machine.upper.tolist(), strict=True)
+        limits = dict(zip(machine.active, pairs, strict=True))
         for phase in phases:
             for _, _, problem in phase.find_problems(circuit.joints, limits, start_positions):
                 raise InputError(problem)
@@ -89,13 +84,8 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
         if self._ramp < 0:
             raise InputError(f"the ramp of the levers is {ramp:g} s, give at least 0")
         self._phases, self._spools = tuple(phases), tuple(circuit.spools.values())
+        self._machine, self._joints = machine, circuit.joints
         self._columns = {x: int(machine.column(x)) for x in circuit.joints}
-        self._joints = circuit.joints
-        self._closure = machine.closure
-        self._home_positions = dict(
-            zip(machine.active, machine.home[machine.closure.active], strict=True)
-        )
-        self._units = {x: machine.unit(x) for x in circuit.joints}
         self._lever_indices = [self._joints.index(spool.joint) for spool in self._spools]
         # a phase ends at a sample; then the levers return
         final_allowance = (len(phases) + 2) * _SAMPLING_PERIOD + self._ramp
@@ -152,13 +142,12 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
         self._sample_rows.append(np.append(signals, clock))
 
     def _begin_phase(self, index: int, time: float, positions: Mapping[str, float]) -> None:
-        """Start a phase."""
         self._phase_index, self._phase_start_time, self._phase_start = index, time, dict(positions)
         self._pending_joints = (
             set() if (index == len(self._phases)) else set(self._phases[index].until)
         )
 
-    def _check_arrivals(self, time: float, positions: Mapping[str, float]) -> None:
+    def _check_arrivals(self, time: float, positions: dict[str, float]) -> None:
         """Find the joints that have reached their positions; start the next phase if all have."""
         while self._phase_index < len(self._phases):
             phase = self._phases[self._phase_index]
@@ -170,7 +159,7 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
             if self._pending_joints and time - self._phase_start_time > phase.within:
                 shares = {x: self._completed_share(x, positions) for x in self._pending_joints}
                 joint = min(shares, key=lambda x: shares[x])
-                at, unit = positions[joint], self._units[joint]
+                at, unit = positions[joint], self._machine.unit(joint)
                 raise SimulationError(
                     f"at t = {time:.6g} s: phase '{phase.name}' has not ended within "
                     f"{phase.within:g} s, '{joint}' is at {at:.4g} {unit} on its way from "
@@ -181,14 +170,13 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
                 break
             self._begin_phase(self._phase_index + 1, time, positions)
 
-    def _remedy_text(self, phase: Phase, positions: Mapping[str, float]) -> str:
+    def _remedy_text(self, phase: Phase, positions: dict[str, float]) -> str:
         """Remedy for a phase that does not end; names a dead centre before the positions."""
-        end = {joint: phase.until[joint] for joint in self._pending_joints}
-        q_a = np.array(
-            [{**positions, **end}.get(joint, at) for joint, at in self._home_positions.items()]
-        )
+        machine = self._machine
+        home = dict(zip(machine.active, machine.home[machine.closure.active], strict=True))
+        ends = {joint: phase.until[joint] for joint in self._pending_joints}
         try:
-            self._closure.solve(q_a)
+            machine.closure.solve(np.array([(home | positions | ends)[x] for x in machine.active]))
         except ClosureError as error:
             return f"a dead centre is in between ({error}), give a position before it"
         return "give it more time or lever, or a position that it reaches"

@@ -69,17 +69,17 @@ def check_invertible(circuit: Hydraulics) -> None:
         InputError: It has a motor, or a valve with flow sharing, two spools or curves.
     """
     for joint, valve in circuit.valves.items():
-        for is_present, component in (
-            (circuit.cylinders[joint].motor, "a motor"),
-            (valve.sharing, "a valve that shares its flow"),
-            (valve.spool_b is not None, "a valve with two spools"),
-            (bool(valve.curves), "a valve with curves"),
-        ):
-            if is_present:
-                raise InputError(
-                    f"the feedforward of valves knows cylinders and valves without curves, "
-                    f"'{joint}' has {component}: take valve-pd"
-                )
+        unknown = {
+            "a motor": circuit.cylinders[joint].motor,
+            "a valve that shares its flow": valve.sharing,
+            "a valve with two spools": valve.spool_b is not None,
+            "a valve with curves": bool(valve.curves),
+        }
+        for component in (name for name, is_present in unknown.items() if is_present):
+            raise InputError(
+                f"the feedforward of valves knows cylinders and valves without curves, "
+                f"'{joint}' has {component}: take valve-pd"
+            )
 
 
 def required_openings(

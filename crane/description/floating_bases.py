@@ -74,7 +74,6 @@ def _is_unconstrained(spec: MachineSpec, series: list[Joint]) -> bool:
 
 
 def _carries_link(parent_joints: Mapping[str, Joint], link: str, body: str) -> bool:
-    """Whether a link is a body or is carried by it."""
     while link != body and link in parent_joints:
         link = parent_joints[link].parent
     return link == body

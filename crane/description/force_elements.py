@@ -36,7 +36,6 @@ def element_name(element: "AnyForceElement") -> str:
 
 
 def _check_frames(element: "AnyForceElement") -> None:
-    """Raise for an element that acts on nothing, or between one frame and itself."""
     if element.between is None and not element.joint:
         raise InputError(f"a {element.kind} acts on nothing, give it a joint or two frames")
     if element.between is not None and not len(element.between) == len(set(element.between)) == 2:

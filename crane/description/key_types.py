@@ -226,7 +226,6 @@ def _completed(key: Key, name: str, entry: Any, component: str) -> Key:
 
 
 def _plain_value(value: Any, key: Key) -> Any:
-    """A value as YAML has it."""
     if isinstance(key, SectionKey):
         return key.section.values_of(value)
     item = getattr(key, "item", key)

@@ -16,15 +16,11 @@ FOLDER_FILES = ("robot.yaml", "model.sdf")  # of example-parallel-robots and Gaz
 MACHINE_SUFFIXES = (".yaml", ".yml", ".urdf", ".xacro", ".sdf", ".world", ".xml", ".mjcf")
 
 
-def _models_folder() -> Path:
-    package = Path(__file__).resolve().parents[1]
-    installed = package / "models"
-    return installed if installed.is_dir() else package.parent / "models"
-
-
 def bundled_machines() -> dict[str, Path]:
     """Return the machine files of the machines in the package by name."""
-    return {path.stem: path for path in sorted(_models_folder().glob("*.yaml"))}
+    package = Path(__file__).resolve().parents[1]
+    folder = package / "models" if (package / "models").is_dir() else package.parent / "models"
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
 def machine_summary(path: Path) -> str:
@@ -90,7 +86,7 @@ def command_line_arguments(
         words += [x for key, value in (values or {}).items() for x in (option, f"{key}={value!r}")]
     for option, joints in {"--active": active, "--free": free}.items():
         words += [] if joints is None else [option, ",".join(joints)]
-    words += ["--floating"] * options.floating_root
+    words += ["--floating"] * options.floating_root + ["--trust-xacro"] * options.trust_xacro
     words += [x for folder in options.packages for x in ("--packages", folder)]
     words += [x for key, value in options.arguments.items() for x in ("--arg", f"{key}:={value}")]
     return shlex.join(words)

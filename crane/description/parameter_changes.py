@@ -64,10 +64,14 @@ def apply_parameter_changes(spec: MachineSpec, changes: Mapping[str, float]) -> 
             new_values[*path[:-1], "source_location"] = f"changed by {name}"
         new_values[path] = value
     changed_joints = [str(path[1]) for path in new_values if path[0] == "friction"]
-    friction = {**spec.friction} | {
-        joint: Friction() for joint in changed_joints if joint not in spec.friction
-    }
-    changed = _replace_values(dataclasses.replace(spec, friction=friction), new_values)
+    changed = _replace_values(
+        dataclasses.replace(
+            spec,
+            friction={**spec.friction}
+            | {joint: Friction() for joint in changed_joints if joint not in spec.friction},
+        ),
+        new_values,
+    )
     for name, value in values.items():
         if name not in sensor_changes and paths[name][0] == "hydraulics":
             _warn_about_unit(spec, name, value)
@@ -80,7 +84,6 @@ def apply_parameter_changes(spec: MachineSpec, changes: Mapping[str, float]) -> 
 def _check_change(
     spec: MachineSpec, names: Mapping[str, float], name: str, new_value: object
 ) -> float:
-    """Return the new value of a parameter as a number."""
     if name.startswith(SENSOR_PREFIX):
         quantity, _ = parse_sensor_parameter(name)
         if quantity_unit(spec.tree, quantity) is None and quantity not in spec.sensors:
@@ -99,15 +102,15 @@ def _check_change(
 
 
 def _replace_values(owner: T, new_values: Mapping[FieldPath, Any]) -> T:
-    """Return a copy of an object with other values at field paths."""
     values_by_key: dict[str | int, dict[FieldPath, Any]] = {}
     for (key, *rest), value in new_values.items():
         values_by_key.setdefault(key, {})[tuple(rest)] = value
     replaced: dict[Any, Any] = {}
     container: Any = owner
     for key, values in values_by_key.items():
-        part = value_at(owner, (key,))
-        replaced[key] = values[()] if () in values else _replace_values(part, values)
+        replaced[key] = (
+            values[()] if () in values else _replace_values(value_at(owner, (key,)), values)
+        )
     if isinstance(container, tuple):
         container = tuple(replaced.get(i, item) for i, item in enumerate(container))
     elif isinstance(container, dict):
@@ -120,7 +123,6 @@ def _replace_values(owner: T, new_values: Mapping[FieldPath, Any]) -> T:
 
 
 def _warn_about_unit(spec: MachineSpec, name: str, value: float) -> None:
-    """Warn of a parameter of the circuit that is implausible in its SI unit."""
     part, _, key = name.rpartition(".")
     kind, _, joint = part.partition(".")
     is_rotary = joint in spec.tree.joints and spec.tree.joints[joint].kind != "prismatic"
@@ -278,16 +280,14 @@ def set_active_joints(
         InputError: A joint is unknown, named twice, or both active and free.
     """
     names = [joint.name for joint in spec.tree.moving_joints]
-    for what, given in (("active", active), ("free", free)):
-        for joint in given or ():
-            if joint not in names:
-                raise InputError(
-                    f"{what} joint '{joint}' is unknown, {suggest_names(names, joint)}"
-                )
-            if list(given or ()).count(joint) > 1:
-                raise InputError(f"{what} joint '{joint}' is named twice, once will do")
-            if joint in (active or ()) and joint in (free or ()):
-                raise InputError(f"joint '{joint}' is active and free, keep one of the two")
+    chosen = {"active": list(active or ()), "free": list(free or ())}
+    for what, joint in [(what, joint) for what, given in chosen.items() for joint in given]:
+        if joint not in names:
+            raise InputError(f"{what} joint '{joint}' is unknown, {suggest_names(names, joint)}")
+        if chosen[what].count(joint) > 1:
+            raise InputError(f"{what} joint '{joint}' is named twice, once will do")
+        if joint in chosen["active"] and joint in chosen["free"]:
+            raise InputError(f"joint '{joint}' is active and free, keep one of the two")
     free_names = tuple(spec.free if free is None else free)
     if active is None:
         drives = _drives_without(spec.drives, free_names)
@@ -355,7 +355,6 @@ def _propagate_locks(
 
 
 def _check_lock_coordinate(joint: Joint, value: float) -> None:
-    """Raise if a coordinate [m], [rad] is outside of the limits of a joint."""
     lower, upper = joint.limits.lower, joint.limits.upper
     tolerance = _LIMIT_TOLERANCE * max(1.0, abs(value))
     if not lower - tolerance <= value <= upper + tolerance:
@@ -367,7 +366,6 @@ def _check_lock_coordinate(joint: Joint, value: float) -> None:
 
 
 def _fix_joint(joint: Joint, value: float) -> Joint:
-    """Return a fixed joint in place of one at a coordinate."""
     from scipy.spatial.transform import Rotation
 
     fixed_joint = dataclasses.replace(joint, kind="fixed", limits=Limits(), rotor_inertia=0.0)

@@ -131,7 +131,6 @@ class Soil:
 
 
 def _typical_soil(unit_weight: float, cohesion: float, degrees: float, adhesion: float) -> Soil:
-    """Return a soil of the table, with its tool friction."""
     phi = math.radians(degrees)
     return Soil(unit_weight, cohesion, phi, 2.0 / 3.0 * phi, adhesion)
 
@@ -334,7 +333,6 @@ class SoilCutting(ExternalForce):
 
 
 def _unit_direction(values: ArrayLike, label: str) -> np.ndarray:
-    """Return a unit vector (3,)."""
     try:
         direction = np.array(values, dtype=np.float64)
     except (TypeError, ValueError):

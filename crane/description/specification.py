@@ -5,8 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from crane.common.errors import suggest_names
-from crane.description.estimation_settings import EstimationSettings
+from crane.common.errors import InputError, suggest_names
 from crane.description.external_forces import ExternalForce, Wrench
 from crane.description.force_elements import (
     AnyForceElement,
@@ -20,6 +19,79 @@ from crane.description.force_elements import (
 from crane.description.kinematic_tree import Joint, Tree, Vector
 from crane.description.sensors import Sensor
 from crane.hydraulics.hydraulic_circuit import Hydraulics
+
+TermValues = tuple[float, ...]
+_MIN_STD = 1e-12  # with a finite weight
+_RELATIVE_STD_RANGE = 1e-7, 1e6
+
+
+@dataclass(frozen=True)
+class ParameterPrior:
+    """Prior knowledge of a parameter.
+
+    Attributes:
+        std: Standard deviation, in the unit of the parameter or relative to the mean.
+        relative: Whether `std` is relative.
+        mean: In the unit of the parameter; None: the value of the machine's description.
+    """
+
+    std: float
+    relative: bool = False
+    mean: float | None = None
+
+    def __post_init__(self) -> None:
+        lower, upper = _RELATIVE_STD_RANGE if self.relative else (_MIN_STD, math.inf)
+        if not lower <= self.std < upper:
+            raise InputError(
+                f"a standard deviation of {self.std:g} is none to estimate with, give {lower:g} "
+                f"or more{' as a share' if self.relative else ''}"
+            )
+
+    @classmethod
+    def parse(cls, text_or_number: object) -> "ParameterPrior":
+        """Return the prior of a number or a text: "50", "10 %", "609 +- 60", "609 +- 10 %".
+
+        Raises:
+            InputError: The text is malformed, or the standard deviation is too small.
+        """
+        text = str(text_or_number)
+        mean, sign, std = text.rpartition("+-")
+        try:
+            is_relative = std.strip().endswith("%")
+            value = float(std.strip().removesuffix("%")) * (0.01 if is_relative else 1.0)
+            mean_value = float(mean) if sign else None
+        except ValueError:
+            value, is_relative, mean_value = math.nan, False, None
+        if not (_MIN_STD <= value < math.inf) or not math.isfinite(mean_value or 0.0):
+            raise InputError(
+                f"'{text}' says no standard deviation of {_MIN_STD:g} or more, write 50, 10 %, "
+                "609 +- 60 or 609 +- 10 %"
+            )
+        return cls(value, is_relative, mean_value)
+
+    def __str__(self) -> str:
+        """Return it in the notation that `parse` reads."""
+        std = f"{100 * self.std:.12g} %" if self.relative else f"{self.std!r}"
+        return std if self.mean is None else f"{self.mean!r} +- {std}"
+
+
+@dataclass(frozen=True)
+class EstimationSettings:
+    """Defaults of `identify` for a machine.
+
+    Attributes:
+        terms: Parameters of additional model terms by name or pattern, such as "q*.presliding";
+            None: the model does not have the term.
+        prior: Priors by name or pattern of parameters, such as "q1.viscous", or by link for all
+            inertial parameters of a body.
+        bandwidth: Cut-off frequency of the low-pass filter [Hz]; None: from the motion.
+        slow: Velocities [m/s], [rad/s] by joint or pattern below which rows are left out.
+    """
+
+    terms: Mapping[str, TermValues | None] = field(default_factory=dict)
+    prior: Mapping[str, ParameterPrior] = field(default_factory=dict)
+    bandwidth: float | None = None
+    slow: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -210,40 +282,28 @@ class Phase:
         if not self.within > 0:
             text = f"phase '{self.name}' may take {self.within:g} s, give it a time above 0"
             yield "within", "", text
-        for joint in self.levers:
-            if text := self._lever_problem(joint, valves):
-                yield "levers", joint, text
+        for joint, lever in self.levers.items():
+            label = f"the lever of '{joint}' in phase '{self.name}'"
+            if joint not in valves:
+                yield "levers", joint, f"no valve for '{joint}', {suggest_names(valves, joint)}"
+            elif not 0 < abs(lever) <= 1:
+                yield "levers", joint, f"{label} is {lever:g}, give it -1 to 1 and not 0"
+            elif joint not in self.until:
+                problem = "has no position that it is held until, add it under 'until'"
+                yield "levers", joint, f"{label} {problem}"
         for joint, position in self.until.items():
-            if text := self._position_problem(
-                joint, limits.get(joint, (position, position)), start_positions.get(joint)
-            ):
-                yield "until", joint, text
-
-    def _lever_problem(self, joint: str, valves: Sequence[str]) -> str:
-        lever, label = self.levers[joint], f"the lever of '{joint}' in phase '{self.name}'"
-        if joint not in valves:
-            return f"no valve for '{joint}', {suggest_names(valves, joint)}"
-        if not 0 < abs(lever) <= 1:
-            return f"{label} is {lever:g}, give it -1 to 1 and not 0"
-        if joint not in self.until:
-            return f"{label} has no position that it is held until, add it under 'until'"
-        return ""
-
-    def _position_problem(
-        self, joint: str, limits: tuple[float, float], start_position: float | None
-    ) -> str:
-        if joint not in self.levers:
-            others = suggest_names(self.levers, joint)
-            return f"phase '{self.name}' moves no lever of '{joint}' and waits for it, {others}"
-        label, position = f"phase '{self.name}' waits for '{joint}' at", self.until[joint]
-        if not limits[0] <= position <= limits[1]:
-            return f"{label} {position:g}, beyond its limits {limits[0]:g} to {limits[1]:g}"
-        if start_position is not None and self.levers[joint] * (position - start_position) < 0:
-            return (
-                f"{label} {position:g}, away from which its lever moves it from "
-                f"{start_position:g}: turn it"
-            )
-        return ""
+            label = f"phase '{self.name}' waits for '{joint}' at {position:g}"
+            lower, upper = limits.get(joint, (position, position))
+            start = start_positions.get(joint, position)
+            if joint not in self.levers:
+                others = suggest_names(self.levers, joint)
+                problem = f"moves no lever of '{joint}' and waits for it, {others}"
+                yield "until", joint, f"phase '{self.name}' {problem}"
+            elif not lower <= position <= upper:
+                yield "until", joint, f"{label}, beyond its limits {lower:g} to {upper:g}"
+            elif self.levers[joint] * (position - start) < 0:
+                problem = f"away from which its lever moves it from {start:g}: turn it"
+                yield "until", joint, f"{label}, {problem}"
 
 
 DEFAULT_RAMP_TIME = 0.3  # [s] in which a hand moves a lever from neutral to its end

@@ -75,10 +75,6 @@ class RecursionInput:
     rotor_inertias: Vector
     joint_forces: Vector
 
-    def remaining_force(self, i: int) -> Scalar:
-        """Force along a joint that is left for accelerations relative to the reference."""
-        return self.joint_forces[i] - self.rotor_inertias[i] * self.reference_accelerations[i]
-
     def articulated_inertia(self, i: int, articulated: ArticulatedInertias) -> ArticulatedInertia:
         """Inertia and wrench of a body with those that it carries, at its origin."""
         mass, lever, tensor = self.body_inertias[i - 1]
@@ -172,7 +168,8 @@ class ArticulatedCluster:
         inertia, wrench = recursion.articulated_inertia(i, articulated)
         column = inertia.apply_to(axis)
         inverse = 1.0 / (spatial_dot(axis, column) + recursion.rotor_inertias[i])
-        net_force = recursion.remaining_force(i) - spatial_dot(axis, wrench)
+        rotor_force = recursion.rotor_inertias[i] * recursion.reference_accelerations[i]
+        net_force = recursion.joint_forces[i] - rotor_force - spatial_dot(axis, wrench)
         constraint_forces = [
             row.jacobian.get(i, 0.0) - spatial_dot(axis, force)
             for row, force in zip(self._loop_rows, self._constraint_wrenches[i], strict=True)
@@ -214,9 +211,11 @@ class ArticulatedCluster:
         forces = self._factorization.solve(right)
         for i in self._cluster.joints:
             step = self._joint_steps[i]
-            parent = body_accelerations[self._recursion.kinematics.geometry.parents[i]]
             total_force = step.net_force + dot(step.constraint_forces, forces)
-            carrier = shift_motion(parent, self._recursion.kinematics.offsets[i])
+            carrier = shift_motion(
+                body_accelerations[self._recursion.kinematics.geometry.parents[i]],
+                self._recursion.kinematics.offsets[i],
+            )
             yield i, (total_force - spatial_dot(step.column, carrier)) * step.inverse
 
 
@@ -270,9 +269,9 @@ class ProjectedCluster:
         for i in reversed(cluster.joints):
             inertia, wrench = recursion.articulated_inertia(i, articulated_inside)
             inertias[i], arm = inertia, kinematics.offsets[i]
-            force = recursion.remaining_force(i) - spatial_dot(
-                kinematics.body_motion_axes(i), wrench
-            )
+            rotor_force = recursion.rotor_inertias[i] * recursion.reference_accelerations[i]
+            force = recursion.joint_forces[i] - rotor_force
+            force = force - spatial_dot(kinematics.body_motion_axes(i), wrench)
             self._net_forces = [
                 old + factor * force
                 for old, factor in zip(self._net_forces, self._gamma[i], strict=True)
@@ -377,10 +376,9 @@ def joint_accelerations(recursion: RecursionInput, plan: RecursionPlan) -> Vecto
     kinematics = recursion.kinematics
     for articulated_cluster in reversed(articulated_clusters):
         for i, rate in articulated_cluster.joint_accelerations(bodies):
-            parent = bodies[kinematics.geometry.parents[i]]
             out[i] = out[i] + rate
             bodies[i] = add_spatial(
-                shift_motion(parent, kinematics.offsets[i]),
+                shift_motion(bodies[kinematics.geometry.parents[i]], kinematics.offsets[i]),
                 scale_spatial(rate, kinematics.body_motion_axes(i)),
             )
     return out

@@ -1,6 +1,7 @@
 """Equations of motion and their derivatives as machine code of one machine."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,6 @@ from crane.closure.gamma_derivatives import GammaDerivatives
 from crane.closure.kinematics_formulas import FormulaConstants, folding_pattern
 from crane.codegen import Program, Scalar, SymbolicExpression, Tape, max_abs
 from crane.codegen.differentiation import directional_derivative
-from crane.codegen.program import BoundFunction
 from crane.common.samples import Array
 from crane.common.threads import ThreadLocal
 from crane.dynamics.dynamics_derivatives import DynamicsDerivatives
@@ -82,7 +82,7 @@ _ANALYTIC_DERIVATIVES: dict[str, _AnalyticDerivatives] = {
 DERIVATIVES_OF = "derivatives of "
 _FLOAT = np.dtype(np.float64)
 # of one sample: second argument, v_A, q_A (n,), result (size,), and what evaluates them
-_SampleBuffers = tuple[Array, Array, Array, Array, BoundFunction]
+_SampleBuffers = tuple[Array, Array, Array, Array, partial[int]]
 
 
 class CompiledQuantity:
@@ -309,8 +309,7 @@ class CompiledParameterDerivatives:
 
     def evaluate_closed(self, q: Array, inputs: Array) -> Array:
         """(size, k) at one closed configuration (nq,), inputs [v_A, x] (2 n,)."""
-        size = self._program.formula_outputs("formula").size
-        out = np.empty((len(self._directions[0]), size))
+        out = np.empty((len(self._directions[0]), self._program.formula_outputs("formula").size))
         for row, *directions in zip(out, *self._directions, strict=True):
             self._program.call("formula", *self._constants, q, inputs, *directions, row)
         return out.T
@@ -321,9 +320,10 @@ def _state_derivatives(
 ) -> list[Scalar]:
     """Derivatives (3, k, n) of values (k,) by q_A, v_A and x."""
     n = len(x)
+    columns_of_gamma = zip(*(row for _, row in sorted(formulas.gamma.items())), strict=True)
     seeds = [
-        dict(zip(map(_tape_index, formulas.q), formulas.coordinate_direction(k), strict=True))
-        for k in range(n)
+        dict(zip(map(_tape_index, formulas.q), formulas.coordinate_rates(motion), strict=True))
+        for motion in ([0.0, *column] for column in columns_of_gamma)
     ]
     for entry in (*formulas.v_a, *x):
         seeds.append({_tape_index(entry): 1.0})

@@ -87,10 +87,11 @@ class DynamicsDerivatives:
         """Mass moments of every body with all bodies beyond it in other clusters."""
         lumped, subtree = dict(self._body_moments), dict(self._body_moments)
         for i in range(len(lumped), 0, -1):
-            if parent := self._parents[i]:
+            parent = self._parents[i]
+            if parent:
                 subtree[parent] = subtree[parent] + subtree[i]
-                if self._cluster_of_joint[parent] != self._cluster_of_joint[i]:
-                    lumped[parent] = lumped[parent] + subtree[i]
+            if parent and self._cluster_of_joint[parent] != self._cluster_of_joint[i]:
+                lumped[parent] = lumped[parent] + subtree[i]
         return lumped
 
     def _accumulate_wrenches(

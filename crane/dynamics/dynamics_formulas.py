@@ -5,7 +5,8 @@ stiction, and the margin whose sign change is a stick-slip transition. Which joi
 are held is decided in `crane.simulation.integration.stick_slip_modes`.
 """
 
-from collections.abc import Iterable, Sequence
+import itertools
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 
@@ -135,7 +136,7 @@ class DynamicsFormulas(InertialForceFormulas):
             ]
         out = [
             *add_vectors(first_moment, self._fixed_inertia[1:]),
-            *_flatten_by_row(map(self._rotate_to_world, jacobian)),
+            *itertools.chain(*zip(*map(self._rotate_to_world, jacobian), strict=True)),
         ]
         out += [mass + self._fixed_inertia[0], *self.passive_force]
         body = self.formula_structure.tip_body
@@ -153,7 +154,7 @@ class DynamicsFormulas(InertialForceFormulas):
                 for x, f in zip(jacobian, self.gamma[i], strict=True)
             ]
         out += self._rotate_to_world(subtract_vectors(point, kinematics.origin[0]))
-        return [*out, *_flatten_by_row(map(self._rotate_to_world, jacobian))]
+        return [*out, *itertools.chain(*zip(*map(self._rotate_to_world, jacobian), strict=True))]
 
     def _rotate_to_world(self, vector: Vector) -> Vector:
         """A vector in the world's axes."""
@@ -401,11 +402,6 @@ class DynamicsFormulas(InertialForceFormulas):
                 for k in range(self._mobility):
                     out[k].append(row[k] * rate)
         return out
-
-
-def _flatten_by_row(columns: Iterable[Vector]) -> Vector:
-    """The entries of a matrix (3, n) given by columns, row by row."""
-    return [entry for row in zip(*columns, strict=True) for entry in row]
 
 
 def _body_regressor_row(u: Vector, r: Vector, w: Vector, e: Vector, a: Vector) -> Vector:

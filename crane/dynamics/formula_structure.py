@@ -71,10 +71,13 @@ def dynamics_constants(machine: Machine, geometry: TreeGeometry, forces: JointFo
                 *(turn.T @ inertia.inertia @ turn)[_UPPER_TRIANGLE],
             ]
         )
-    gravity = machine.model.gravity.linear
-    rotors = machine.model.armature
     joint_laws, distance_laws = np.split(forces.table, [len(bodies)])
-    numbers = [np.ravel(bodies), np.ravel(joint_laws), gravity, rotors]
+    numbers = [
+        np.ravel(bodies),
+        np.ravel(joint_laws),
+        machine.model.gravity.linear,
+        machine.model.armature,
+    ]
     for law, ends in zip(distance_laws, forces.lengths.end_points, strict=True):
         turns = (
             geometry.body_rotations[machine.coordinates.body_of_joint[joint]] for joint, _ in ends
@@ -127,9 +130,15 @@ class FormulaStructure:
         bodies = machine.coordinates.body_of_joint
         spans = ((bodies[one], bodies[two]) for (one, _), (two, _) in forces.lengths.end_points)
         plan = plan_recursion(machine) if formulation == "exact" else ()
-        kinds = forces.sticking, forces.circuit_friction_columns
         tip = None if machine.tip is None else bodies[frame_placement(machine, machine.tip)[0]]
-        return cls(carrier_bodies(machine, formulation), plan, tuple(spans), *kinds, tip)
+        return cls(
+            carrier_bodies(machine, formulation),
+            plan,
+            tuple(spans),
+            forces.sticking,
+            forces.circuit_friction_columns,
+            tip,
+        )
 
     @property
     def constants_layout(self) -> Layout:

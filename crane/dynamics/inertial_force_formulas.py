@@ -68,10 +68,11 @@ class InertialForceFormulas(JointForceFormulas):
     @cached_property
     def body_inertias(self) -> list[tuple[Scalar, Vector, list[Vector]]]:
         """Per body mass, COM, inertia about it, in the frame of the reference body."""
-        origins = self.kinematics.origin[1:]
         return [
             (mass, add_vectors(origin, lever), tensor)
-            for origin, (mass, lever, tensor) in zip(origins, self._body_inertias, strict=True)
+            for origin, (mass, lever, tensor) in zip(
+                self.kinematics.origin[1:], self._body_inertias, strict=True
+            )
         ]
 
     @cached_property
@@ -115,9 +116,10 @@ class InertialForceFormulas(JointForceFormulas):
             )
             carrier = self.formula_structure.carrier_bodies[i]
             if carrier:
-                arm = self.kinematics.offsets[i]
                 forces[carrier - 1] = add_vectors(forces[carrier - 1], force)
-                moments[carrier - 1] = add_vectors(moments[carrier - 1], moment, cross(arm, force))
+                moments[carrier - 1] = add_vectors(
+                    moments[carrier - 1], moment, cross(self.kinematics.offsets[i], force)
+                )
         return out
 
     def body_motions(
@@ -190,15 +192,10 @@ class InertialForceFormulas(JointForceFormulas):
     @property
     def coordinate_derivatives(self) -> Vector:
         """Time derivatives of the coordinates (nb,): the rates, except for rotation vectors."""
-        return self._coordinate_derivatives(self.joint_velocities)
+        return self.coordinate_rates(self.joint_velocities)
 
-    def coordinate_direction(self, k: int) -> Vector:
-        """Derivatives of the coordinates (nb,) along the motion v_k = 1."""
-        return self._coordinate_derivatives(
-            [0.0, *(self.gamma[i][k] for i in range(1, self._body_count))]
-        )
-
-    def _coordinate_derivatives(self, joint_velocities: Vector) -> Vector:
+    def coordinate_rates(self, joint_velocities: Sequence[Scalar]) -> Vector:
+        """Derivatives of the coordinates (nb,) along joint velocities (nb + 1,)."""
         out = list(joint_velocities[1:])
         for i in self.kinematics.geometry.floating_bases:
             linear, angular = out[i - 1 : i + 2], out[i + 2 : i + 5]
@@ -210,18 +207,17 @@ class InertialForceFormulas(JointForceFormulas):
     @property
     def rate_jacobian(self) -> list[Vector]:
         """d(rates)/dv_A (nb, n), zero for floating bases."""
-        floating = self.kinematics.geometry.floating_bodies
         none: Vector = [0.0] * self._mobility
+        floating = self.kinematics.geometry.floating_bodies
         return [none if i in floating else self.gamma[i] for i in range(1, self._body_count)]
 
     @cached_property
     def kinetic(self) -> Scalar:
         """v_A^T M_A v_A / 2, summed over bodies [J]."""
-        velocity = self._carrier_velocities.velocities
         total: Scalar = 0.0
         for i in range(1, self._body_count):
             mass, centre, tensor = self.body_inertias[i - 1]
-            v, w = velocity[i]
+            v, w = self._carrier_velocities.velocities[i]
             at = add_vectors(v, cross(w, centre))
             total = total + 0.5 * mass * dot(at, at) + 0.5 * dot(w, matvec(tensor, w))
         for inertia, rate in zip(self.rotor_inertias, self.joint_velocities, strict=True):

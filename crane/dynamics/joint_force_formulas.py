@@ -177,10 +177,12 @@ class JointForceFormulas:
     def _joint_law_values(self) -> list[ForceLawValues]:
         """Values of the force laws of all joints (nb + 1,)."""
         every = zip(self._joint_laws, self.q, self.joint_velocities[1:], strict=True)
-        sticking = self._stick_slip_columns
         return [
             NO_FORCE,
-            *(evaluate_force_law(*x, i in sticking, self._use_modes) for i, x in enumerate(every)),
+            *(
+                evaluate_force_law(*x, i in self._stick_slip_columns, self._use_modes)
+                for i, x in enumerate(every)
+            ),
         ]
 
     @cached_property

@@ -147,13 +147,12 @@ class PinocchioDynamics:
                 return self._kinetic_and_potential_energy(state)
             case "rates":
                 a_a, _, margin, _ = self._accelerations_with_stick_slip(state, x)
-                return np.concatenate(
-                    [
-                        self._coordinates.coordinate_derivatives(q, v),
-                        a_a,
-                        [self._dissipated_power(state), margin],
-                    ]
-                )
+                forces = self._joint_forces
+                # of dampers and end stops
+                braking = forces.passive_forces(q, np.zeros_like(v)) - forces.passive_forces(q, v)
+                dissipated_power = v @ (forces.friction_forces(v, use_modes=True) + braking)
+                rates = self._coordinates.coordinate_derivatives(q, v)
+                return np.concatenate([rates, a_a, [dissipated_power, margin]])
             case "observation":
                 _, joint_friction, _, holding_forces = self._accelerations_with_stick_slip(
                     state, x
@@ -264,14 +263,6 @@ class PinocchioDynamics:
                 pin.computePotentialEnergy(self._model, data, configuration)
                 + self._joint_forces.potential_energy(state.q),
             ]
-        )
-
-    def _dissipated_power(self, state: ClosedState) -> float:
-        """Power dissipated by friction, dampers and end stops."""
-        conservative = self._joint_forces.passive_forces(state.q, np.zeros_like(state.v))
-        braking = conservative - self._joint_forces.passive_forces(state.q, state.v)
-        return float(
-            state.v @ (self._joint_forces.friction_forces(state.v, use_modes=True) + braking)
         )
 
     def _inverse_dynamics(self, state: ClosedState, a: Array, friction: bool) -> Array:

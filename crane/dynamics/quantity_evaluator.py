@@ -242,18 +242,12 @@ class QuantityEvaluator(OneLineRepr):
     def _compiled_quantity(self, quantity: str) -> CompiledQuantity | None:
         """Machine code of a quantity, or None on the Pinocchio backend."""
         if quantity not in self._compiled_quantities:
-            made = None
+            parts = self.formula_constants, self.constant_pattern, self.formula_structure
+            is_compiled = self.backend == "compiled"
             try:
-                if self.backend == "compiled":
-                    made = CompiledQuantity(
-                        quantity,
-                        self.machine,
-                        self.formula_constants,
-                        self.constant_pattern,
-                        self.formula_structure,
-                    )
+                made = CompiledQuantity(quantity, self.machine, *parts) if is_compiled else None
             except FormulaTooLongError:
-                pass
+                made = None
             # if two threads compile it at the same time, both use the first
             self._compiled_quantities.setdefault(quantity, made)
         return self._compiled_quantities[quantity]
@@ -278,10 +272,9 @@ class QuantityEvaluator(OneLineRepr):
         self._required_formula(quantity)
         key = quantity, tuple(names)
         if key not in self._parameter_derivatives:
-            closure = self.machine.closure
             constants = ConstantDerivatives(self.machine).jacobian(names, self.constants_of)
             geometry, numbers = np.split(
-                constants, [len(closure.compiled_closure.geometry.constants)], axis=1
+                constants, [len(self.machine.closure.compiled_closure.geometry.constants)], axis=1
             )
             geometry[:, -1] = 0.0  # the characteristic length only scales residuals
             self._parameter_derivatives[key] = CompiledParameterDerivatives(
@@ -348,7 +341,7 @@ class QuantityEvaluator(OneLineRepr):
 
         run_with_fallback(
             len(targets),
-            lambda i, _: formula.evaluate_targets(targets[i:], rows[i:], out[i:]),
+            lambda i: formula.evaluate_targets(targets[i:], rows[i:], out[i:]),
             reach,
         )
         return out

@@ -40,6 +40,10 @@ class _StackKinematics(NamedTuple):
     loop_wrenches: Array
     scaled_jacobian: Array
 
+    def position(self, body: int, point: Array) -> Array:
+        """(N, 3) positions of a point of a body in the world."""
+        return np.asarray(self.origins[:, body] + self.rotations[:, body] @ point)
+
 
 class Reactions(OneLineRepr):
     """Wrenches in the joints of a machine with closed loops.
@@ -173,7 +177,7 @@ class Reactions(OneLineRepr):
         body, placement = frame_placement(self.machine, link)
         rows, stacked = self._as_stack(q, "q")
         kinematics = self._evaluate_kinematics(rows)
-        point = self._point_in_world(kinematics, body, placement.translation)
+        point = kinematics.position(body, placement.translation)
         push = np.broadcast_to(np.eye(3), (len(rows), 3, 3))
         carried = (
             -self._is_carried_by[body][None, :, None, None]
@@ -238,9 +242,9 @@ class Reactions(OneLineRepr):
         friction: bool,
     ) -> tuple[Array, Array]:
         rows, stacked = self._as_stack(q, "q")
-        velocities = np.zeros_like(rows) if v is None else self._as_matching_stack(v, rows, "v")
+        velocities = np.zeros_like(rows) if v is None else self._as_stack(v, "v", rows)[0]
         if a is not None:
-            accelerations = self._as_matching_stack(a, rows, "a")
+            accelerations = self._as_stack(a, "a", rows)[0]
         else:
             accelerations = (
                 np.zeros_like(rows) if v is None else self.machine.closure.drift(rows, velocities)
@@ -250,7 +254,7 @@ class Reactions(OneLineRepr):
         kinematics = self._evaluate_kinematics(rows, carried, velocities, accelerations)
         element_forces, _ = forces.passive_forces_by_element(rows, velocities)
         for ends, force in zip(forces.lengths.end_points, element_forces[:, nv:].T, strict=True):
-            one, two = (self._point_in_world(kinematics, *end) for end in ends)
+            one, two = (kinematics.position(*end) for end in ends)
             way = two - one
             push = (
                 force[:, None] * way / np.maximum(np.linalg.norm(way, axis=1), MIN_LENGTH)[:, None]
@@ -282,7 +286,7 @@ class Reactions(OneLineRepr):
     ) -> None:
         """Subtract a wrench (6,) or (N, 6) about a point of a body from `carried`."""
         about = np.array(np.broadcast_to(wrench, (len(carried), 6)))
-        about[:, 3:] += np.cross(self._point_in_world(kinematics, *point), about[:, :3])
+        about[:, 3:] += np.cross(kinematics.position(*point), about[:, :3])
         carried -= self._is_carried_by[point[0]][:, None] * about[:, None]
 
     def _solve_loop_forces(
@@ -352,14 +356,13 @@ class Reactions(OneLineRepr):
     ) -> _StackKinematics:
         """Kinematics of configurations (N, nq); writes wrenches (N, nj, 6) into `carried`."""
         model, data, equations = self._model, self._data, self._equations
-        configurations = self.machine.coordinates.configuration(q)
         columns = np.empty((len(q), 6, model.nv))
         bodies = np.empty((len(q), model.njoints, 4, 4))
         joint_placements, joint_forces = (
             list(data.oMi),
             list(data.f)[1:],
         )  # references, updated by Pinocchio
-        for i, at in enumerate(configurations):
+        for i, at in enumerate(self.machine.coordinates.configuration(q)):
             columns[i] = pin.computeJointJacobians(model, data, at).reshape(6, -1)
             bodies[i] = [placement.homogeneous for placement in joint_placements]
             if carried is not None and v is not None and a is not None:
@@ -388,22 +391,12 @@ class Reactions(OneLineRepr):
             axis=1,
         )
 
-    def _point_in_world(
-        self, kinematics: _StackKinematics, body: int, local_point: Array
-    ) -> Array:
-        """(N, 3) positions of a point of a body in the world."""
-        return np.asarray(
-            kinematics.origins[:, body] + kinematics.rotations[:, body] @ local_point
-        )
-
-    def _as_stack(self, value: ArrayLike, what: str) -> tuple[Array, bool]:
+    def _as_stack(self, value: ArrayLike, what: str, q: Array | None = None) -> tuple[Array, bool]:
+        """A value as stack (N, nq), as many as configurations q, and whether it is one."""
         given = as_samples(value, self._model.nv, what, self.machine.joints)
         if not given.size:
             raise InputError(f"{what} is an empty stack, give at least one sample")
-        return np.atleast_2d(given), given.ndim == 2
-
-    def _as_matching_stack(self, value: ArrayLike, q: Array, what: str) -> Array:
-        given = self._as_stack(value, what)[0]
-        if given.shape != q.shape:
-            raise InputError(f"{what} has {len(given)} samples and q {len(q)}, give as many")
-        return given
+        rows = np.atleast_2d(given)
+        if q is not None and rows.shape != q.shape:
+            raise InputError(f"{what} has {len(rows)} samples and q {len(q)}, give as many")
+        return rows, given.ndim == 2

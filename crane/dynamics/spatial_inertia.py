@@ -78,7 +78,7 @@ class SpatialInertia:
             tensor: Inertia about the COM (3, 3).
         """
         moment = scale_vector(mass, lever)
-        out = _symmetric_matrix(
+        out = symmetric_matrix(
             lambda r, c: (
                 tensor[r][c] - moment[r] * lever[c] + (dot(moment, lever) if r == c else 0.0)
             )
@@ -91,9 +91,9 @@ class SpatialInertia:
 
     def __add__(self, other: "SpatialInertia") -> "SpatialInertia":
         return SpatialInertia(
-            _symmetric_matrix(lambda r, c: self.mass[r][c] + other.mass[r][c]),
+            symmetric_matrix(lambda r, c: self.mass[r][c] + other.mass[r][c]),
             [add_vectors(one, two) for one, two in zip(self.mixed, other.mixed, strict=True)],
-            _symmetric_matrix(lambda r, c: self.turning[r][c] + other.turning[r][c]),
+            symmetric_matrix(lambda r, c: self.turning[r][c] + other.turning[r][c]),
         )
 
     def apply_to(self, motion: SpatialVector) -> SpatialVector:
@@ -127,23 +127,26 @@ class SpatialInertia:
         return SpatialInertia(
             self.mass,
             coupling,
-            _symmetric_matrix(
+            symmetric_matrix(
                 lambda r, c: self.turning[r][c] - dot(old[r], across[c]) + dot(skew[r], new[c])
             ),
         )
 
 
-def _symmetric_matrix(entry: Callable[[int, int], Scalar]) -> Matrix:
-    out: Matrix = [[0.0] * 3 for _ in range(3)]
-    for r in range(3):
-        for c in range(r + 1):
+def symmetric_matrix(
+    entry: Callable[[int, int], Scalar], size: int = 3, upper: bool = False
+) -> Matrix:
+    """The symmetric matrix of some entries, from its lower or upper triangle row by row."""
+    out: Matrix = [[0.0] * size for _ in range(size)]
+    for r in range(size):
+        for c in range(r, size) if upper else range(r + 1):
             out[r][c] = out[c][r] = entry(r, c)
     return out
 
 
 def _subtract_symmetric_product(matrix: Matrix, one: Vector, two: Vector) -> Matrix:
     """A symmetric matrix without a symmetric product."""
-    return _symmetric_matrix(lambda r, c: matrix[r][c] - one[r] * two[c])
+    return symmetric_matrix(lambda r, c: matrix[r][c] - one[r] * two[c])
 
 
 def _skew(v: Vector) -> Matrix:
@@ -190,13 +193,10 @@ class ClusterMassColumns:
             i: [dot([*row.values()], [gamma[j][k] for j in row]) for k in count]
             for i, row in tree.items()
         }
-        self.mass_block: list[Vector] = [[0.0] * len(count) for _ in count]
-        for k in count:
-            column = [row[k] for row in moved.values()]
-            for j in range(k + 1):
-                self.mass_block[j][k] = self.mass_block[k][j] = dot(
-                    [row[j] for row in gamma.values()], column
-                )
+        columns = [[row[k] for row in moved.values()] for k in count]
+        self.mass_block = symmetric_matrix(
+            lambda k, j: dot([row[j] for row in gamma.values()], columns[k]), len(count)
+        )
 
 
 def propagate_wrench(
@@ -293,14 +293,17 @@ class MassMoments:
         """
         first = scale_vector(mass, centre)
         square = dot(first, centre)
-        inertia = _symmetric_from_upper(
-            lambda r, c: tensor[r][c] - first[r] * centre[c] + (square if r == c else 0.0)
+        inertia = symmetric_matrix(
+            lambda r, c: tensor[r][c] - first[r] * centre[c] + (square if r == c else 0.0),
+            upper=True,
         )
         v, w = motion
         momentum = scale_vector(mass, add_vectors(v, cross(w, centre)))
         # second moments about the centre, tr(I) / 2 - I
         half = 0.5 * (tensor[0][0] + tensor[1][1] + tensor[2][2])
-        spread = _symmetric_from_upper(lambda r, c: (half if r == c else 0.0) - tensor[r][c])
+        spread = symmetric_matrix(
+            lambda r, c: (half if r == c else 0.0) - tensor[r][c], upper=True
+        )
         spun = transpose([cross(w, column) for column in spread])
         k = [
             [p * x + more for x, more in zip(centre, row, strict=True)]
@@ -319,8 +322,8 @@ class MassMoments:
         return MassMoments(
             self.mass + other.mass,
             add_vectors(self.first_moment, other.first_moment),
-            _symmetric_from_upper(
-                lambda r, c: self.inertia_tensor[r][c] + other.inertia_tensor[r][c]
+            symmetric_matrix(
+                lambda r, c: self.inertia_tensor[r][c] + other.inertia_tensor[r][c], upper=True
             ),
             add_vectors(self.momentum, other.momentum),
             [
@@ -343,12 +346,3 @@ class MassMoments:
         """Angular part of B^T of a motion."""
         v, w = motion
         return add_vectors(cross(self.momentum, v), matvec(transpose(self.moment_rate), w))
-
-
-def _symmetric_from_upper(entry: Callable[[int, int], Scalar]) -> Matrix:
-    """`_symmetric_matrix` from the upper triangle: the order of operations stays the same."""
-    out: Matrix = [[0.0] * 3 for _ in range(3)]
-    for r in range(3):
-        for c in range(r, 3):
-            out[r][c] = out[c][r] = entry(r, c)
-    return out

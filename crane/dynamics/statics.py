@@ -68,8 +68,7 @@ class StaticsEvaluator:
         machine.frame(frame)
         self.frame, self.machine = frame, dataclasses.replace(machine, tip=frame)
         self.dynamics = Dynamics(self.machine)
-        self._n = len(machine.active)
-        n = self._n
+        n = self._n = len(machine.active)
         self.layout = Layout(
             moment=3, moment_jacobian=3 * n, mass=1, passive=n, tip=3, tip_jacobian=3 * n
         )

@@ -186,10 +186,11 @@ class TippingStability:
         # the rate of momentum acts at the centre of mass of the moving bodies
         moved = rates[:, :3] - (self.mass - own.mass) * self._gravity
         out[:, 3:] += np.cross(centres, moved) - np.cross(own.mass * own.lever, self._gravity)
-        if external_wrenches is not None:
-            for k in range(len(self.machine.external_forces)):
-                if k not in self._support_contacts:
-                    out -= self._external_wrench_about_origin(q, k, external_wrenches)
+        if external_wrenches is None:
+            return out
+        for k in range(len(self.machine.external_forces)):
+            if k not in self._support_contacts:
+                out -= self._external_wrench_about_origin(q, k, external_wrenches)
         return out
 
     def contact_wrench(self, q: Array, external_wrenches: Array) -> Array:
@@ -209,17 +210,12 @@ class TippingStability:
         points = self.support_positions(q)
         weight = self.mass * float(np.linalg.norm(self._gravity))
         moments = self._moments_about_lines(points, ground_wrench)
-        shares = np.empty_like(moments)
-        for k, (first, second) in enumerate(self.line_indices):
-            line_direction = points[:, second, :2] - points[:, first, :2]
-            across = points[..., :2] - points[:, first, None, :2]
-            area = (
-                line_direction[:, None, 0] * across[..., 1]
-                - line_direction[:, None, 1] * across[..., 0]
-            )
-            distances = np.abs(area).max(axis=1) / np.linalg.norm(line_direction, axis=1)
-            shares[:, k] = moments[:, k] / (weight * distances)
-        return TippingMargins(moments, shares)
+        first, second = np.array(self.line_indices).T
+        lines = (points[:, second] - points[:, first])[..., None, :2]  # (N, k, 1, 2)
+        across = points[:, None, :, :2] - points[:, first, None, :2]  # (N, k, s, 2)
+        area = lines[..., 0] * across[..., 1] - lines[..., 1] * across[..., 0]
+        distances = np.abs(area).max(axis=2) / np.linalg.norm(lines[:, :, 0], axis=2)
+        return TippingMargins(moments, moments / (weight * distances))
 
     def support_forces(self, q: Array, ground_wrench: Array) -> Array:
         """Force of each support (N, s) [N], for supports of equal stiffness under a rigid frame.
@@ -248,14 +244,10 @@ class TippingStability:
 
     def _moments_about_lines(self, points: Array, wrench: Array) -> Array:
         """(N, k) moments of wrenches (N, 6) about the lines."""
-        out = np.empty((len(points), len(self.line_indices)))
-        for k, (first, second) in enumerate(self.line_indices):
-            line_direction = points[:, second] - points[:, first]
-            moment = wrench[:, 3:] - np.cross(points[:, first], wrench[:, :3])
-            out[:, k] = (line_direction * moment).sum(axis=1) / np.linalg.norm(
-                line_direction, axis=1
-            )
-        return out
+        first, second = np.array(self.line_indices).T
+        lines = points[:, second] - points[:, first]
+        moments = wrench[:, None, 3:] - np.cross(points[:, first], wrench[:, None, :3])
+        return np.asarray((lines * moments).sum(axis=2) / np.linalg.norm(lines, axis=2))
 
     def _external_wrench_about_origin(self, q: Array, k: int, external_wrenches: Array) -> Array:
         """(N, 6) wrench of external force k about the world's origin."""

@@ -176,11 +176,10 @@ def warn_about_assembly_modes(
         return
     is_from_simulator = is_simulator_file(spec.path)
     names = closure.equations.coordinates.names
-    is_specified = [is_from_simulator or name in spec.home for name in names]
     alternatives = find_alternative_assembly_modes(
         closure,
         initial_guess,
-        np.flatnonzero(is_specified),
+        np.flatnonzero([is_from_simulator or name in spec.home for name in names]),
         _THOROUGH_STARTS if thorough else _QUICK_STARTS,
     )
     remainder = ""
@@ -212,9 +211,9 @@ def alternative_configurations(machine: Machine) -> list[Array]:
 
 
 def _alternative_text(spec: MachineSpec, closure: Closure, alternative: AssemblyMode) -> str:
-    loops = " and ".join(f"'{name}'" for name in alternative.loops[:_MAX_LISTED])
-    if more := len(alternative.loops) - _MAX_LISTED:
-        loops += f" and {more} more" if more > 0 else ""
+    more = len(alternative.loops) - _MAX_LISTED
+    listed = [f"'{name}'" for name in alternative.loops[:_MAX_LISTED]]
+    loops = " and ".join([*listed, *[f"{more} more"] * (more > 0)])
     location = spec.source_locations.get("home") or spec.source_locations.get(
         f"loop {alternative.loops[0]}", spec.path.name
     )
@@ -243,7 +242,6 @@ def _alternative_text(spec: MachineSpec, closure: Closure, alternative: Assembly
 
 
 def _home_element_text(spec: MachineSpec) -> str:
-    """Return the name of the section or element of a file that contains home."""
     if spec.path.suffix.lower() in (".yaml", ".yml"):
         return "under 'home:'"
     if is_sdf_file(spec.path):

@@ -23,6 +23,7 @@ from crane.machine.machine import Machine
 TextEdit = tuple[int, int, str]  # start, end, new text
 
 _SAME_HOME_TOLERANCE = 1e-9
+_BYTE_ORDER_MARK = "\ufeff"
 _TAG_PATTERN = re.compile(r"""<(?:[^>"']|"[^"]*"|'[^']*')*>""")
 _VALUE_PATTERN = re.compile(r"""(?<=\s)value\s*=\s*(?:"[^"]*"|'[^']*')""")
 
@@ -71,11 +72,11 @@ def write_home(
         except UnicodeDecodeError:
             raise OutputError(f"{path}: is not UTF-8, save it so first") from None
         home = dict(zip(machine.joints, machine.home.tolist(), strict=True))
-        is_urdf = path.suffix.lower() not in (".yaml", ".yml")
-        _replace_text(
-            path,
-            _apply_edits(text, _xml_edits(text, home) if is_urdf else _yaml_edits(text, home)),
-        )
+        find_edits = _yaml_edits if path.suffix.lower() in (".yaml", ".yml") else _xml_edits
+        edited = text.removeprefix(_BYTE_ORDER_MARK)
+        for start, end, new in sorted(find_edits(edited, home), reverse=True):
+            edited = edited[:start] + new + edited[end:]
+        _replace_text(path, _BYTE_ORDER_MARK * text.startswith(_BYTE_ORDER_MARK) + edited)
         try:
             _check_written_home(path, machine)
         except CraneError:
@@ -90,15 +91,19 @@ def _replace_text(path: Path, text: str) -> None:
         shutil.copymode(path, temporary_file)
 
 
-def _file_arguments(machine: Machine) -> dict[str, str]:
-    """Return the load arguments without the one that accepts any home."""
-    return {x: value for x, value in machine.arguments.items() if x != NEAREST_ASSEMBLY}
+def _without_lenience(machine: Machine) -> Machine:
+    return replace(
+        machine,
+        arguments=MappingProxyType(
+            {x: value for x, value in machine.arguments.items() if x != NEAREST_ASSEMBLY}
+        ),
+    )
 
 
 def _check_is_writable(machine: Machine, path: Path) -> None:
     search = machine.closure.home_search
     if search is None or not search.is_far:
-        machine = replace(machine, arguments=MappingProxyType(_file_arguments(machine)))
+        machine = _without_lenience(machine)
     copy_hint = f"write it into a copy: crane convert {machine.command_line_arguments} FOLDER"
     packaged_files = {
         place.resolve() for place in (*bundled_machines().values(), *example_robots().values())
@@ -112,14 +117,14 @@ def _check_is_writable(machine: Machine, path: Path) -> None:
 
 
 def _check_written_home(path: Path, expected: Machine) -> None:
-    """Load the file that was written, and compare its home."""
     try:
         machine = load(
             path,
             active=expected.chosen_joints.get("active"),
             free=expected.chosen_joints.get("free"),
             packages=expected.packages,
-            arguments=_file_arguments(expected),
+            arguments=_without_lenience(expected).arguments,
+            trust_xacro=expected.trusts_xacro,
         )
     except CraneError as error:
         raise OutputError(f"{path}: home cannot be written into it ({error})") from None
@@ -132,28 +137,18 @@ def _check_written_home(path: Path, expected: Machine) -> None:
         )
 
 
-def _apply_edits(text: str, edits: list[TextEdit]) -> str:
-    for start, end, new in sorted(edits, reverse=True):
-        text = text[:start] + new + text[end:]
-    return text
-
-
 def _yaml_edits(text: str, home: Mapping[str, float]) -> list[TextEdit]:
-    """Return the edits of a machine file or robot.yaml."""
-    bom = text.startswith("\ufeff")
     line_break = "\r\n" if "\r\n" in text else "\n"
-    top = yaml.compose(text[bom:], yaml.SafeLoader)
+    top = yaml.compose(text, yaml.SafeLoader)
     assert isinstance(top, yaml.MappingNode), "it was read before"
     home_node = next((value for key, value in top.value if key.value == "home"), None)
     if home_node is not None:
-        edits = _mapping_edits(text[bom:], home_node, home, line_break)
-    elif top.flow_style:
-        edits = [(top.end_mark.index - 1,) * 2 + (f", home: {{{_flow_text(home)}}}",)]
-    else:
-        end = top.end_mark.index
-        separator = "" if text[bom:][:end].endswith("\n") else line_break
-        edits = [(end, end, f"{separator}home:{_block_text(home, '  ', line_break)}{line_break}")]
-    return [(start + bom, end + bom, new) for start, end, new in edits]
+        return _mapping_edits(text, home_node, home, line_break)
+    end = top.end_mark.index
+    if top.flow_style:
+        return [(end - 1, end - 1, f", home: {{{_flow_text(home)}}}")]
+    separator = "" if text[:end].endswith("\n") else line_break
+    return [(end, end, f"{separator}home:{_block_text(home, '  ', line_break)}{line_break}")]
 
 
 def _mapping_edits(
@@ -166,7 +161,7 @@ def _mapping_edits(
             "'home' shares values with other keys (&, *), write its numbers out first"
         )
     edits: list[TextEdit] = [
-        (value.start_mark.index, value.end_mark.index, _yaml_number(home[key.value]))
+        (value.start_mark.index, value.end_mark.index, _yaml_text(home[key.value]))
         for key, value in home_node.value
     ]
     missing = {
@@ -186,26 +181,19 @@ def _mapping_edits(
 
 def _block_text(home: Mapping[str, float], indent: str, line_break: str) -> str:
     return "".join(
-        f"{line_break}{indent}{_yaml_name(x)}: {_yaml_number(value)}" for x, value in home.items()
+        f"{line_break}{indent}{_yaml_text(x)}: {_yaml_text(value)}" for x, value in home.items()
     )
 
 
 def _flow_text(home: Mapping[str, float]) -> str:
-    return ", ".join(
-        f"{_yaml_name(joint)}: {_yaml_number(value)}" for joint, value in home.items()
-    )
+    return ", ".join(f"{_yaml_text(joint)}: {_yaml_text(value)}" for joint, value in home.items())
 
 
-def _yaml_name(joint: str) -> str:
-    return str(yaml.safe_dump([joint], default_flow_style=True, width=10**6)).strip()[1:-1]
-
-
-def _yaml_number(value: float) -> str:
-    return str(yaml.safe_dump(value)).split("\n", 1)[0]
+def _yaml_text(value: str | float) -> str:
+    return str(yaml.safe_dump([value], default_flow_style=True, width=10**6)).strip()[1:-1]
 
 
 def _xml_edits(text: str, home: Mapping[str, float]) -> list[TextEdit]:
-    """Return the edits of a URDF."""
     data = text.encode("utf-8")
     line_break = "\r\n" if "\r\n" in text else "\n"
     home_elements: list[tuple[int, int]] = []  # start of the start tag and of the end tag
@@ -236,7 +224,12 @@ def _xml_edits(text: str, home: Mapping[str, float]) -> list[TextEdit]:
     def place(index: int) -> int:
         return len(data[:index].decode("utf-8"))
 
-    edits = [_value_edit(text, place(joints[joint]), home[joint]) for joint in joints]
+    edits = []
+    for joint, index in joints.items():
+        tag = _TAG_PATTERN.match(text, place(index))
+        old = None if tag is None else _VALUE_PATTERN.search(text, tag.start(), tag.end())
+        assert old is not None, "it was read before"
+        edits.append((old.start(), old.end(), f'value="{home[joint]!r}"'))
     missing = {joint: home[joint] for joint in home if joint not in joints}
     if not missing:
         return edits
@@ -258,14 +251,6 @@ def _xml_edits(text: str, home: Mapping[str, float]) -> list[TextEdit]:
             ),
         ]
     return [*edits, (last, last, f"{_joint_elements(missing, line_break).lstrip()}  ")]
-
-
-def _value_edit(text: str, position: int, value: float) -> TextEdit:
-    """Return the edit of the value in a `<joint>` tag."""
-    tag = _TAG_PATTERN.match(text, position)
-    old = None if tag is None else _VALUE_PATTERN.search(text, tag.start(), tag.end())
-    assert old is not None, "it was read before"
-    return old.start(), old.end(), f'value="{value!r}"'
 
 
 def _joint_elements(home: Mapping[str, float], line_break: str) -> str:

@@ -4,7 +4,6 @@ import json
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from weakref import WeakKeyDictionary
@@ -17,6 +16,7 @@ from crane.common.errors import CraneWarning, DescriptionError, InputError, summ
 from crane.common.package_search import (
     check_argument_values,
     check_package_folders,
+    load_options,
     use_load_options,
 )
 from crane.common.samples import read_only_copy
@@ -51,6 +51,7 @@ def load(
     packages: Sequence[str | Path] = (),
     arguments: Mapping[str, object] | None = None,
     strict: bool = False,
+    trust_xacro: bool = False,
 ) -> Machine:
     """Load a machine, optionally with changed parameters or locked joints.
 
@@ -78,6 +79,8 @@ def load(
             home that is far from the home of the file.
         strict: Whether to refuse, as `check` does, formal errors such as infeasible inertias, see
             `crane.machine.machine_checks`.
+        trust_xacro: Whether a xacro file may run Python in its expressions and read all files and
+            environment variables, as by xacro itself; by default as `docs/security.md` says.
 
     Returns:
         The machine, closed at home.
@@ -91,13 +94,11 @@ def load(
     floating = floating if isinstance(floating, bool) else check_freedoms(floating)
     with (
         summarize_warnings(),
-        use_load_options(package_paths, values, bool(floating), strict) as options,
+        use_load_options(package_paths, values, bool(floating), strict, trust_xacro or None),
     ):
-        spec = _read_spec(name, active, free, floating)
-        machine = _assemble_machine(spec, changes, lock, active, free, floating)
-        return replace(
-            machine, packages=options.packages, arguments=MappingProxyType(options.arguments)
-        )
+        chosen_joints = _check_chosen_joints(active=active, free=free)
+        spec = _read_spec(name, chosen_joints, floating)
+        return _assemble_machine(spec, changes, lock, chosen_joints, floating)
 
 
 ClosureProvider = Callable[[pin.Model, Sequence[LoopSpec], Sequence[Coupling]], Closure | None]
@@ -123,10 +124,7 @@ class MachineVariants:
         self._machine = machine
         with summarize_warnings(), self._load_options():
             spec_before_changes = _SPEC_BEFORE_CHANGES.get(machine.closure) or _read_spec(
-                machine.load_name,
-                machine.chosen_joints.get("active"),
-                machine.chosen_joints.get("free"),
-                machine.floating_base,
+                machine.load_name, machine.chosen_joints, machine.floating_base
             )
             self.spec = apply_parameter_changes(spec_before_changes, machine.parameter_changes)
         # the description has no payload mass after a change
@@ -137,7 +135,14 @@ class MachineVariants:
     def machine(self, changes: Mapping[str, float]) -> Machine:
         """Return the machine with changed parameters, see `load`."""
         known_closures = self._known_closures
-        variant = self._build_variant(changes, lambda *tree: _reuse_closure(known_closures, *tree))
+
+        def reuse_closure(
+            model: pin.Model, loops: Sequence[LoopSpec], couplings: Sequence[Coupling]
+        ) -> Closure | None:
+            variants = (x.with_other_masses(model, loops, couplings) for x in known_closures)
+            return next((closure for closure in variants if closure is not None), None)
+
+        variant = self._build_variant(changes, reuse_closure)
         if all(variant.closure.structure is not closure.structure for closure in known_closures):
             self._known_closures = [variant.closure, *known_closures][:_MAX_KNOWN_CLOSURES]
         return variant
@@ -154,39 +159,35 @@ class MachineVariants:
     def _build_variant(
         self, changes: Mapping[str, float], closure_provider: ClosureProvider
     ) -> Machine:
-        original, all_changes = self._machine, {**self._machine.parameter_changes, **changes}
-        chosen_joints = original.chosen_joints.get("active"), original.chosen_joints.get("free")
+        original = self._machine
         with summarize_warnings(), self._load_options():
-            variant = _assemble_machine(
+            return _assemble_machine(
                 self._spec_before_changes,
-                all_changes,
+                {**original.parameter_changes, **changes},
                 original.locked_joints,
-                *chosen_joints,
+                original.chosen_joints,
                 original.floating_base,
                 closure_provider,
             )
-        return replace(variant, packages=original.packages, arguments=original.arguments)
 
     def _load_options(self) -> AbstractContextManager[object]:
         original = self._machine
-        folders, parameters = (
+        return use_load_options(
             check_package_folders(original.packages),
             check_argument_values(original.arguments),
+            bool(original.floating_base),
+            trust_xacro=original.trusts_xacro,
         )
-        return use_load_options(folders, parameters, bool(original.floating_base))
 
 
 def _read_spec(
     name: str | Path,
-    active: Sequence[str] | None,
-    free: Sequence[str] | None,
+    chosen_joints: Mapping[str, tuple[str, ...]],
     floating: bool | tuple[str, ...],
 ) -> MachineSpec:
     spec = add_floating_base(read_machine_spec(name), floating)
-    if active is not None or free is not None:
-        spec = set_active_joints(
-            spec, _check_joint_list(active, "active"), _check_joint_list(free, "free")
-        )
+    if chosen_joints:
+        spec = set_active_joints(spec, chosen_joints.get("active"), chosen_joints.get("free"))
     return spec
 
 
@@ -194,12 +195,11 @@ def _assemble_machine(
     spec: MachineSpec,
     changes: Mapping[str, float] | None,
     lock: Mapping[str, float] | None,
-    active: Sequence[str] | None,
-    free: Sequence[str] | None,
+    chosen_joints: Mapping[str, tuple[str, ...]],
     floating: bool | tuple[str, ...],
     closure_provider: ClosureProvider = lambda *_: None,
 ) -> Machine:
-    chosen_joints, spec_before_changes = {"active": active, "free": free}, spec
+    spec_before_changes = spec
     if changes:
         spec = apply_parameter_changes(spec, changes)
     if lock:
@@ -236,12 +236,11 @@ def _assemble_machine(
         control=MappingProxyType(dict(spec.control)),
         hydraulics=spec.hydraulics,
         sensors=MappingProxyType(dict(spec.sensors)),
-        chosen_joints=MappingProxyType(
-            {key: tuple(names) for key, names in chosen_joints.items() if names is not None}
-        ),
+        chosen_joints=MappingProxyType(dict(chosen_joints)),
         floating_base=floating,
-        packages=(),
-        arguments=MappingProxyType({}),
+        packages=load_options().packages,
+        arguments=MappingProxyType(load_options().arguments),
+        trusts_xacro=load_options().trust_xacro,
         parameter_changes=MappingProxyType(
             {name: float(value) for name, value in (changes or {}).items()}
         ),
@@ -257,17 +256,6 @@ def _assemble_machine(
     return machine.with_external_forces(*spec.external_forces) if spec.external_forces else machine
 
 
-def _reuse_closure(
-    closures: Sequence[Closure],
-    model: pin.Model,
-    loops: Sequence[LoopSpec],
-    couplings: Sequence[Coupling],
-) -> Closure | None:
-    """Return the first closure whose tree has the same geometry, with the masses of a model."""
-    variants = (closure.with_other_masses(model, loops, couplings) for closure in closures)
-    return next((closure for closure in variants if closure is not None), None)
-
-
 def _build_closure(spec: MachineSpec, model: pin.Model, is_modified: bool) -> Closure:
     initial_guess = home_initial_guess(spec, model)
     try:
@@ -279,16 +267,21 @@ def _build_closure(spec: MachineSpec, model: pin.Model, is_modified: bool) -> Cl
     return closure
 
 
-def _check_joint_list(joints: object, label: str) -> Sequence[str] | None:
-    if joints is None:
-        return None
-    if isinstance(joints, str) or not isinstance(joints, Sequence):
-        raise InputError(f"{label} is {joints!r}, give a list of joints such as ['lift', 'tilt']")
-    return tuple(map(str, joints))
+def _check_chosen_joints(**chosen_joints: Sequence[str] | None) -> dict[str, tuple[str, ...]]:
+    for label, joints in chosen_joints.items():
+        if joints is not None and (isinstance(joints, str) or not isinstance(joints, Sequence)):
+            raise InputError(
+                f"{label} is {joints!r}, give a list of joints such as ['lift', 'tilt']"
+            )
+    return {
+        label: tuple(map(str, joints))
+        for label, joints in chosen_joints.items()
+        if joints is not None
+    }
 
 
 def load_from_expression(expression: str) -> Machine:
-    """Load a machine from the text of `Machine.load_expression`.
+    """Load a machine from the text of `Machine.load_expression`, without trust in xacro files.
 
     Raises:
         InputError: The text is malformed; otherwise as `load`.
@@ -299,7 +292,8 @@ def load_from_expression(expression: str) -> Machine:
         if CHANGES_SEPARATOR not in expression:
             raise
     else:
-        return load(expression)  # a path may hold anything
+        with use_load_options(trust_xacro=False):
+            return load(expression)  # a path may hold anything
     name, _, text = expression.partition(CHANGES_SEPARATOR)
     try:
         options = json.loads(text)
@@ -321,4 +315,5 @@ def load_from_expression(expression: str) -> Machine:
         raise InputError(
             f"'{expression}' names no machine, write NAME{CHANGES_SEPARATOR}{example}"
         )
-    return load(name, changes, lock, active, free, floating, packages, arguments)
+    with use_load_options(trust_xacro=False):
+        return load(name, changes, lock, active, free, floating, packages, arguments)

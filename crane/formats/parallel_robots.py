@@ -16,13 +16,13 @@ from crane.description.key_types import (
 from crane.description.kinematic_tree import Joint, Link, Tree, joint_series
 from crane.description.specification import Chain, Drive, LoopSpec, MachineSpec, source_locations
 from crane.formats.machine_file.structure_sections import TreeBuilder, read_home
-from crane.formats.machine_file.yaml_parser import MAX_FILE_SIZE, format_value
 from crane.formats.machine_file.yaml_section import YamlSection
+from crane.formats.machine_file.yaml_text import MAX_FILE_SIZE, format_value
 from crane.formats.urdf.link_joint_elements import MOVABLE_TYPES
 from crane.formats.urdf.urdf_reader import UrdfModel, read_urdf
 from crane.formats.xml_file import XmlFile
 
-URDF_FILE, YAML_FILE = "robot.urdf", "robot.yaml"
+URDF_FILE = "robot.urdf"
 
 _ROBOT_FILE = SectionSchema(
     "the machine file",
@@ -68,7 +68,7 @@ def read_parallel_robot(path: Path) -> MachineSpec:
         raise DescriptionError(f"{path}: there is no {URDF_FILE} beside it, add it")
     replaced_types = _replaced_joint_types(top)
     urdf = read_urdf(file, lambda xml: _replace_joint_types(xml, replaced_types, top))
-    for joint, (kind, _) in replaced_types.items():
+    for joint, kind in replaced_types.items():
         if kind not in ("SPHERICAL", "FIXED"):
             universal_axes = _UNIVERSAL_PATTERN.fullmatch(kind)
             urdf = _split_universal_joint(
@@ -81,8 +81,7 @@ def read_parallel_robot(path: Path) -> MachineSpec:
             f"{urdf.loops[0].source_location}: the loops stand in {path.name}, keep <loop> or "
             "closed_loop"
         )
-    name = urdf.name
-    chain = Chain(name, file, None, path.name, urdf.moving_joints)
+    chain = Chain(urdf.name, file, None, path.name, urdf.moving_joints)
     tree = TreeBuilder()
     tree.add_chain(chain, urdf)
     if not tree.joints:
@@ -93,19 +92,16 @@ def read_parallel_robot(path: Path) -> MachineSpec:
         if joint not in tree.joints and joint in replaced_types:
             raise top.error_at(
                 "name_mot",
-                f"the motor '{joint}' is {replaced_types[joint][0]}, drive a joint with one "
-                "freedom",
+                f"the motor '{joint}' is {replaced_types[joint]}, drive a joint with one freedom",
             )
         tree.check_joint(joint, top.source_location("name_mot"))
-    home, home_lines = read_home(top, tree)
-    locations = {"active": top.source_location("name_mot")} | source_locations(
-        loops, urdf.couplings
-    )
-    locations |= {f"home {joint}": place for joint, place in home_lines.items()}
+    home, home_locations = read_home(top, tree)
+    locations = source_locations(loops, urdf.couplings) | home_locations
+    locations["active"] = top.source_location("name_mot")
     if "home" in top:
         locations["home"] = top.source_location("home")
     return MachineSpec(
-        name=name,
+        name=urdf.name,
         source=path.name,
         path=path,
         chains=(chain,),
@@ -121,8 +117,7 @@ def read_parallel_robot(path: Path) -> MachineSpec:
     )
 
 
-def _replaced_joint_types(top: YamlSection) -> dict[str, tuple[str, str]]:
-    """Return the new type of joints of the URDF, and its source location, by joint."""
+def _replaced_joint_types(top: YamlSection) -> dict[str, str]:
     names = top.names("joint_name")
     if not names:
         return {}
@@ -140,16 +135,12 @@ def _replaced_joint_types(top: YamlSection) -> dict[str, tuple[str, str]]:
                 "joint_type",
                 f"joint type '{kind}' is unknown, {suggest_names(_JOINT_TYPES, kind)}",
             )
-    where = top.source_location("joint_type")
-    return {name: (kind, where) for name, kind in zip(names, types, strict=True)}
+    return dict(zip(names, types, strict=True))
 
 
-def _replace_joint_types(
-    xml: XmlFile, replaced_types: dict[str, tuple[str, str]], top: YamlSection
-) -> None:
-    """Write other types of joints into a URDF."""
+def _replace_joint_types(xml: XmlFile, replaced_types: dict[str, str], top: YamlSection) -> None:
     joints = {joint.get("name", "").strip(): joint for joint in xml.root.iterfind("joint")}
-    for name, (kind, _) in replaced_types.items():
+    for name, kind in replaced_types.items():
         if name not in joints:
             raise top.error_at(
                 "joint_name", f"joint '{name}' is unknown, {suggest_names(joints, name)}"
@@ -170,30 +161,37 @@ def _split_universal_joint(urdf: UrdfModel, name: str, axes: tuple[str, str]) ->
     """Return the URDF with a universal joint as two joints, the first at the parent."""
     parts: list[Link | Joint] = []
     for part in urdf.tree:
-        if isinstance(part, Joint) and part.name == name:
-            parts += _universal_joint_parts(part, axes, urdf.tree)
-        else:
+        if not isinstance(part, Joint) or part.name != name:
             parts.append(part)
-    return dataclasses.replace(urdf, tree=Tree({}, {}).with_parts(*parts))
-
-
-def _universal_joint_parts(joint: Joint, axes: tuple[str, str], tree: Tree) -> list[Link | Joint]:
-    """Return the joints and links of a universal joint; their names must be unused."""
-    freedoms = [(axis, "revolute", _AXES[axis]) for axis in axes]
-    place, end_links = (joint.xyz, joint.rpy), (joint.parent, joint.child)
-    parts = joint_series(joint.name, freedoms, place, end_links, joint.source_location)
-    for made in parts:
-        if made.name in (tree.links if isinstance(made, Link) else tree.joints):
+            continue
+        freedoms = [(axis, "revolute", _AXES[axis]) for axis in axes]
+        placement, end_links = (part.xyz, part.rpy), (part.parent, part.child)
+        series = joint_series(name, freedoms, placement, end_links, part.source_location)
+        used_names = {(type(x), x.name) for x in urdf.tree}
+        if taken := [x.name for x in series if (type(x), x.name) in used_names]:
             raise DescriptionError(
-                f"{joint.source_location}: joint '{joint.name}' makes '{made.name}', which is "
-                "there already, rename one"
+                f"{part.source_location}: joint '{name}' makes '{taken[0]}', which is there "
+                "already, rename one"
             )
-    return parts
+        parts += series
+    return dataclasses.replace(urdf, tree=Tree({}, {}).with_parts(*parts))
 
 
 def _read_loops(top: YamlSection, urdf: UrdfModel, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
     """Return the loops between the frames of `closed_loop`: spherical or fixed."""
-    pairs = _read_pairs(top, "closed_loop") if "closed_loop" in top else []
+    pairs: list[list[str]] = []
+    if "closed_loop" in top:
+        pairs = top.read_list(
+            "closed_loop",
+            "give a list of pairs [[a, b]]",
+            lambda item: isinstance(item, list) and len(item) == 2,
+            "write pairs as [a, b]",
+        )
+    for invalid in [x for pair in pairs for x in pair if not _is_text(x)]:
+        raise top.error_at(
+            "closed_loop",
+            f"'closed_loop' lists {format_value(invalid)}, which is not a name, quote it",
+        )
     kinds = _read_texts(top, "type") if "type" in top else ["6d"] * len(pairs)
     if len(kinds) != len(pairs):
         raise top.error_at(
@@ -233,23 +231,7 @@ def _read_loops(top: YamlSection, urdf: UrdfModel, tree: TreeBuilder) -> tuple[L
 
 
 def _read_texts(top: YamlSection, key: str) -> list[str]:
-    """A list of texts."""
     return top.read_list(key, "give a list such as [a, b]", _is_text, "which is no text, quote it")
-
-
-def _read_pairs(top: YamlSection, key: str) -> list[list[str]]:
-    """A list of pairs of names."""
-    pairs = top.read_list(
-        key,
-        "give a list of pairs [[a, b]]",
-        lambda item: isinstance(item, list) and len(item) == 2,
-        "write pairs as [a, b]",
-    )
-    for invalid in [x for pair in pairs for x in pair if not _is_text(x)]:
-        raise top.error_at(
-            key, f"'{key}' lists {format_value(invalid)}, which is not a name, quote it"
-        )
-    return pairs
 
 
 def _is_text(value: object) -> bool:

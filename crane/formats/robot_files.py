@@ -28,7 +28,7 @@ def _expand_xacro(xml: XmlFile) -> XmlFile:
     """Return a file with its macros expanded and the source locations of its elements.
 
     xacro itself processes includes by `$(find PACKAGE)`, `package://` and paths, arguments,
-    conditions, properties and YAML.
+    conditions, properties and YAML, with the restrictions of `crane.formats.xacro_process`.
 
     Raises:
         DescriptionError: xacro is not installed, or refuses the file.
@@ -49,14 +49,17 @@ def _expand_xacro(xml: XmlFile) -> XmlFile:
         raise DescriptionError(f"{location}: xacro refuses it ({answer['wrong']}), correct it")
     for name in load_options().arguments:
         if name not in (*answer["arguments"], *OWN_ARGUMENTS):
-            hint = suggest_names(answer["arguments"], name)
-            raise InputError(f"{xml.file.name} has no argument '{name}', {hint}")
+            raise InputError(
+                f"{xml.file.name} has no argument '{name}', "
+                f"{suggest_names(answer['arguments'], name)}"
+            )
     parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
     root = etree.fromstring(answer["text"].encode("utf-8"), parser)
     locations = {xml.file.name: 0}
     for element in root.iter(etree.Element):
-        place = element.attrib.pop(xacro_process.LOCATION_ATTRIBUTE, "0:1")
-        number, _, line = place.partition(":")
+        number, _, line = element.attrib.pop(xacro_process.LOCATION_ATTRIBUTE, "0:1").partition(
+            ":"
+        )
         file_name = Path(answer["files"][int(number)]).name
         set_source_location(element, f"{file_name}:{line}", locations)
     return XmlFile(xml.file, root, locations)
@@ -66,7 +69,7 @@ def _run_xacro_process(file: Path) -> dict[str, Any]:
     options = load_options()
     request = {
         "file": str(file), "root": str(_PACKAGE_ROOT), "packages": list(options.packages),
-        "arguments": dict(options.arguments),
+        "arguments": dict(options.arguments), "trust": options.trust_xacro,
     }  # fmt: skip
     program = [sys.executable, "-P", xacro_process.__file__]  # without its folder in sys.path
     try:
@@ -119,9 +122,8 @@ def is_sdf_file(file: Path) -> bool:
 
 def is_simulator_file(file: Path) -> bool:
     """Whether a file is SDF or MJCF, which give all coordinates of home and are not changed."""
-    if file.suffix.lower() in (".yaml", ".yml"):
-        return False
-    return is_sdf_file(file) or not is_robot_file(file)
+    is_machine_file = file.suffix.lower() in (".yaml", ".yml")
+    return not is_machine_file and (is_sdf_file(file) or not is_robot_file(file))
 
 
 @contextmanager
@@ -133,7 +135,7 @@ def open_robots(machine: Machine, chains: Iterable[str] | None = None) -> Iterat
         chains: Names of the chains, all if not given.
     """
     chain_names = None if chains is None else set(chains)
-    with use_load_options(machine.packages, machine.arguments):
+    with use_load_options(machine.packages, machine.arguments, trust_xacro=machine.trusts_xacro):
         with warnings.catch_warnings():  # they were issued when it was loaded
             warnings.simplefilter("ignore", CraneWarning)
             documents = [

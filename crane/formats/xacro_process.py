@@ -1,24 +1,30 @@
 """A process that expands a xacro file, so that the file can crash only this process.
 
 `crane.formats.robot_files` runs it with its request as JSON on the standard input; it writes a
-line of JSON. xacro evaluates Python expressions without bounds, so time and memory are limited.
+line of JSON. Time and memory are limited. Unless the request trusts the file, its expressions are
+those of `crane.formats.xacro_expressions`, it reads files of its own package, of packages that it
+names and of the folders of the user, and no environment variables but those of ROS's version.
 
 The attribute `LOCATION_ATTRIBUTE` of every element of the result contains index of the file and
 line.
 """
 
+import errno
 import json
 import os
 import sys
 import types
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from xml.dom import expatbuilder
 from xml.parsers.expat import ExpatError
 
+_WORKSPACE_LEVELS = 3  # from the folder of a file to that of its package's neighbours
 MAX_LENGTH = 50_000_000  # characters of an expanded file
 LOCATION_ATTRIBUTE = "crane_place"
 _XACRO_PREFIX = "xacro:"
+_VARIABLES = ("ROS_DISTRO", "ROS_VERSION", "ROS_PYTHON_VERSION")  # that each file may read
 
 
 def main() -> None:
@@ -39,6 +45,49 @@ def main() -> None:
     output.flush()
 
 
+class _ReadableFolders:
+    """The folders whose files a xacro file may read.
+
+    Args:
+        file: The first file; its package, or without one its folder, is readable.
+        packages: Folders that the user gave.
+    """
+
+    def __init__(self, file: Path, packages: list[str]) -> None:
+        from crane.common.package_search import enclosing_package
+
+        self._file, self._enclosing_package = file.resolve(), enclosing_package
+        self._folders = {Path(package).resolve() for package in packages}
+        for folder in (file.absolute().parent, self._file.parent):
+            self._folders.add((enclosing_package(folder) or folder).resolve())
+
+    def add_package(self, folder: Path) -> None:
+        """Add a package, and its source if it is installed by links.
+
+        Any folder has the name of a package, so one without a manifest is added only if it is near
+        the first file: it contains the file, or is in one of the folders that do, at most
+        `_WORKSPACE_LEVELS` above it and below the user's home.
+        """
+        if self._enclosing_package(folder) == folder:
+            self._folders |= {folder.resolve(), (folder / "package.xml").resolve().parent}
+            return
+        nearby = self._file.parents[: _WORKSPACE_LEVELS + 1]
+        workspace = [x for x in nearby if not Path.home().is_relative_to(x)]
+        if {folder.resolve(), folder.resolve().parent} & {*workspace}:
+            self._folders.add(folder.resolve())
+
+    def check(self, file: str | Path) -> Path:
+        """Return a path if it is in one of the folders.
+
+        Raises:
+            PermissionError: It is not.
+        """
+        if not any(Path(file).resolve().is_relative_to(folder) for folder in self._folders):
+            reason = "not in its package, give --packages FOLDER or --trust-xacro"
+            raise PermissionError(errno.EACCES, reason, str(file))
+        return Path(file)
+
+
 class _LocationBuilder(expatbuilder.ExpatBuilderNS):
     """Builds the document of a file with the locations of all elements but those of xacro.
 
@@ -56,8 +105,9 @@ class _LocationBuilder(expatbuilder.ExpatBuilderNS):
         super().start_element_handler(name, attributes)
         element: Any = self.curNode
         if not element.tagName.startswith(_XACRO_PREFIX):
-            location = f"{self._number}:{self.getParser().CurrentLineNumber}"
-            element.setAttribute(LOCATION_ATTRIBUTE, location)
+            element.setAttribute(
+                LOCATION_ATTRIBUTE, f"{self._number}:{self.getParser().CurrentLineNumber}"
+            )
         elif element.localName == "arg":
             self._arguments[element.getAttribute("name")] = None
 
@@ -66,10 +116,14 @@ def _expand(xacro: Any, request: dict[str, Any]) -> dict[str, Any]:
     from crane.formats.visuals.mesh_process import MAX_MEMORY, limit_resources
 
     limit_resources()
+    folders = _ReadableFolders(Path(request["file"]), request["packages"])
+    readable_path: Callable[[str], Path] = Path if request["trust"] else folders.check
     names: list[str] = []
     arguments: dict[str, None] = {}
     missing: list[str] = []
-    _provide_package_search(Path(request["file"]).parent, request["packages"], missing, xacro)
+    _provide_package_search(request, folders, missing, xacro)
+    if not request["trust"]:
+        _restrict(xacro, folders)
 
     def parse(inp: Any, filename: str | None = None) -> Any:
         if filename is None:
@@ -77,7 +131,7 @@ def _expand(xacro: Any, request: dict[str, Any]) -> dict[str, Any]:
         names.append(filename)
         try:
             builder = _LocationBuilder(len(names) - 1, arguments)
-            return builder.parseString(Path(filename).read_bytes())
+            return builder.parseString(readable_path(filename).read_bytes())
         except OSError as error:
             xacro.filestack.pop()
             raise xacro.XacroException(f"{error.strerror}: {filename}", exc=error) from None
@@ -105,11 +159,26 @@ def _expand(xacro: Any, request: dict[str, Any]) -> dict[str, Any]:
             "arguments": list(arguments), **found}  # fmt: skip
 
 
+def _restrict(xacro: Any, folders: _ReadableFolders) -> None:
+    """Restrict xacro to expressions of data, to readable folders, and to few variables."""
+    from xacro import substitution_args
+
+    from crane.formats.xacro_expressions import restrict_expressions
+
+    restrict_expressions(xacro, substitution_args)
+    xacro.open = lambda file: folders.check(file).open()  # for `load_yaml`
+    variables = {name: os.environ[name] for name in _VARIABLES if name in os.environ}
+    substitution_args.os = types.SimpleNamespace(environ=variables, path=os.path)
+
+
 def _provide_package_search(
-    folder: Path, packages: list[str], missing_packages: list[str], xacro: Any
+    request: dict[str, Any], folders: _ReadableFolders, missing_packages: list[str], xacro: Any
 ) -> None:
     """Make xacro find packages as this package does, whether ROS is installed or not."""
     from crane.common.package_search import find_file, find_package, use_load_options
+
+    folder, packages = Path(request["file"]).parent, request["packages"]
+    original_function = xacro.abs_filename_spec
 
     def share(name: str) -> str:
         here = Path(next((x for x in reversed(xacro.filestack or []) if x), folder / "x")).parent
@@ -118,18 +187,19 @@ def _provide_package_search(
         if found is None:
             missing_packages.append(name)
             raise LookupError(f"package '{name}' is not found")
+        folders.add_package(found)
         return str(found)
-
-    original_function = xacro.abs_filename_spec
 
     def absolute(name: str) -> str:
         if "://" not in name:
             return str(original_function(name))
         package = name.partition("://")[2].partition("/")[0]
         with use_load_options(packages):
-            found = find_file(name, folder)
-            if found is None and find_package(package, folder) is None:
-                missing_packages.append(package)
+            found, package_folder = find_file(name, folder), find_package(package, folder)
+        if package_folder is not None:
+            folders.add_package(package_folder)
+        elif found is None:
+            missing_packages.append(package)
         if found is None:
             raise LookupError(f"there is no '{name}'")
         return str(found)

@@ -1,18 +1,32 @@
-"""Strict reading of XML: no entities, no network access, source locations in all errors."""
+"""Strict reading of XML, and writing of the elements of URDF.
+
+Reading expands no entities, has no network access, and names source locations in all errors.
+"""
 
 import math
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
+import numpy as np
 from lxml import etree
 
 from crane.common.errors import DescriptionError, suggest_names
 from crane.common.package_search import read_plain_file
 from crane.description.findings import report_error
-from crane.description.kinematic_tree import Placement, Vector
+from crane.description.kinematic_tree import (
+    NO_LIMIT,
+    Inertial,
+    Joint,
+    Limits,
+    Link,
+    Placement,
+    Vector,
+)
 from crane.description.specification import AXISLESS_TYPES, unit_vector
 
+TENSOR_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 MAX_FILE_SIZE = 50_000_000  # bytes
 _X = (1.0, 0.0, 0.0)
 _ROOT_ELEMENTS = {  # by suffix, if not a <robot>
@@ -36,25 +50,6 @@ def set_source_location(element: etree._Element, location: str, locations: dict[
     element.sourceline = number if number < _MAX_LINE_NUMBER else 0  # 16 bits in libxml2
 
 
-class _DocumentTypeError(Exception):
-    """The file has a document type."""
-
-
-class _RootDetector:
-    """Parser target that stops at the root element or document type, in any encoding."""
-
-    def doctype(self, *_: object) -> None:
-        """Called before the declarations of the document type."""
-        raise _DocumentTypeError
-
-    def start(self, *_: object) -> None:
-        """Called at the root element."""
-        raise StopIteration
-
-    def close(self) -> None:
-        """Called at the end of a file without elements."""
-
-
 def _read_root(file: Path) -> etree._Element:
     """Read the root element of a file, without comments.
 
@@ -67,17 +62,8 @@ def _read_root(file: Path) -> etree._Element:
             f"{file}: cannot be read ({error.strerror}), check the path"
         ) from None
     if not data.strip():
-        root = _ROOT_ELEMENTS.get(file.suffix.lower(), "a <robot>")
-        raise DescriptionError(f"{file.name}: the file is empty, write {root} in it")
-    try:
-        etree.fromstring(data, etree.XMLParser(target=_RootDetector(), no_network=True))
-    except _DocumentTypeError:
-        line = data.count(b"\n", 0, max(data.find(b"<!DOCTYPE"), 0)) + 1
-        raise DescriptionError(
-            f"{file.name}:{line}: <!DOCTYPE> is not supported, remove it"
-        ) from None
-    except (StopIteration, etree.XMLSyntaxError):  # errors are reported by the actual parsing
-        pass
+        element = _ROOT_ELEMENTS.get(file.suffix.lower(), "a <robot>")
+        raise DescriptionError(f"{file.name}: the file is empty, write {element} in it")
     if b"encoding" not in data[:200] and not data.startswith((b"\xff\xfe", b"\xfe\xff")):
         try:
             data.decode("utf-8")
@@ -89,13 +75,22 @@ def _read_root(file: Path) -> etree._Element:
     parser = etree.XMLParser(
         resolve_entities=False, no_network=True, remove_comments=True, remove_pis=True
     )
+    line = data.count(b"\n", 0, max(data.find(b"<!DOCTYPE"), 0)) + 1
+    document_type_error = DescriptionError(
+        f"{file.name}:{line}: <!DOCTYPE> is not supported, remove it"
+    )
     try:
-        return etree.fromstring(data, parser)
+        root = etree.fromstring(data, parser)
     except etree.XMLSyntaxError as error:
+        if b"<!DOCTYPE" in data or re.search("amplification|reference loop", error.msg or ""):
+            raise document_type_error from None
         text = (error.msg or "broken").splitlines()[0].split(", line")[0].rstrip(" !")
         raise DescriptionError(
             f"{file.name}:{error.lineno or 1}: not XML, {text}, mend it"
         ) from None
+    if root.getroottree().docinfo.doctype:
+        raise document_type_error
+    return root
 
 
 class XmlFile:
@@ -133,6 +128,13 @@ class XmlFile:
     def error_at(self, element: etree._Element, problem: str) -> DescriptionError:
         """Return an error with the source location of an element."""
         return DescriptionError(f"{self.source_location(element)}: {problem}")
+
+    def report(self, element: etree._Element, problem: str, harmless: bool = False) -> None:
+        """Raise an error with the source location of an element, or record it.
+
+        See `crane.description.findings.report_error`.
+        """
+        report_error(self.error_at(element, problem), harmless)
 
     def check_elements(
         self,
@@ -175,9 +177,10 @@ class XmlFile:
             similar = get_close_matches(key.lower(), known_attributes, 1, 0.75)
             is_correctable = bool(similar) and element.get(similar[0]) is None
             if element.tag in closed_elements or is_correctable:
-                hint = suggest_names(known_attributes, key.lower())
-                report_error(
-                    self.error_at(element, f'unknown {key}="..." in <{element.tag}>, {hint}'),
+                self.report(
+                    element,
+                    f'unknown {key}="..." in <{element.tag}>, '
+                    f"{suggest_names(known_attributes, key.lower())}",
                     harmless=is_correctable,
                 )
             if is_correctable:
@@ -190,18 +193,17 @@ class XmlFile:
         tags = children.get(element.tag, set())
         similar = get_close_matches(child.tag.lower(), tags, 1, 0.75)
         if similar:
-            hint = suggest_names(tags, child.tag.lower())
             is_correctable = similar[0] in _REPEATABLE_ELEMENTS or element.find(similar[0]) is None
-            report_error(
-                self.error_at(child, f"unknown <{child.tag}> in <{element.tag}>, {hint}"),
+            self.report(
+                child,
+                f"unknown <{child.tag}> in <{element.tag}>, "
+                f"{suggest_names(tags, child.tag.lower())}",
                 harmless=is_correctable,
             )
             if is_correctable:
                 child.tag = similar[0]
         elif any(child.tag in x for x in children.values() if tags):
-            report_error(
-                self.error_at(child, f"<{child.tag}> has no place in <{element.tag}>, move it")
-            )
+            self.report(child, f"<{child.tag}> has no place in <{element.tag}>, move it")
 
     def single_child(self, element: etree._Element, tag: str, label: str) -> etree._Element | None:
         """Return the child with a tag, None if there is none.
@@ -211,7 +213,7 @@ class XmlFile:
         """
         found = element.findall(tag)
         if len(found) > 1:
-            report_error(self.error_at(found[1], f"{label} has {len(found)} <{tag}>, keep one"))
+            self.report(found[1], f"{label} has {len(found)} <{tag}>, keep one")
         return found[0] if found else None
 
     def number(
@@ -292,7 +294,7 @@ class XmlFile:
         axis = self.single_child(element, "axis", label)
         xyz = default if axis is None else self.vector(axis, "xyz", f"the axis of {label}", 3)
         if (unit := unit_vector(xyz)) is None:
-            report_error(self.error_at(axis, f"the axis of {label} is zero, give a direction"))
+            self.report(axis, f"the axis of {label} is zero, give a direction")
             return _X
         return unit
 
@@ -310,3 +312,75 @@ class XmlFile:
             self.vector(origin, key, f"the origin of {label}", 3, zero) for key in ("xyz", "rpy")
         )
         return (x, y, z), (roll, pitch, yaw)
+
+
+def format_numbers(values: Sequence[float] | np.ndarray) -> str:
+    """Return numbers in full precision, separated by blanks."""
+    return " ".join(repr(float(value) + 0.0) for value in np.ravel(values))
+
+
+def finite_limits(limits: Limits) -> tuple[float, float] | None:
+    """Return lower and upper limit as written in files, None for a joint without limits."""
+    if math.isinf(limits.lower) and math.isinf(limits.upper):
+        return None
+    return max(limits.lower, -NO_LIMIT), min(limits.upper, NO_LIMIT)
+
+
+def add_origin(element: etree._Element, xyz: Vector, rpy: Vector) -> None:
+    """Add an `<origin>`."""
+    etree.SubElement(element, "origin", xyz=format_numbers(xyz), rpy=format_numbers(rpy))
+
+
+def add_inertial(link: etree._Element, inertial: Inertial) -> None:
+    """Add an `<inertial>`."""
+    element = etree.SubElement(link, "inertial")
+    add_origin(element, inertial.com, inertial.rpy)
+    etree.SubElement(element, "mass", value=format_numbers([inertial.mass]))
+    tensor = zip(TENSOR_ATTRIBUTES, inertial.tensor, strict=True)
+    etree.SubElement(element, "inertia", {key: format_numbers([value]) for key, value in tensor})
+
+
+def add_link(robot: etree._Element, link: Link) -> etree._Element:
+    """Add a `<link>` with its inertial."""
+    element = etree.SubElement(robot, "link", name=link.name)
+    if link.composite_joint is not None:
+        element.set("between", link.composite_joint)
+    if link.inertial is not None:
+        add_inertial(element, link.inertial)
+    return element
+
+
+def add_joint(robot: etree._Element, joint: Joint) -> etree._Element:
+    """Add a `<joint>` with its limits.
+
+    A revolute joint without limits is continuous. URDF requires both limits of a prismatic joint
+    and of a joint that is limited on one side; 1e9 stands for no limit and is read as such.
+    """
+    limits = joint.limits
+    limit_values = finite_limits(limits)
+    is_continuous = limit_values is None and joint.kind == "revolute"
+    kind = "continuous" if is_continuous else joint.kind
+    element = etree.SubElement(robot, "joint", name=joint.name, type=kind)
+    add_origin(element, joint.xyz, joint.rpy)
+    etree.SubElement(element, "parent", link=joint.parent)
+    etree.SubElement(element, "child", link=joint.child)
+    if joint.kind in AXISLESS_TYPES:
+        return element
+    etree.SubElement(element, "axis", xyz=format_numbers(joint.axis))
+    values = {key: min(getattr(limits, key), NO_LIMIT) for key in ("effort", "velocity")}
+    if not is_continuous:
+        lower, upper = limit_values or (-NO_LIMIT, NO_LIMIT)
+        values = {"lower": lower, "upper": upper} | values
+    elif math.isinf(limits.effort) and math.isinf(limits.velocity):
+        return element
+    etree.SubElement(
+        element, "limit", {key: format_numbers([value]) for key, value in values.items()}
+    )
+    return element
+
+
+def add_friction(joint: etree._Element, viscous: float, coulomb: float) -> None:
+    """Add the `<dynamics>` of a joint that has Coulomb or viscous friction."""
+    if viscous or coulomb:
+        values = {"damping": format_numbers([viscous]), "friction": format_numbers([coulomb])}
+        etree.SubElement(joint, "dynamics", values)

@@ -1,5 +1,6 @@
 """Pumps, engine, lines, accumulators and elements of a circuit, and checks of parameters."""
 
+import itertools
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
@@ -275,14 +276,14 @@ def check_summed_pumps(supplies: dict[str, Supply]) -> None:
     Raises:
         CircuitPathError: One does not.
     """
-    for name, supply in supplies.items():
-        for other in supply.summed:
-            if other not in supplies or not supplies[other].power:
-                hint = suggest_names((x for x, y in supplies.items() if y.power), other)
-                raise CircuitPathError(
-                    (*_supply_path(name), "summed"),
-                    f"'summed' of '{name}' names '{other}', give pumps with a power, {hint}",
-                )
+    limited = [name for name, supply in supplies.items() if supply.power]
+    for name, other in ((name, x) for name, supply in supplies.items() for x in supply.summed):
+        if other not in limited:
+            raise CircuitPathError(
+                (*_supply_path(name), "summed"),
+                f"'summed' of '{name}' names '{other}', give pumps with a power, "
+                f"{suggest_names(limited, other)}",
+            )
 
 
 def check_pump_pressures(supplies: dict[str, Supply]) -> None:
@@ -292,14 +293,14 @@ def check_pump_pressures(supplies: dict[str, Supply]) -> None:
         CircuitPathError: One is not.
     """
     tank = supplies[MAIN_PUMP].tank
-    for name, supply in supplies.items():
-        for key in ("pressure", "relief"):
-            if 0 < getattr(supply, key) <= tank:
-                raise CircuitPathError(
-                    (*_supply_path(name), key),
-                    f"{key} of '{name}' is {getattr(supply, key):g} Pa, not above the tank's "
-                    f"{tank:g} Pa, give a higher one",
-                )
+    for name, key in itertools.product(supplies, ("pressure", "relief")):
+        pressure = getattr(supplies[name], key)
+        if 0 < pressure <= tank:
+            raise CircuitPathError(
+                (*_supply_path(name), key),
+                f"{key} of '{name}' is {pressure:g} Pa, not above the tank's {tank:g} Pa, give a "
+                "higher one",
+            )
 
 
 def _supply_path(name: str) -> tuple[str, ...]:

@@ -197,10 +197,8 @@ class CircuitValues:
         ]
         priority_share = clip(1.0 - largest_of(shortages), 0.0, 1.0) if shortages else 1.0
         return_pressures = [self.pressures[valve.return_a], self.pressures[valve.return_b]]
-        flows = cylinder.flows(
-            supply, return_pressures, loads.get(valve.supply, tank), priority_share
-        )
-        flows += cylinder.leak_and_relief_flows(tank)
+        load = loads.get(valve.supply, tank)
+        flows = cylinder.flows(supply, return_pressures, tank, load, priority_share)
         balance.add_flows(flows)
         nodes = list(cylinder.pressures_by_node)
         hose_flows = net_inflows_of((x for x in flows if x.path not in INTERNAL_FLOWS), nodes)

@@ -40,7 +40,6 @@ class ChamberValues:
     Attributes:
         pressure: Pressure [Pa].
         volume: Volume [m3].
-        area: Area [m2], [m3/rad].
         hose_flow: Flow through its hose into the chamber [m3/s].
         net_inflow: Inflow less the rate of the volume [m3/s].
         pressure_state_rate: Rate of the state of the pressure [Pa/s].
@@ -48,7 +47,6 @@ class ChamberValues:
 
     pressure: Scalar
     volume: Scalar
-    area: Scalar
     hose_flow: Scalar
     net_inflow: Scalar
     pressure_state_rate: Scalar
@@ -172,19 +170,33 @@ class ValveCylinderEquations:
         self,
         supply: Scalar,
         return_pressures: Sequence[Scalar],
+        tank: Scalar,
         highest_load: Scalar,
         priority_share: Scalar,
     ) -> list[Flow]:
-        """Flows through its valve and past its piston.
+        """Flows through its valve and past its piston, and leakage, relief and suction flows.
 
         Args:
             supply: Pressure of the supply [Pa].
             return_pressures: Pressures of the nodes to which A and B are drained [Pa].
+            tank: Pressure of the tank [Pa].
             highest_load: Highest load pressure of the valves of the supply [Pa].
             priority_share: Share of the inflow that priority valves leave.
         """
         float_share: Scalar = 0.0
-        flows = self._flows_between_chambers()
+        constants, (node_a, node_b) = self._constants, self.pressures_by_node
+        difference = self.pressures[0] - self.pressures[1]
+        flows = [Flow(node_a, node_b, constants["leakage"] * difference, "piston")]
+        if self._cylinder.cross_relief > 0:
+            for source, target, sign in ((node_a, node_b, 1.0), (node_b, node_a, -1.0)):
+                excess = maximum(sign * difference - constants["cross_relief"], 0.0)
+                flows.append(Flow(source, target, constants["relief_gain"] * excess, "cross"))
+        if self.valve.regeneration > 0:
+            orifice = series_coefficient(
+                constants["regeneration"] * self.inlet_openings[0], *self._outflow_restrictions(1)
+            )
+            rate = orifice * signed_square_root(maximum(-difference, 0.0))
+            flows.append(Flow(node_b, node_a, self._limit_outflow(rate, 1), "regeneration"))
         if self.valve.float_from > 0:
             excess = -self._spool_positions[0] - self._constants["float_from"]
             float_share = clip(excess * self._constants["per_float"], 0.0, 1.0)
@@ -212,31 +224,9 @@ class ValveCylinderEquations:
             )
             return_node = (self.valve.return_a, self.valve.return_b)[side]
             flows.append(Flow(node, return_node, self._limit_outflow(outflow, side), "outlet"))
-        return flows
-
-    def _flows_between_chambers(self) -> list[Flow]:
-        """Leakage past the piston, cross relief, regeneration."""
-        constants, (node_a, node_b) = self._constants, self.pressures_by_node
-        difference = self.pressures[0] - self.pressures[1]
-        flows = [Flow(node_a, node_b, constants["leakage"] * difference, "piston")]
-        if self._cylinder.cross_relief > 0:
-            for source, target, sign in ((node_a, node_b, 1.0), (node_b, node_a, -1.0)):
-                excess = maximum(sign * difference - constants["cross_relief"], 0.0)
-                flows.append(Flow(source, target, constants["relief_gain"] * excess, "cross"))
-        if self.valve.regeneration > 0:
-            orifice = series_coefficient(
-                constants["regeneration"] * self.inlet_openings[0], *self._outflow_restrictions(1)
-            )
-            rate = orifice * signed_square_root(maximum(-difference, 0.0))
-            flows.append(Flow(node_b, node_a, self._limit_outflow(rate, 1), "regeneration"))
-        return flows
-
-    def leak_and_relief_flows(self, tank: Scalar) -> list[Flow]:
-        """Leakage, relief and suction flows between both chambers and the tank."""
-        constants, flows = self._constants, []
-        for name, p in zip("ab", self.pressures, strict=True):
-            node = f"{self.joint}.{name}"
-            flows.append(Flow(node, TANK_NODE, constants[f"leakage_{name}"] * (p - tank), "leak"))
+        for side, node in enumerate(self.pressures_by_node):
+            p, leakage = self.pressures[side], constants[f"leakage_{'ab'[side]}"]
+            flows.append(Flow(node, TANK_NODE, leakage * (p - tank), "leak"))
             if self._cylinder.relief > 0:
                 rate = constants["relief_gain"] * maximum(p - constants["relief"], 0.0)
                 flows.append(Flow(node, TANK_NODE, rate, "relief"))
@@ -270,7 +260,7 @@ class ValveCylinderEquations:
             compliance = void_compliance + (compliance - void_compliance) * filled_share
         else:
             compliance = where_positive(state, compliance, void_compliance)
-        return ChamberValues(p, volume, area, hose_flow, net, net / compliance)
+        return ChamberValues(p, volume, hose_flow, net, net / compliance)
 
     def circuit_friction(self, tank: Scalar) -> Scalar:
         """Coulomb friction that seals and brake add to that of the joint [N], [N m].
@@ -406,7 +396,7 @@ def cylinder_constants(cylinder: Cylinder, valve: Valve, stroke: float) -> dict[
     return named | {"counterbalance": counterbalance}
 
 
-def spool_constants(spool: Valve | Spool) -> dict[str, float]:
+def spool_constants(spool: Valve | Spool) -> dict[str, Scalar]:
     """Constants of a spool."""
     return {
         "neutral": spool.neutral,

@@ -20,7 +20,6 @@ from crane.common.errors import InputError, LimitError, suggest_names
 from crane.common.one_line_repr import OneLineRepr, format_count
 from crane.common.package_search import LoadOptions
 from crane.common.samples import Array, as_samples, read_only_copy
-from crane.description.estimation_settings import EstimationSettings
 from crane.description.external_forces import ExternalForce, PhasedWrench
 from crane.description.force_elements import (
     AnyForceElement,
@@ -39,7 +38,7 @@ from crane.description.machine_lookup import (
 )
 from crane.description.pinocchio_conversion import add_rigid_load
 from crane.description.sensors import Sensor
-from crane.description.specification import Chain, Drive, PIGains, Task
+from crane.description.specification import Chain, Drive, EstimationSettings, PIGains, Task
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.machine.machine_checks import check_force_elements, check_limited
 from crane.machine.payload import Payload
@@ -86,6 +85,7 @@ class Machine(OneLineRepr):
         floating_base: Whether its root was made a floating base, or with which degrees of freedom.
         packages: Folders in which packages were searched for.
         arguments: Values of its file's arguments.
+        trusts_xacro: Whether its xacro files may run Python and read all files.
     """
 
     name: str
@@ -120,6 +120,7 @@ class Machine(OneLineRepr):
     floating_base: bool | tuple[str, ...]
     packages: tuple[str, ...]
     arguments: Mapping[str, str]
+    trusts_xacro: bool = False
 
     def _one_line(self) -> str:
         words = [
@@ -211,6 +212,7 @@ class Machine(OneLineRepr):
         """Text from which this machine can be loaded again, with its changes and locks.
 
         For example 'patu655 with {"changes": {"payload.mass": 200.0}, "lock": {"slew": 0.0}}'.
+        Trust in its xacro files is not part of it.
         """
         given = {
             "changes": dict(self.parameter_changes),
@@ -227,7 +229,12 @@ class Machine(OneLineRepr):
     @property
     def command_line_arguments(self) -> str:
         """Command line arguments that load this machine again, quoted for a shell."""
-        load_options = LoadOptions(self.packages, self.arguments, bool(self.floating_base))
+        load_options = LoadOptions(
+            self.packages,
+            self.arguments,
+            bool(self.floating_base),
+            trust_xacro=self.trusts_xacro,
+        )
         active, free = map(self.chosen_joints.get, ("active", "free"))
         changed = self.parameter_changes, self.locked_joints
         return command_line_arguments(self.load_name, active, free, *changed, load_options)

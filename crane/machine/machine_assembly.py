@@ -15,8 +15,7 @@ from crane.common.errors import CraneWarning, DescriptionError, MechanismError, 
 from crane.common.samples import Array
 from crane.description.findings import error_recovery, is_strict, report_error
 from crane.description.floating_bases import floating_bases
-from crane.description.inertia_feasibility import inertia_problem
-from crane.description.kinematic_tree import Joint, Link, Tree
+from crane.description.kinematic_tree import Joint, Link, Tree, inertia_problem
 from crane.description.pinocchio_conversion import inertia_from_inertial, se3_from_xyz_rpy
 from crane.description.specification import LoopSpec, MachineSpec
 from crane.machine.axis_diagnosis import find_wrong_axis

@@ -17,13 +17,14 @@ from crane.common.errors import CraneWarning, DescriptionError, InputError
 from crane.common.samples import Array
 from crane.description.findings import is_strict, report_error
 from crane.description.force_elements import AnyForceElement, GasSpring, element_name
-from crane.description.inertia_feasibility import (
+from crane.description.kinematic_tree import (
     InertiaProblem,
+    Joint,
+    Link,
     format_inertia,
     inertia_problem,
     nearest_inertia,
 )
-from crane.description.kinematic_tree import Joint, Link
 from crane.description.specification import MachineSpec
 from crane.machine.machine_assembly import assemble_tree
 
@@ -215,9 +216,8 @@ def check_force_elements(
     for item in elements:
         if item.between is None:
             closure.equations.coordinates.column(item.joint)
-        else:
-            for link in item.between:
-                find_frame(link)
+        for link in item.between or ():
+            find_frame(link)
     for problem in frame_element_problems(closure, elements):
         raise InputError(problem)
     for joint in gas_springs:

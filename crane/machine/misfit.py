@@ -106,7 +106,11 @@ def misfit(spec: MachineSpec, model: pin.Model, guess: Array) -> Misfit | None:
         passive[in_loops & ~said],
         lambda q, _: (*equations.evaluate_scaled(q), guess),
     )
-    gaps, size = _gaps(equations, guess), equations.characteristic_length
+    phi, size = equations.evaluate(guess)[0], equations.characteristic_length
+    loop_rows = [
+        (equations.loop_of_row == i) & equations.is_translation for i in range(len(spec.loops))
+    ]
+    gaps = np.array([np.linalg.norm(phi[rows]) for rows in loop_rows])  # [m]
     if not len(gaps) or gaps.max() <= FILE_PRECISION * size:
         return None
     open_loops = [
@@ -195,15 +199,6 @@ def _joints(spec: MachineSpec, loop: LoopSpec) -> set[str]:
             link = above[link].parent
         ways.append(way)
     return ways[0] ^ ways[1]
-
-
-def _gaps(equations: LoopEquations, q: Array) -> Array:
-    """(l,) distances of the loops' frames along locked translations [m]."""
-    phi = equations.evaluate(q)[0]
-    return np.array([
-        np.linalg.norm(phi[(equations.loop_of_row == i) & equations.is_translation])
-        for i in range(len(equations.loops))
-    ])  # fmt: skip
 
 
 def _change(

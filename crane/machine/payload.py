@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from crane.common.errors import InputError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import as_number, as_sample, as_samples
-from crane.description.inertia_feasibility import inertia_problem
+from crane.description.kinematic_tree import inertia_problem
 
 
 @dataclass(frozen=True, repr=False)

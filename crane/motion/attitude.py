@@ -207,7 +207,6 @@ def via_attitudes(
             "(N, 3) roll, pitch and yaw"
         )
     vectors, vector_rates = np.full_like(given_angles, np.nan), np.full_like(given_angles, np.nan)
-    times = np.ravel(time)
     previous_vector, initial_rotation = np.zeros(3), roll_pitch_yaw(np.nan_to_num(given_angles[0]))
     for i in np.flatnonzero(np.isfinite(given_angles).all(axis=1)):
         rotation = roll_pitch_yaw(given_angles[i])
@@ -220,8 +219,9 @@ def via_attitudes(
         previous_vector = vectors[i] = vector + 2 * np.pi * revolutions * axis
         if np.linalg.norm(previous_vector) > _MAX_ROTATION_ANGLE:
             raise InputError(
-                f"the attitude at {times[i]:g} s is {np.linalg.norm(previous_vector):.3g} rad "
-                f"from the first one, give at most {_MAX_ROTATION_ANGLE:g}"
+                f"the attitude at {np.ravel(time)[i]:g} s is "
+                f"{np.linalg.norm(previous_vector):.3g} rad from the first one, give at most "
+                f"{_MAX_ROTATION_ANGLE:g}"
             )
         if np.isfinite(given_rates[i]).all():
             rate_jacobian = pin.rpy.computeRpyJacobian(given_angles[i], pin.LOCAL_WORLD_ALIGNED)

@@ -93,8 +93,9 @@ class CompiledPoint:
     def _build_program(self, program: Program) -> None:
         nq, n = self._nq, self._n
         size = program.add_formula("formula", 4, self._output_expressions(Tape())).size
-        arrays = ("geometry", "place", "q", "v", "out")
-        with program.add_routine("rows", counts=("count",), arrays=arrays) as r:
+        with program.add_routine(
+            "rows", counts=("count",), arrays=("geometry", "place", "q", "v", "out")
+        ) as r:
             with r.loop(r.count) as i:
                 rows = r.q.row_pointer(i, nq), r.v.row_pointer(i, n), r.out.row_pointer(i, size)
                 r.call("formula", r.geometry, r.place, *rows)
@@ -251,24 +252,24 @@ class FrameKinematics(OneLineRepr):
         Returns:
             (3,) or (N, 3) [m/s2]; 3 + k in place of 3 with the k coordinates of an attitude.
         """
-        names = self.machine.active
         attitude_coordinates = None if attitude is None else self._attitude_coordinates(attitude)
 
         def sample_bias(q: Array, v_a: Array) -> Array:
             v = self.machine.closure.gamma(q) @ v_a
             drift = self.machine.closure.drift(q, v)
-            pinocchio_configuration = self.machine.coordinates.configuration(q)
-            pin.forwardKinematics(self._model, self._data, pinocchio_configuration, v, drift)
-            axes = pin.LOCAL_WORLD_ALIGNED
-            second = pin.getFrameClassicalAcceleration(self._model, self._data, self._frame, axes)
+            pin.forwardKinematics(
+                self._model, self._data, self.machine.coordinates.configuration(q), v, drift
+            )
+            frame = self._model, self._data, self._frame
+            second = pin.getFrameClassicalAcceleration(*frame, pin.LOCAL_WORLD_ALIGNED)
             if attitude_coordinates is None:
                 return np.array(second.linear)
-            rate = pin.getFrameVelocity(self._model, self._data, self._frame, axes)
-            rotation = pin.updateFramePlacement(self._model, self._data, self._frame).rotation
+            rate = pin.getFrameVelocity(*frame, pin.LOCAL_WORLD_ALIGNED)
+            rotation = pin.updateFramePlacement(*frame).rotation
             bend = attitude_coordinates.accelerations(rotation, rate.angular, second.angular)
             return np.concatenate([second.linear, bend])
 
-        v_a = as_samples(v_a, len(names), "v_a", names)
+        v_a = as_samples(v_a, len(self.machine.active), "v_a", self.machine.active)
         q = self.machine.closure.solve(q_a)
         is_matching_stack = q.ndim == 2 and q.shape[:1] == v_a.shape[:-1]
         if is_matching_stack and attitude_coordinates is None and self._compiled_frame is not None:
@@ -336,9 +337,12 @@ class FrameKinematics(OneLineRepr):
 
     def _spatial_tree_jacobian(self, q: Array) -> Array:
         """Linear and angular Jacobian (6, nv) of the spanning tree."""
-        configuration = self.machine.coordinates.configuration(q)
         jacobian: Array = pin.computeFrameJacobian(
-            self._model, self._data, configuration, self._frame, pin.LOCAL_WORLD_ALIGNED
+            self._model,
+            self._data,
+            self.machine.coordinates.configuration(q),
+            self._frame,
+            pin.LOCAL_WORLD_ALIGNED,
         )
         return jacobian.reshape(6, -1)  # Pinocchio returns a vector for a single joint
 
@@ -370,9 +374,10 @@ class FrameKinematics(OneLineRepr):
         else:  # for many joints a random subset
             cells = np.random.default_rng(0).integers(shape, size=(_MAX_GRID_SIZE, len(shape)))
         for cell in cells:
-            q_a = np.array([axis[i] for axis, i in zip(stroke_values, cell, strict=True)])
             try:
-                q = machine.closure.solve(q_a)
+                q = machine.closure.solve(
+                    np.array([axis[i] for axis, i in zip(stroke_values, cell, strict=True)])
+                )
             except ClosureError:
                 continue
             configurations.append((q, self.position_at_configuration(q)))

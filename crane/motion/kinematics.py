@@ -111,14 +111,13 @@ class Kinematics(FrameKinematics):
         self, attitude: ArrayLike, positions: Array
     ) -> tuple[AttitudeCoordinates, Array]:
         """Attitude coordinates of a given attitude, and its targets as flat arrays."""
-        values = np.asarray(attitude)
         stack_shape, shape = positions.shape[:-1], np.shape(attitude)
         if shape not in (stack_shape, (*stack_shape, 3), (*stack_shape, 3, 3)):
             accepted_shapes = ", ".join(
                 str((*stack_shape, *trailing_shape)) for trailing_shape in ((), (3,), (3, 3))
             )
             raise InputError(f"attitude has the shape {shape}, give one of {accepted_shapes}")
-        flat_values = as_samples(values.ravel(), values.size, "attitude")
+        flat_values = as_samples(np.ravel(attitude), np.size(attitude), "attitude")
         if shape == stack_shape:
             return self._attitude_coordinates(INCLINATION), flat_values.reshape(*stack_shape, 1)
         rotations = flat_values.reshape(shape)
@@ -174,8 +173,9 @@ class Kinematics(FrameKinematics):
                 q_a = np.clip(q_a + step[:, :, 0], machine.lower, machine.upper)
         except (ClosureError, np.linalg.LinAlgError):
             return None
-        deviation = np.abs(best_solution - curve)
-        is_near_curve = (deviation <= _INTERPOLATION_TOLERANCE * self._stroke_scales).all()
+        is_near_curve = (
+            np.abs(best_solution - curve) <= _INTERPOLATION_TOLERANCE * self._stroke_scales
+        ).all()
         tolerance = 1e-2 * _POSITION_TOLERANCE * reference_distance
         return best_solution if is_near_curve and smallest_distance.max() <= tolerance else None
 

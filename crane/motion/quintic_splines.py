@@ -82,16 +82,17 @@ def quintic_polynomials(time: Array, x: Array, v: Array, a: Array) -> PiecewiseP
     return PiecewisePolynomial(np.array(coefficients), np.asarray(time, dtype=np.float64))
 
 
-def _quintic_basis() -> Array:
-    """Matrix (6, 6) from (x, x', x'') at u = 0 and u = 1 to the coefficients of a quintic in u."""
-    d, e, f = np.array(
-        [[-1.0, -1.0, -0.5, 1.0, 0.0, 0.0], [0, -1, -1, 0, 1, 0], [0, 0, -1, 0, 0, 1]]
-    )
-    start = np.eye(6)[:3] * np.array([1.0, 1.0, 0.5])[:, None]
-    return np.vstack([start, 10 * d - 4 * e + f / 2, -15 * d + 7 * e - f, 6 * d - 3 * e + f / 2])
-
-
-_QUINTIC_BASIS = _quintic_basis()
+# rows of (d, e, f) of `quintic_polynomials` in (x, x', x'') at u = 0 and u = 1, for h = 1
+_REMAINDERS = np.array(
+    [[-1.0, -1.0, -0.5, 1.0, 0.0, 0.0], [0, -1, -1, 0, 1, 0], [0, 0, -1, 0, 0, 1]]
+)
+# matrix (6, 6) from (x, x', x'') at u = 0 and u = 1 to the coefficients of a quintic in u
+_QUINTIC_BASIS = np.vstack(
+    [
+        np.eye(6)[:3] * np.array([1.0, 1.0, 0.5])[:, None],
+        np.array([[10.0, -4.0, 0.5], [-15.0, 7.0, -1.0], [6.0, -3.0, 0.5]]) @ _REMAINDERS,
+    ]
+)
 _JERK_SCALES = np.array([6.0, 24.0, 60.0])  # of u^3, u^4, u^5, differentiated three times
 # quadratic form (6, 6) of int (x''')^2 du over 0 <= u <= 1 in (x, x', x'') at both ends
 _JERK_FORM = (
@@ -185,8 +186,8 @@ def least_jerk(time: Array, x: Array, v: Array) -> Array:
     for k in range(1, len(band)):  # rows and columns of given values
         band[k, :-k] *= is_unknown[k:] & is_unknown[:-k]
     band[0] = np.where(is_unknown, band[0], 1.0)
-    right_side = np.where(is_unknown, -product, 0.0)
-    knot_values = knots.unscale_values(y + solveh_banded(band, right_side, lower=True))
+    y += solveh_banded(band, np.where(is_unknown, -product, 0.0), lower=True)
+    knot_values = knots.unscale_values(y)
     knot_values[:, 0] = x
     return knot_values
 

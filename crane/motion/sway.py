@@ -86,10 +86,9 @@ class Sway(OneLineRepr):
             q_a[..., free] -= np.clip(newton_step, -0.5, 0.5)
             if np.abs(newton_step).max() < _EQUILIBRIUM_TOLERANCE**0.5 * 1e-3:
                 return q_a
-        names = ", ".join(self.machine.free)
         raise InputError(
-            f"what {names} carry has no stable equilibrium nearby: choose a configuration in "
-            "which it hangs"
+            f"what {', '.join(self.machine.free)} carry has no stable equilibrium nearby: choose "
+            "a configuration in which it hangs"
         )
 
     def stiffness(self, q_a: Array) -> Array:
@@ -122,8 +121,9 @@ class Sway(OneLineRepr):
             viscous friction, phi^T C phi / (2 omega phi^T M_ff phi).
         """
         omega, shapes, _ = self._modal_analysis(np.asarray(q_a, dtype=np.float64))
-        modal_damping = np.einsum("ik,i,ik->k", shapes, self._viscous, shapes)
-        return omega, np.asarray(modal_damping / (2.0 * omega))
+        return omega, np.asarray(
+            np.einsum("ik,i,ik->k", shapes, self._viscous, shapes) / (2.0 * omega)
+        )
 
     def frequency_matrix(self, q_a: Array) -> Array:
         """Matrix Omega (f, f) [rad/s] with Omega^2 = M_ff^-1 G, at an equilibrium (n,)."""
@@ -234,8 +234,9 @@ def _shaped_reference(machine: Machine, reference: Trajectory, time: Array, meth
     """Samples (N, n) of the reference, shortened by the length of the shaper, after the shaper."""
     if method == "none":
         return reference.position(time)
-    middle = reference.position(0.5 * reference.duration)
-    delays, shares = input_shaper(machine, middle, robust=method == "zvd")
+    delays, shares = input_shaper(
+        machine, reference.position(0.5 * reference.duration), robust=method == "zvd"
+    )
     remaining_duration = reference.duration - delays[-1]
     if remaining_duration <= 0:
         raise InputError(

@@ -145,7 +145,7 @@ def task_trajectory(machine: Machine, task: str) -> Trajectory:
         raise InputError(f"task '{task}' moves levers, it has no trajectory")
     closure = machine.closure
     dependencies = (
-        closure.cache_key, closure.structure, machine.home, machine.lower, machine.upper,
+        closure.equations.cache_key, closure.structure, machine.home, machine.lower, machine.upper,
         machine.active, machine.is_driven, machine.tip, task_spec.space, task_spec.duration,
         tuple((name, tuple(row)) for name, row in task_spec.coefficients.items()),
         tuple((x.time, tuple(x.point.items()), tuple(x.rates.items())) for x in task_spec.via),
@@ -154,8 +154,7 @@ def task_trajectory(machine: Machine, task: str) -> Trajectory:
     def curve(names: Sequence[str]) -> Trajectory:
         if task_spec.via:
             return via_points(*via_point_table(names))
-        coefficients = [task_spec.coefficients[name] for name in names]
-        return polynomial(coefficients, task_spec.duration)
+        return polynomial([task_spec.coefficients[name] for name in names], task_spec.duration)
 
     def via_point_table(names: Sequence[str]) -> tuple[Array, Array, Array]:
         """Times (N,), coordinates and rates (N, n) of via points, NaN where none is given."""
@@ -167,8 +166,7 @@ def task_trajectory(machine: Machine, task: str) -> Trajectory:
 
     def compute() -> Trajectory:
         if task_spec.space != "tip":
-            trajectory = curve(machine.driven_joints)
-            return _joint_trajectory(machine, trajectory, f"task '{task}': ")
+            return _joint_trajectory(machine, curve(machine.driven_joints), f"task '{task}': ")
         names = [name for name in task_spec.coordinates if name not in TIP_COORDINATES]
         return _pose_trajectory(machine, names, curve, lambda: via_point_table(names))
 
@@ -256,50 +254,34 @@ def read_path(machine: Machine, path: str | Path) -> Trajectory:
 def _path_columns(machine: Machine, table: Table) -> dict[str, str]:
     """Columns of a path by coordinate: driven joints, or the tip and its attitude."""
     joints, headings = machine.driven_joints, list(table.units)
-    present_joints = [joint for joint in joints if joint in headings]
-    is_recording = any(name.endswith((VELOCITY_SUFFIX, FORCE_SUFFIX)) for name in headings)
+    groups = [group for group in ATTITUDE_COORDINATES if any(name in headings for name in group)]
     tip = {
         axis: name
         for axis in TIP_COORDINATES
         for name in (axis, _TIP_PREFIX + axis)
         if name in headings
     }
-    if present_joints:
-        missing = [joint for joint in joints if joint not in headings]
-        if missing:
-            raise InputError(
-                f"column '{missing[0]}' is missing, a path of joints has all that are driven: "
-                f"{', '.join(joints)}"
-            )
+    if any(joint in headings for joint in joints):
         columns = {joint: joint for joint in joints}
+        hint = f"a path of joints has all that are driven: {', '.join(joints)}"
     elif tip:
-        missing = [axis for axis in TIP_COORDINATES if axis not in tip]
-        if missing:
-            raise InputError(f"column '{missing[0]}' is missing, a path of the tip has x, y, z")
         if machine.tip is None:
             raise InputError(f"'{machine.name}' has no tip, name its frame under 'tip:'")
-        groups = [
-            group for group in ATTITUDE_COORDINATES if any(name in headings for name in group)
-        ]
         if len(groups) > 1:
             raise InputError("it has an inclination and roll, pitch, yaw, give one of both")
-        for name in groups[0] if groups else ():
-            if name not in headings:
-                raise InputError(f"column '{name}' is missing beside the others of the attitude")
-        columns = tip | {name: name for group in groups for name in group}
+        columns = {axis: tip.get(axis, axis) for axis in TIP_COORDINATES}
+        columns |= {name: name for group in groups for name in group}
+        hint = "a path of the tip has x, y, z, and all or no columns of an attitude"
     else:
         raise InputError(
             f"it has no column of a path, give time and {', '.join(joints)}, or time and x, y, z"
         )
+    if missing := [name for name in columns.values() if name not in headings]:
+        raise InputError(f"column '{missing[0]}' is missing, {hint}")
     unknown = [name for name in headings if name not in (TIME, *columns.values())]
-    if unknown and not is_recording:
-        known_names = (
-            *joints,
-            *TIP_COORDINATES,
-            *(name for group in ATTITUDE_COORDINATES for name in group),
-        )
+    if unknown and not any(name.endswith((VELOCITY_SUFFIX, FORCE_SUFFIX)) for name in headings):
         raise InputError(
-            f"column '{unknown[0]}' is unknown, {suggest_names(known_names, unknown[0])}"
+            f"column '{unknown[0]}' is unknown, {suggest_names([*joints, *_UNITS], unknown[0])}"
         )
     return columns
 
@@ -344,6 +326,5 @@ def _fit_curve(
         if i in smoothed_columns:
             derivatives[:, :, i] = smoothed_columns[i].T
         else:
-            trajectory = via_points(time, points[:, [i]])
-            derivatives[:, :, i] = np.array(trajectory(knots))[:, :, 0]
+            derivatives[:, :, i] = np.array(via_points(time, points[:, [i]])(knots))[:, :, 0]
     return knots, derivatives

@@ -51,9 +51,11 @@ class Trajectory(OneLineRepr):
         self._polynomials = (curve, curve.derivative(), curve.derivative(2))
 
     def _one_line(self) -> str:
-        count = np.size(self.position(0.0))
-        summary = f"{self.duration:.6g} s of {format_count(count, 'coordinate')}"
-        return f"{type(self).__name__}({summary}{', by its tip' * (self.tip is not None)})"
+        return (
+            f"{type(self).__name__}({self.duration:.6g} s of "
+            f"{format_count(np.size(self.position(0.0)), 'coordinate')}"
+            f"{', by its tip' * (self.tip is not None)})"
+        )
 
     def position(self, time: ArrayLike) -> Array:
         """Coordinates (n,) or (N, n) at times () or (N,) [s]."""
@@ -137,8 +139,9 @@ class AdaptedTrajectory(Trajectory):
 
     def position(self, time: ArrayLike) -> Array:
         """See `Trajectory`."""
-        x = self._reference.position(np.asarray(time) * self._time_scale)
-        return self._insert_driven(x, self._start)
+        return self._insert_driven(
+            self._reference.position(np.asarray(time) * self._time_scale), self._start
+        )
 
     def _derivative(self, order: int, time: ArrayLike) -> Array:
         x = self._reference._derivative(order, np.asarray(time) * self._time_scale)

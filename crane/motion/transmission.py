@@ -76,14 +76,15 @@ class Transmission(OneLineRepr):
         self._jacobians = FrameJacobians(machine)
 
     def _one_line(self) -> str:
-        actuators = ", ".join(self.actuators)
-        return f"Transmission of '{self.machine.name}': {actuators} to {len(self.joints)} joints"
+        return (
+            f"Transmission of '{self.machine.name}': {', '.join(self.actuators)} to "
+            f"{len(self.joints)} joints"
+        )
 
     @property
     def unknown_actuators(self) -> tuple[str, ...]:
         """Active joints whose position is not known yet."""
-        is_unknown = np.isnan(self._received_values[0])
-        return tuple(np.array(self.actuators)[is_unknown].tolist())
+        return tuple(np.array(self.actuators)[np.isnan(self._received_values[0])].tolist())
 
     def update(
         self,
@@ -238,8 +239,10 @@ class Transmission(OneLineRepr):
 
     def _known_gamma(self) -> Array:
         if self._gamma is None:
-            unknown_names = ", ".join(self.unknown_actuators)
-            raise InputError(f"the configuration is not known yet, update it with {unknown_names}")
+            raise InputError(
+                "the configuration is not known yet, update it with "
+                f"{', '.join(self.unknown_actuators)}"
+            )
         return self._gamma
 
     def _joint_index(self, joint: str) -> int:

@@ -111,7 +111,8 @@ class ConfigurationSearch(Strokes):
             patch = fill_patch(
                 machine, held_coordinates, self.position_strokes, (axes[0], axes[1])
             )
-            self._patches += [] if patch is None else [patch]
+            if patch is not None:
+                self._patches.append(patch)
         if not self._patches:
             raise InputError(f"no posture of '{machine.name}' closes on the way from home")
         self.configurations = np.concatenate(

@@ -56,10 +56,6 @@ class Capacity(RatingChart):
         """Joints whose drives raise the load; all others hold."""
         return self.working_joints
 
-    def file_notes(self) -> dict[str, str]:
-        """Return the rule for the head of a file."""
-        return {"rule": self.rule.description}
-
     def pressures(self) -> dict[str, Array]:
         """Compute the pressures of the chambers that hold the rated loads at rest.
 

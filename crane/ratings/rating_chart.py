@@ -138,8 +138,8 @@ class RatingChart(RatingConditions):
         self._write_rows(path, indices, units, [self.derivatives(parameter_names)[indices]], {})
 
     def file_notes(self) -> dict[str, str]:
-        """Return further notes for the head of a file."""
-        return {}
+        """Return further notes for the head of a file: the rule."""
+        return {"rule": self.rule.description}
 
     def _write_rows(
         self,

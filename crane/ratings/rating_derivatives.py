@@ -89,14 +89,21 @@ def rating_derivatives(
         limits, (at_rest, by_coordinates, by_parameters), limits.pin_loads(at_rest, angles, q),
         angles, by_drive,
     )  # fmt: skip
-    jacobian, by_position = _position_derivatives(conditions, at_rest, by_parameters, angles)
+    # the section stands at home: positions are turned back by the slew angles
+    section, strokes = conditions.section, conditions.places.moving
+    rotations = Rotation.from_rotvec(-angles[:, None] * section.second_direction).as_matrix()
+    offsets = (rotations @ (at_rest.tip_positions - section.origin)[:, :, None])[:, :, 0]
+    jacobian, by_position = (
+        section.section_jacobian(section.origin + offsets, rotations @ derivatives)
+        for derivatives in (at_rest.tip_jacobian, by_parameters.tip_positions)
+    )
+    jacobian = jacobian[:, :, strokes]
     for i, magnitude in enumerate(magnitudes):
         active = np.flatnonzero(
             bound_magnitudes[i] <= magnitude * (1 + SIMULTANEOUS_TOLERANCE)
         ).tolist()
         if not all(j in by_q for j in active):
             continue
-        strokes = conditions.places.moving
         gradients = np.array([by_q[j][i, strokes] for j in active])
         if len(strokes) == 2:
             factor_multipliers = np.zeros(len(active))
@@ -153,26 +160,6 @@ def _bound_derivatives(
                 by_p = by_p + bound.sign * by_drive[:, k] / slope
         all_by_q[j], all_by_p[j] = by_q * share, by_p * share
     return magnitudes, all_by_q, all_by_p
-
-
-def _position_derivatives(
-    conditions: RatingConditions,
-    at_rest: StaticQuantities,
-    by_parameters: StaticQuantities,
-    angles: Array,
-) -> tuple[Array, Array]:
-    """Return dx/dq of the moving strokes (N, 2, s) and dx/dp (N, 2, k) in the section.
-
-    The section stands at home, so that positions are turned back by the slew angles (N,).
-    """
-    section, strokes = conditions.section, conditions.places.moving
-    rotations = Rotation.from_rotvec(-angles[:, None] * section.second_direction).as_matrix()
-    offsets = (rotations @ (at_rest.tip_positions - section.origin)[:, :, None])[:, :, 0]
-    positions = section.origin + offsets
-    jacobian = section.section_jacobian(positions, rotations @ at_rest.tip_jacobian)
-    return jacobian[:, :, strokes], section.section_jacobian(
-        positions, rotations @ by_parameters.tip_positions
-    )
 
 
 def _lagrange_multipliers(

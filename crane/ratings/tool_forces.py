@@ -223,10 +223,10 @@ def _direction_action(
         if direction.endswith(("tangent", "normal")):
             i = bucket_and_arm_strokes(search, joint)[0]
             sign = -1.0 if direction.startswith("-") else 1.0
-            action = PathUnitAction(i, sign * tangent_action(search, i).sign, up)
+            tangent = PathUnitAction(i, sign * tangent_action(search, i).sign, up)
             is_tangent = direction.endswith("tangent")
-            normal = None if is_tangent else _normal_action(search, action, sign)
-            return normal or action, machine.active[i] if is_tangent else None
+            action = tangent if is_tangent else _normal_action(search, tangent, sign)
+            return action, machine.active[i] if is_tangent else None
         outward = section.first_direction
         pushed = {"up": up, "down": -up, "in": -outward, "out": outward}[direction]
     else:
@@ -247,9 +247,8 @@ def _normal_action(
     """Return the reaction to a force away from the pivot, or with sign -1 towards it."""
     machine, frame, section = search.machine, search.statics.frame, search.section
     normal = np.cross(section.first_direction, section.second_direction)
-    tip_tangent = search.statics.evaluate(machine.home[None]).tip_jacobian[
-        0, :, path_action.stroke
-    ]
+    statics = search.statics.evaluate(machine.home[None])
+    tip_tangent = statics.tip_jacobian[0, :, path_action.stroke]
     angular_rate = frame_angular_jacobian(machine, frame, machine.home)[:, path_action.stroke]
     outward = np.cross(tip_tangent, angular_rate)  # r w^2, from the centre of rotation
     orientation = np.sign(np.cross(normal, tip_tangent) @ outward)

@@ -306,8 +306,11 @@ class DimensionFinder:
         )
         if optimum is None or optimum[0] <= _MIN_DEPTH:
             return None
-        if not self._reaches_ground_vertically(optimum[1]):
-            return None
+        radius, lip_height = self._lip.coordinates(optimum[1][None])[0].tolist()
+        objective, zeros = self._lip.coordinate_objective(1), np.zeros(len(positions))
+        for height in np.linspace(lip_height, self._ground, _CHECKED_POINTS)[1:].tolist():
+            if self._maximize_fixed(objective, zeros, {0: radius, 1: height}) is None:
+                return None
         return self._dimension(
             "vertical wall digging depth", optimum,
             "deepest lip with neither the bucket's floor nor its pivot beyond an upright line, "
@@ -325,15 +328,6 @@ class DimensionFinder:
             return float(direction @ floor), np.asarray(gradient)
 
         return evaluate
-
-    def _reaches_ground_vertically(self, q: Array) -> bool:
-        """Return whether the lip can move from a configuration vertically to the ground."""
-        radius, lip_height = self._lip.coordinates(q[None])[0].tolist()
-        objective, zeros = self._lip.coordinate_objective(1), np.zeros(len(self._positions))
-        return all(
-            self._maximize_fixed(objective, zeros, {0: radius, 1: height}) is not None
-            for height in np.linspace(lip_height, self._ground, _CHECKED_POINTS)[1:].tolist()
-        )
 
     def _dump_height(self, pivot: FrameSectionCoordinates) -> Dimension | None:
         lip, size = self._lip, self._size
@@ -397,12 +391,12 @@ def _front_pin_links(machine: Machine, frame: str) -> list[str]:
     """Return the frame and the links whose origins are the pins of the slewing part."""
     slewing_joint = find_slewing_joint(machine, frame)
     assert slewing_joint is not None, "it slews"
-    model = machine.model
-    slew_joint_id = model.getJointId(machine.active[slewing_joint[0]])
-    out = [frame]
-    for joint in machine.tree.moving_joints:
-        if joint.kind == "revolute" and model.existJointName(joint.name):
-            joint_id = model.getJointId(joint.name)
-            if joint_id != slew_joint_id and slew_joint_id in list(model.supports[joint_id]):
-                out.append(joint.child)
-    return out + [loop.successor for loop in machine.closure.equations.loops]
+    model, slew = machine.model, machine.active[slewing_joint[0]]
+    pins = [x for x in machine.tree.moving_joints if x.kind == "revolute" and x.name != slew]
+    carried = [
+        x.child
+        for x in pins
+        if model.existJointName(x.name)
+        and model.getJointId(slew) in list(model.supports[model.getJointId(x.name)])
+    ]
+    return [frame, *carried, *(loop.successor for loop in machine.closure.equations.loops)]

@@ -127,7 +127,10 @@ def working_range(
     except InputError:
         if bucket is not None:
             raise
-    ground_height = _ground_height(machine)
+    grounds = (getattr(force, "ground", None) for force in machine.external_forces)
+    ground_height = next(
+        (float(x.height) for x in grounds if x is not None and not x.profile), 0.0
+    )
     return WorkingRange(
         machine,
         reach.frame,
@@ -137,9 +140,3 @@ def working_range(
         level,
         tuple(DimensionFinder(reach, ground_height, pivot_joint).find_all(level)),
     )
-
-
-def _ground_height(machine: Machine) -> float:
-    """Return the height of the ground under the machine [m]; 0 if nothing touches ground."""
-    grounds = (getattr(force, "ground", None) for force in machine.external_forces)
-    return next((float(x.height) for x in grounds if x is not None and not x.profile), 0.0)

@@ -100,9 +100,11 @@ def assemble_table(
         )
     found: dict[str, np.ndarray] = {}
     for line in lines:
+        if line.heading in found:
+            raise RecordingError(
+                f"{line.source_location}: column '{line.heading}' is there twice, remove one"
+            )
         with timeseries.located_errors(line.source_location):
-            if line.heading in found:
-                raise RecordingError(f"column '{line.heading}' is there twice, remove one")
             found[line.heading] = _evaluate_expression(line.expression, arrays)
     count = max((len(x) for x in found.values() if x.ndim), default=1)
     for line in lines:

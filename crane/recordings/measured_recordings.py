@@ -1,4 +1,4 @@
-"""Recordings of real machines, completed from angles and pressures.
+"""Recordings from files and folders of runs, completed from angles and pressures.
 
 A recording (crane.recordings.recording) has the columns X and X_force for every active joint X.
 Missing ones are computed:
@@ -11,6 +11,7 @@ Missing ones are computed:
 Recorded columns are not changed. All other columns are channels.
 """
 
+import itertools
 import re
 import warnings
 from collections.abc import Mapping, Sequence
@@ -19,9 +20,11 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from crane.common.errors import CraneWarning, RecordingError
+from crane.common.errors import CraneWarning, DescriptionError, InputError, RecordingError
 from crane.common.samples import Array
+from crane.description.machine_lookup import find_machine_file, without_changes
 from crane.description.sensors import PRESSURE_PREFIX, SENSOR_PREFIX, Sensor
+from crane.formats.machine_loading import load_from_expression
 from crane.machine.machine import Machine
 from crane.recordings.measured_configurations import (
     HELD_JOINT_TOLERANCE,
@@ -46,7 +49,9 @@ from crane.recordings.recording_reader import (
     FULL_TIME_SPAN,
     TimeSpan,
     known_sensors,
+    quantities_from_readings,
     read_quantities,
+    read_sensor_readings,
 )
 from crane.recordings.sensor_discrepancy import noise_std, warn_discrepancies
 from crane.recordings.timeseries import (
@@ -59,6 +64,7 @@ from crane.recordings.timeseries import (
     table_column,
 )
 
+RECORDING, RECORDING_NPZ = "recording.csv", "recording.npz"
 _CHAMBER_PATTERN = re.compile("pressure_.+_[ab]")
 _NOISE_FACTOR = 6.0  # standard deviations, more than the extreme of a million samples
 _STROKE_TOLERANCE = 0.02  # of a stroke, for errors of sensors
@@ -89,6 +95,86 @@ def read_measured(
             the machine cannot move so.
     """
     return complete_recording(machine, read_quantities(path, machine, columns, span), path)
+
+
+def read_run(
+    path: str | Path,
+    machine: Machine | None = None,
+    columns: str | Path | None = None,
+    span: TimeSpan = FULL_TIME_SPAN,
+    required_columns: Sequence[Sequence[str]] = (),
+) -> Recording:
+    """Read the recording of a run's folder, a CSV or npz file, or a log of another program.
+
+    Args:
+        path: Folder or file.
+        machine: The recorded machine. Coordinates and forces that the file does not have are
+            computed with it, see the module's documentation. By default this is done
+            with the machine that the file names, if it has pressures or angles instead of forces.
+        columns: File that assigns the columns of a log, see `crane.recordings.logs`.
+        span: Start and end [s] of the part to read, in recorded time.
+        required_columns: Further columns that the file has to have, any one of each group, if a
+            machine is given.
+
+    Returns:
+        The recording.
+
+    Raises:
+        RecordingError: There is no recording, it is malformed, or it does not determine all
+            coordinates and forces.
+        DescriptionError: The machine that the file names is not found.
+    """
+    path = recording_file(path)
+    if machine is not None:
+        table = read_quantities(path, machine, columns, span)
+        return complete_recording(machine, table, path, required_columns)
+    table = read_sensor_readings(path, columns=columns)
+    name = table.notes.get("machine", "")
+    if name and is_measured(table):
+        machine = recorded_machine(path, name)
+        table = quantities_from_readings(table, path, machine, span)
+        return complete_recording(machine, table, path)
+    return Recording.from_table(quantities_from_readings(table, path, None, span), path)
+
+
+def recording_file(path: str | Path) -> Path:
+    """The file of a recording: the path itself, or the file in the folder of a run.
+
+    Raises:
+        RecordingError: The folder has none.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return path
+    for file in (path / RECORDING, path / RECORDING_NPZ):
+        if file.is_file():
+            return file
+    raise RecordingError(f"{path}: no {RECORDING} in this folder, give a run's folder")
+
+
+def recorded_machine(path: str | Path, name: str) -> Machine:
+    """Load the machine that a recording names.
+
+    Args:
+        path: The recording, for errors.
+        name: The machine in the recording, see `Recording.machine`.
+
+    Raises:
+        InputError: The name is empty.
+        DescriptionError: The machine is not found, or cannot be read.
+    """
+    if not name:
+        raise InputError(
+            f"{path}: does not name its machine, add --machine, or write '# machine: NAME' above "
+            "its header row"
+        )
+    try:
+        find_machine_file(without_changes(name))
+    except DescriptionError as error:
+        raise DescriptionError(
+            f"{path}: its machine is not found ({error}); add --machine to say where it is"
+        ) from None
+    return load_from_expression(name)
 
 
 def complete_recording(
@@ -310,12 +396,12 @@ def dead_length(machine: Machine, joint: str) -> float | None:
     axis = data.oMf[machine.frame(slide.child)].rotation @ np.array(slide.axis)
     bodies = machine.tree.bodies_by_link()
     smallest_deviation, length = _MAX_AXIS_DEVIATION, None
-    for one in _pin_positions(machine, data, bodies[slide.parent], joint):
-        for two in _pin_positions(machine, data, bodies[slide.child], joint):
-            along = float(axis @ (two - one))
-            axis_distance = float(np.linalg.norm(two - one - along * axis))
-            if axis_distance < smallest_deviation * along:
-                smallest_deviation, length = axis_distance / along, along
+    pins = (_pin_positions(machine, data, bodies[x], joint) for x in (slide.parent, slide.child))
+    for one, two in itertools.product(*pins):
+        along = float(axis @ (two - one))
+        axis_distance = float(np.linalg.norm(two - one - along * axis))
+        if axis_distance < smallest_deviation * along:
+            smallest_deviation, length = axis_distance / along, along
     return None if length is None else length - float(machine.home[machine.column(joint)])
 
 

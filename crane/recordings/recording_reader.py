@@ -29,11 +29,11 @@ from crane.description.sensors import (
     VALVE_SIGNAL_PREFIX,
     Sensor,
     parse_sensor_parameter,
+    quantity_names,
     quantity_unit,
     sensor_parameters,
     with_sensor_parameters,
 )
-from crane.description.sensors import quantity_names as quantity_names
 from crane.machine.machine import Machine
 from crane.recordings import logs, table_reader
 from crane.recordings.recording import IDEAL_SENSORS, SENSORS_NOTE

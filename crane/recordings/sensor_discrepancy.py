@@ -179,8 +179,10 @@ class _RedundantSensor:
     def _determining_joints(self) -> list[str]:
         configurations = self._configurations
         q = configurations.q[configurations.derivative_slice]
-        gamma = np.moveaxis(configurations.machine.closure.gamma(q), 2, 0)
-        slopes = [configurations.directional_derivative(self.quantity, q, g) for g in gamma]
+        slopes = [
+            configurations.directional_derivative(self.quantity, q, g)
+            for g in np.moveaxis(configurations.machine.closure.gamma(q), 2, 0)
+        ]
         pairs = zip(configurations.machine.active, slopes, strict=True)
         return [joint for joint, slope in pairs if np.abs(slope).max() > _ZERO_DERIVATIVE]
 
@@ -272,9 +274,8 @@ class _RedundantSensor:
         for _ in range(_MAX_ITERATIONS):
             delayed = np.interp(self.time - delay, self.time, self.expected)
             discrepancy = self.off + self.expected - delayed
-            derivative = -np.gradient(delayed, self.time)
             (zero, change, *_), residual_rms = self._fit_discrepancy(
-                [self._zero_column, derivative], discrepancy
+                [self._zero_column, -np.gradient(delayed, self.time)], discrepancy
             )
             delay += float(change)
         if delay > 0:  # a delay is causal
@@ -300,9 +301,8 @@ class _RedundantSensor:
                         - self._configurations.expected_reading(self.name, q)
                     )
                     residual_rms = float(np.sqrt(np.mean(discrepancy**2)))
-                    gamma = self._configurations.machine.closure.gamma(q)
                     derivative = -self._configurations.directional_derivative(
-                        self.name, q, gamma[:, :, i]
+                        self.name, q, self._configurations.machine.closure.gamma(q)[:, :, i]
                     )
                     if np.abs(derivative).max() < _ZERO_DERIVATIVE:
                         break

@@ -115,7 +115,7 @@ def _constraint_derivatives(machine: Machine, loop_sides: list[tuple[int, float,
         axes = (data.oMi[joint] * local).rotation
         frame = machine.model.frames[machine.frame(parent)]
         rotation = (data.oMi[frame.parentJoint] * frame.placement).rotation
-        for row in range(count):
-            if equations.loop_of_row[row] == i and equations.is_translation[row]:
-                out[row] += side * axes[:, equations.axis_of_frame1[row]] @ rotation
+        of_loop = (equations.loop_of_row[:count] == i) & equations.is_translation[:count]
+        for row in np.flatnonzero(of_loop):
+            out[row] += side * axes[:, equations.axis_of_frame1[row]] @ rotation
     return out

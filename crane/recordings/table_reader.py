@@ -199,14 +199,14 @@ def _check_sample_count(values: Array, notes: Mapping[str, str]) -> None:
         )
 
 
+@np.errstate(over="ignore")  # infinite values are reported with their name later
 def _convert_to_si(table: Table) -> Table:
     units, values = dict(table.units), table.values
     for i, (name, unit) in enumerate(table.units.items()):
         scratch_arrays.release_pages()
         if unit in SI_CONVERSIONS:
             units[name], a, b = SI_CONVERSIONS[unit]
-            with np.errstate(over="ignore"):  # infinite values are reported with their name later
-                values[:, i] = values[:, i] * a / b
+            values[:, i] = values[:, i] * a / b
         column = values[:, i]
         is_too_large = np.isfinite(column) & (np.abs(column) > _MAX_VALUE)
         if is_too_large.any():
@@ -317,10 +317,10 @@ def _shortened(cell: str) -> str:
 
 def _read_values(path: Path, header: int, lines: int, units: Mapping[str, str]) -> Array:
     """Read numbers (N, columns) below the header row, line `header` of `lines`."""
-    values, count, is_valid = scratch_arrays.empty_array(lines - header, len(units)), 0, True
+    values, count = scratch_arrays.empty_array(lines - header, len(units)), 0
     try:
-        with path.open(encoding="utf-8") as file, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # numpy warns of blank lines
+        # numpy warns of blank lines
+        with path.open(encoding="utf-8") as file, warnings.catch_warnings(action="ignore"):
             for _ in itertools.islice(file, header):
                 pass
             for line in file:
@@ -328,10 +328,8 @@ def _read_values(path: Path, header: int, lines: int, units: Mapping[str, str]) 
                 rows = np.loadtxt(block, delimiter=",", comments=None, ndmin=2)
                 if not rows.size:
                     continue
-                if rows.shape[1] != len(units):
-                    is_valid = False
-                    break
-                is_valid = is_valid and bool(np.isfinite(rows).all())
+                if rows.shape[1] != len(units) or not np.isfinite(rows).all():
+                    _raise_first_fault(path, header, units)
                 values[count : count + len(rows)] = rows
                 count += len(rows)
                 scratch_arrays.release_pages()
@@ -339,10 +337,10 @@ def _read_values(path: Path, header: int, lines: int, units: Mapping[str, str]) 
         _raise_first_fault(path, header, units)
         reason = " ".join(str(error).split())[:120]
         raise RecordingError(f"{reason}, correct the file") from None
-    if is_valid and not count:
+    if not count:
         raise RecordingError("has a header and no samples, write one row per sample")
     values = values[:count]
-    if not is_valid or (np.diff(values[:, list(units).index(TIME)]) <= 0).any():
+    if (np.diff(values[:, list(units).index(TIME)]) <= 0).any():
         _raise_first_fault(path, header, units)
     return values
 
@@ -357,8 +355,7 @@ def _read_log_values(
         ValueError: Rows have different numbers of cells.
     """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # numpy warns of a file without samples
+        with warnings.catch_warnings(action="ignore"):  # numpy warns of a file without samples
             values = np.loadtxt(rows(), delimiter=separator, comments=None, ndmin=2)
     except ValueError:
         _raise_invalid_cell(rows(), header, separator, names)

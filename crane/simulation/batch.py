@@ -50,7 +50,6 @@ class Batch(OneLineRepr):
     warnings: dict[int, str]
 
     def _one_line(self) -> str:
-        """Number of simulations, duration, and number of failures."""
         return (
             f"Batch of {format_count(len(self.q), 'simulation')}, {self.time[-1]:.6g} s in "
             f"{format_count(len(self.time), 'sample')}: {len(self.failures)} failed"
@@ -107,15 +106,11 @@ def simulate_batch(
                 f"{', '.join(active)}: simulate them apart"
             )
 
-    limit_warnings: dict[int, str] = {}
-
     def run(i: int) -> _Result:
         machine = machines[i]
         control = resolve_controller(None if controller is None else controller(machine), machine)
         machine = machine_under_control(machine, control)
         steps = count_steps(control, duration, step)
-        if text := reference_limits_text(machine, control, steps * step):
-            limit_warnings[i] = text
         dynamics = Dynamics(machine)
         found = integrate(
             dynamics,
@@ -131,12 +126,14 @@ def simulate_batch(
             raise found.stop
         time, rows = found.time, found.rows
         energy = np.hstack([rows.kinetic, rows.potential, rows.work[:, :1], rows.dissipated])
-        q_a = rows.q[:, machine.closure.active]
-        doubts = [
+        every_step = has_fixed_steps(dynamics, control, method)
+        texts = [
+            reference_limits_text(machine, control, steps * step),
             *found.notes,
-            *run_warnings(machine, time, rows, step, has_fixed_steps(dynamics, control, method)),
+            *run_warnings(machine, time, rows, step, every_step),
         ]
-        return time, q_a, rows.v_a, rows.tau, energy, "; ".join(doubts)
+        q_a = rows.q[:, machine.closure.active]
+        return time, q_a, rows.v_a, rows.tau, energy, "; ".join(filter(None, texts))
 
     results: dict[int, _Result] = {}
     failures: dict[int, str] = {}
@@ -153,7 +150,7 @@ def simulate_batch(
                 progress((len(results) + len(failures)) / len(machines))
     if not results:
         raise InputError(f"all {len(machines)} simulations failed, the first: {failures[0]}")
-    return _stack_results(results, failures, limit_warnings, len(machines))
+    return _stack_results(results, failures, len(machines))
 
 
 def _completed_runs(
@@ -166,12 +163,7 @@ def _completed_runs(
             yield futures[future], future
 
 
-def _stack_results(
-    results: dict[int, _Result],
-    failures: dict[int, str],
-    limit_warnings: dict[int, str],
-    count: int,
-) -> Batch:
+def _stack_results(results: dict[int, _Result], failures: dict[int, str], count: int) -> Batch:
     lengths = {len(result[0]) for result in results.values()}
     if len(lengths) > 1:
         raise InputError(
@@ -182,9 +174,6 @@ def _stack_results(
     for i, result in results.items():
         for stack, part in zip(stacks, result[1:5], strict=True):
             stack[i] = part
+    texts = {i: results[i][5] for i in sorted(results) if results[i][5]}
     q, v, tau, energy = stacks
-    warning_texts = {}
-    for i in sorted(results):
-        if text := "; ".join(filter(None, (limit_warnings.get(i, ""), results[i][5]))):
-            warning_texts[i] = text
-    return Batch(first[0], q, v, tau, energy, dict(sorted(failures.items())), warning_texts)
+    return Batch(first[0], q, v, tau, energy, dict(sorted(failures.items())), texts)

@@ -159,7 +159,6 @@ def _kinematic_quantity(
 
 
 def _simulation_quantity(machine: Machine) -> tuple[dict[str, int], list[Any], FormulaOutputs]:
-    """The same for the quantity "simulation"."""
     for column in find_stick_slip_columns(machine):
         joint = machine.joints[column]
         raise InputError(

@@ -9,7 +9,6 @@ import numpy as np
 
 from crane.common.errors import (
     CraneWarning,
-    InputError,
     RecordingError,
     prefix_location,
     suggest_names,
@@ -18,7 +17,7 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.progress import progress_reporter
 from crane.common.result import Result
 from crane.common.samples import Array, as_number
-from crane.control.valve_commands import ValveSignals
+from crane.control.valve_commands import ValveSignals, require_circuit
 from crane.control.valve_drive import ValveDrive
 from crane.description.sensors import SUPPLY_PRESSURE, TANK_PRESSURE, VALVE_SIGNAL_PREFIX
 from crane.machine.machine import Machine
@@ -92,7 +91,6 @@ class Comparison(Result):
     recording: Recording | None = None
 
     def _one_line(self) -> str:
-        """Duration and compared channels."""
         return (
             f"Comparison over {self.time[-1] - self.time[0]:.6g} s in {len(self.time)} samples: "
             + ", ".join(channel.name for channel in self.channels)
@@ -149,37 +147,23 @@ def replay(
     table = read_quantities(path, machine, columns, span)
     try:
         inputs = replay_inputs(machine, table)
-        drive = inputs.valve_drive(machine)
+        drive, time = inputs.valve_drive(machine), inputs.time
+        steps = int(time[-1] / step + 1e-9)
+        if steps < 1:
+            raise RecordingError(f"is shorter than a step of {step:g} s, shorten the step")
+        recording = simulate(
+            machine,
+            drive,
+            inputs.initial,
+            steps * step,
+            step,
+            label=Path(path).stem,
+            progress=progress,
+        )
+        names = recorded_columns(machine, table, recording)
     except RecordingError as error:
         raise RecordingError(prefix_location(str(path), error)) from None
-    time, initial = inputs.time, inputs.initial
-    steps = int(time[-1] / step + 1e-9)
-    if steps < 1:
-        raise RecordingError(f"{path}: is shorter than a step of {step:g} s, shorten the step")
-    recording = simulate(
-        machine, drive, initial, steps * step, step, label=Path(path).stem, progress=progress
-    )
-    try:
-        return recording, compare_channels(machine, table, recording)
-    except RecordingError as error:
-        raise RecordingError(prefix_location(str(path), error)) from None
-
-
-def compare_channels(machine: Machine, table: Table, recording: Recording) -> Comparison:
-    """Compare the channels of a measurement with those of a simulation, without the inputs.
-
-    Args:
-        machine: The simulated machine.
-        table: The measurement.
-        recording: The simulation from the same instant on.
-
-    Raises:
-        RecordingError: A channel of the file has the unit of another quantity.
-    """
-    time = table_column(table, TIME)
-    time = time - time[0]
     inside = time <= recording.time[-1] * (1 + 1e-12)
-    names = recorded_columns(machine, table, recording)
     channels = [
         ChannelComparison(
             name,
@@ -191,7 +175,7 @@ def compare_channels(machine: Machine, table: Table, recording: Recording) -> Co
             names, read_simulation(machine, recording, names).T, strict=True
         )
     ]
-    return Comparison(time[inside], tuple(channels), recording)
+    return recording, Comparison(time[inside], tuple(channels), recording)
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,27 +220,21 @@ def replay_inputs(machine: Machine, table: Table) -> ReplayInputs:
         RecordingError: The table has no signals, or is malformed.
         InputError: The machine has no valves.
     """
-    joints = machine.hydraulics.joints if machine.hydraulics else ()
-    spools = tuple(machine.hydraulics.spools) if machine.hydraulics else ()
-    if not joints:
-        raise InputError(
-            f"machine '{machine.name}' has no valves, describe its circuit under 'hydraulics' of "
-            "the machine file"
-        )
+    circuit = require_circuit(machine)
     time = table_column(table, TIME)
     time = time - time[0]
     if len(time) < 2:
         raise RecordingError("has one sample, give at least two")
     signals, pressures, missing = {}, {}, MissingMeasurements(machine, table)
     with missing.collect_errors():
-        signals = _spool_signals(machine, spools, table)
+        signals = _spool_signals(machine, tuple(circuit.spools), table)
     check_pressures(machine, table)
     supply, tank = (
         table_column(table, name, "Pa") if name in table.units else None
         for name in (SUPPLY_PRESSURE, TANK_PRESSURE)
     )
     with missing.collect_errors():
-        pressures = _initial_pressures(joints, table, time)
+        pressures = _initial_pressures(circuit.joints, table, time)
     table_with_angles = add_inclination_angles(machine, table)
     has_joint_motion = any(joint in table_with_angles.units for joint in machine.joints)
     if has_joint_motion:
@@ -312,29 +290,11 @@ def _initial_pressures(
 def _initial_motion(
     machine: Machine, table: Table, time: Array, signals: list[Array]
 ) -> tuple[Array, Array]:
-    """Initial active coordinates and velocities."""
     for text in locked_joint_conflicts(
         machine, dict(zip(table.units, table.values.T, strict=True)), table.units
     ):
         raise RecordingError(f"{text}, do not lock it, or lock it where it is")
     q_a, v_a = joint_motion(machine, table)
-    _warn_of_limits(machine, time, q_a)
-    has_moved = [np.abs(x - x[0]) > 1e-9 * max(float(np.ptp(x)), 1e-300) for x in signals]
-    # at rest until a valve moves, within bounds
-    first = min(float(time[x.argmax()]) if x.any() else np.inf for x in has_moved)
-    fit_duration = max(_START_FIT_DURATION, float(time[min(_MIN_FIT_SAMPLES, len(time)) - 1]))
-    steady = time <= max(min(first, _MAX_REST_DURATION), fit_duration)
-    states = []
-    for i, joint in enumerate(machine.active):
-        has_velocity = joint + VELOCITY_SUFFIX in table.units or joint not in table.units
-        states.append(
-            _start_of_joint(time, q_a[:, i], v_a[:, i] if has_velocity else None, steady)
-        )
-    return np.array([x for x, _ in states]), np.array([v for _, v in states])
-
-
-def _warn_of_limits(machine: Machine, time: Array, q_a: Array) -> None:
-    """Warn of measured coordinates (N, n) outside of the limits."""
     span = machine.upper - machine.lower
     excess = np.maximum(machine.lower - q_a, q_a - machine.upper)
     excess /= np.where(np.isfinite(span), span, 1.0)
@@ -347,8 +307,20 @@ def _warn_of_limits(machine: Machine, time: Array, q_a: Array) -> None:
                 f"measured '{joint}' goes to {q_a[k, i]:.6g} {unit} at t = {time[k]:.4g} s, "
                 f"beyond its limit {limit:.6g} {unit}: look at the limits and the sensor's zero",
                 CraneWarning,
-                stacklevel=5,
+                stacklevel=4,
             )
+    has_moved = [np.abs(x - x[0]) > 1e-9 * max(float(np.ptp(x)), 1e-300) for x in signals]
+    # at rest until a valve moves, within bounds
+    first = min(float(time[x.argmax()]) if x.any() else np.inf for x in has_moved)
+    fit_duration = max(_START_FIT_DURATION, float(time[min(_MIN_FIT_SAMPLES, len(time)) - 1]))
+    steady = time <= max(min(first, _MAX_REST_DURATION), fit_duration)
+    states = []
+    for i, joint in enumerate(machine.active):
+        has_velocity = joint + VELOCITY_SUFFIX in table.units or joint not in table.units
+        states.append(
+            _start_of_joint(time, q_a[:, i], v_a[:, i] if has_velocity else None, steady)
+        )
+    return np.array([x for x, _ in states]), np.array([v for _, v in states])
 
 
 def _start_of_joint(

@@ -178,11 +178,9 @@ def buried_contact_text(machine: Machine, q: Array) -> str:
     frames = FrameJacobians(machine)
     frames.set_configuration(q)
     for contact in contacts:
-        depth = contact.radius - float(
-            contact.ground.distance_and_normal(
-                frames.frame_pose(contact.frame).translation.tolist()
-            )[0]
-        )
+        position = frames.frame_pose(contact.frame).translation.tolist()
+        height = float(contact.ground.distance_and_normal(position)[0])  # type: ignore[arg-type]
+        depth = contact.radius - height
         if contact.stiffness * depth > _MAX_CONTACT_FORCE_RATIO * weight:
             return (
                 f"'{contact.name}' is {depth:.3g} m inside the ground, where its whole weight "
@@ -293,7 +291,6 @@ def friction_chatter_text(machine: Machine, time: Array, rows: LayoutView, step:
 
 
 def _energies_differ(one: Array, other: Array, tolerance: float) -> np.ndarray:
-    """Whether energies (N,) [J] differ."""
     gap = np.abs(one - other)
     return (gap > _MAX_DISSIPATION_ERROR * np.maximum(np.abs(one), np.abs(other))) & (
         gap > tolerance

@@ -20,6 +20,7 @@ from crane.common.errors import (
 )
 from crane.common.progress import progress_reporter
 from crane.common.samples import as_number
+from crane.common.threads import single_threaded_blas
 from crane.control.control_law import (
     ControlLaw,
     Controller,
@@ -244,12 +245,11 @@ def integrate(
     contact_states = np.zeros(state_count(machine.external_forces))
     energies = np.zeros(2 + len(machine.external_forces))
     state = np.concatenate([configuration, v_a, contact_states, controller_state, energies])
-    make_integrator = integrator_factory(
-        dynamics, control, len(controller_state), method, tolerance
-    )
+    count = len(controller_state)
+    make_integrator = integrator_factory(dynamics, control, count, method, tolerance)
     chart = chart or Chart.from_dynamics(dynamics)
-    integrator = ChartSwitchingIntegrator(chart, control, len(controller_state), make_integrator)
-    layout = row_layout(machine, control, len(controller_state))
+    integrator = ChartSwitchingIntegrator(chart, control, count, make_integrator)
+    layout = row_layout(machine, control, count)
     times = step * np.arange(step_count + 1, dtype=np.float64)
     # stored by columns, so that channels are views
     rows = scratch_arrays.empty_array(step_count + 1, layout.size)
@@ -271,7 +271,8 @@ def integrate(
 
     run = IntegrationResult(times, rows, layout, integrator.notes, start_text)
     try:
-        integrator.run(times[:-1], state, step, rows, report)
+        with single_threaded_blas(machine.model.nv):
+            integrator.run(times[:-1], state, step, rows, report)
         rows[-1] = integrator.final_row(times[-1], state)
     except _CommandFinishedError:
         run = run.first_instants(integrator.done, None)
@@ -301,7 +302,6 @@ def has_fixed_steps(dynamics: Dynamics, control: Controller, method: str | None)
 
 
 def _default_method(dynamics: Dynamics, control: Controller) -> str:
-    """Name of the default method."""
     if isinstance(control, ValveDrive):
         return "rosenbrock"
     return (

@@ -12,7 +12,7 @@ from crane.control.valve_drive import ValveDrive
 from crane.description.force_elements import Friction
 from crane.description.sensors import VELOCITY_SUFFIX
 from crane.dynamics.dynamics import Dynamics
-from crane.hydraulics.circuit_elements import MAIN_PUMP, Engine
+from crane.hydraulics.circuit_elements import MAIN_PUMP
 from crane.hydraulics.circuit_equations import (
     ROD_POWER,
     SHAFT_POWER,
@@ -109,9 +109,12 @@ def power_balance(machine: Machine, recording: Recording) -> PowerBalance:
     engine_power, fuel = None, None
     if hydraulics.engine is not None:
         speed = recorded.get("engine_speed") if "engine" in circuit.state_units else None
-        engine_power = shaft if speed is None else _engine_power(hydraulics.engine, speed)
-        if hydraulics.engine.fuel:
-            fuel_rate = hydraulics.engine.idle + hydraulics.engine.fuel * engine_power
+        engine, engine_power = hydraulics.engine, shaft
+        if speed is not None:  # the governor's torque
+            excess = (engine.speed + engine.speed_droop - speed) / engine.speed_droop
+            engine_power = np.asarray(engine.torque * np.clip(excess, 0.0, 1.0) * speed)
+        if engine.fuel:
+            fuel_rate = engine.idle + engine.fuel * engine_power
             fuel = float(np.trapezoid(fuel_rate, recording.time))
     return PowerBalance(
         recording.time,
@@ -123,13 +126,6 @@ def power_balance(machine: Machine, recording: Recording) -> PowerBalance:
         machine.name,
         recording.task,
     )
-
-
-def _engine_power(engine: Engine, speed: Array) -> Array:
-    torque_share = np.clip(
-        (engine.speed + engine.speed_droop - speed) / engine.speed_droop, 0.0, 1.0
-    )
-    return np.asarray(engine.torque * torque_share * speed)
 
 
 def _joint_friction(

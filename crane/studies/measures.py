@@ -100,8 +100,7 @@ def _force_measures(machine: Machine, time: Array, v_a: Array, tau: Array) -> di
     for joint in machine.driven_joints:
         i = machine.active.index(joint)
         measures[f"peak_{joint}"] = float(np.abs(tau[:, i]).max())
-        mean_square = np.trapezoid(tau[:, i] ** 2, time) / duration
-        measures[f"rms_{joint}"] = float(np.sqrt(mean_square))
+        measures[f"rms_{joint}"] = float(np.sqrt(np.trapezoid(tau[:, i] ** 2, time) / duration))
     measures["energy"] = float(np.trapezoid(np.maximum(power, 0.0).sum(axis=1), time))
     measures["work"] = float(np.trapezoid(power.sum(axis=1), time))
     measures["duration"] = duration

@@ -22,8 +22,6 @@ _OBSERVATION_TIME = 10.0  # after the motion [s]
 _STEP = 1e-2  # [s]
 DEFAULT_DAMPING_RATIO = 0.2
 
-Progress = Callable[[float], None]
-
 
 @dataclass(frozen=True)
 class SwayRow:
@@ -95,7 +93,7 @@ def sway_study(
     payloads: Sequence[float] = (0.0, 100.0, 200.0, 300.0, 400.0, 500.0),
     damping: float = DEFAULT_DAMPING_RATIO,
     changes: Mapping[str, float] | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> SwayStudy:
     """Compute the residual sway of a task, with and without each sway suppression method.
 
@@ -118,7 +116,7 @@ def sway_study(
     if not payloads:
         raise InputError("no payloads, give some masses [kg]")
     rows: list[SwayRow] = []
-    finished_count, total_count = 0, len(payloads) * len(SWAY_METHODS) * (1 + (damping > 0))
+    total_count = len(payloads) * len(SWAY_METHODS) * (1 + (damping > 0))
     for mass in payloads:
         payload_mass = as_number(mass, "the payload", "kg")
         payload_changes = {
@@ -148,9 +146,8 @@ def sway_study(
                         1.0 - residual / reference_result[1],
                     )
                 )
-                finished_count += 1
                 if progress is not None:
-                    progress(finished_count / total_count)
+                    progress(len(rows) / total_count)
     return SwayStudy(task, tuple(rows))
 
 

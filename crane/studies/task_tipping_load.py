@@ -60,8 +60,8 @@ def tipping_load(machine: Machine, task: str) -> TippingLoad:
 
     @cache
     def simulate_with(mass: float) -> Recording:
-        with warnings.catch_warnings():  # tipping is expected
-            warnings.simplefilter("ignore", CraneWarning)
+        # tipping is expected
+        with warnings.catch_warnings(action="ignore", category=CraneWarning):
             return _simulate_task(variants.machine({PAYLOAD_MASS: mass}), task)
 
     def smallest_margin(mass: float, channel: str) -> float:

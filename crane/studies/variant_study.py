@@ -20,7 +20,7 @@ from crane.common.errors import (
 )
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_count, as_samples, as_seed
-from crane.description.parameter_units import parameter_unit
+from crane.description.machine_parameters import parameter_unit
 from crane.dynamics.dynamics import Dynamics
 from crane.formats.machine_loading import MachineVariants, load
 from crane.machine.machine import Machine
@@ -54,7 +54,6 @@ _MAX_VARIANTS = 100_000
 _REQUIREMENT_TOLERANCE = 1e-9  # relative violation of a requirement that is accepted
 # first words of parameters that do not change inverse dynamics
 _NON_MECHANICAL_PREFIXES = ("control", "supply", "oil", "cylinder", "valve", "valve_control")
-Progress = Callable[[float], None]
 
 # one machine per set of formulas; variants share its machine code as long as it exists
 _CODE_OWNERS: dict[int, Machine] = {}
@@ -98,7 +97,7 @@ def study(
     seed: int = 0,
     processes: int = 1,
     scheduler: str | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> Study:
     """Measure variants of a machine: a grid of parameter values, or random draws.
 
@@ -196,8 +195,8 @@ def study(
 
 def measure_variant(study_job: StudyJob) -> tuple[dict[str, float], str]:
     """Return the columns of one variant, and the reasons for missing ones."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)  # the machine itself has given them
+    # the machine itself has given its warnings
+    with warnings.catch_warnings(action="ignore", category=CraneWarning):
         try:
             machine = load(study_job.machine, study_job.changes, study_job.locked_joints)
         except CraneError as error:

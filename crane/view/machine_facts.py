@@ -161,8 +161,9 @@ def _circuit_fact(machine: Machine) -> Iterator[MachineFact]:
         unit, size = ("cm2", 1e4) if machine.unit(joint) == "m" else ("cm3/rad", 1e6)
         areas = f"{size * cylinder.area_a:.4g} and {size * cylinder.area_b:.4g} {unit}"
         rows.append((joint, f"{kind} valve{spool_text}", areas))
-    text = f"{1e-5 * supply.pressure:.4g} bar{flow}"
-    yield MachineFact("hydraulics", text, ("", "", ""), tuple(rows))
+    yield MachineFact(
+        "hydraulics", f"{1e-5 * supply.pressure:.4g} bar{flow}", ("", "", ""), tuple(rows)
+    )
 
 
 def _sensor_facts(machine: Machine) -> Iterator[MachineFact]:

@@ -17,9 +17,9 @@ from crane.common.result import Result
 from crane.formats.machine_file.machine_writer import write_machine
 from crane.formats.machine_loading import load_from_expression
 from crane.machine.machine import Machine
+from crane.recordings.measured_recordings import RECORDING, RECORDING_NPZ
 from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import heading, result_title, summarize
-from crane.recordings.run_folder import RECORDING, RECORDING_NPZ
 
 SUMMARY, FIGURE, PAGE = "summary.md", "figure.png", "view.html"
 REPORT, MACHINE_FOLDER = "report.html", "machine"

@@ -11,11 +11,11 @@ import crane
 from crane.common.samples import Array
 from crane.control import ValveSignals
 from crane.hydraulics.hydraulic_circuit import PDGains
+from crane.identification.hydraulics.cylinder_equations import cylinder_signals
 from crane.identification.hydraulics.cylinder_friction import (
     CylinderFriction,
     identify_cylinder_friction,
 )
-from crane.identification.hydraulics.cylinder_signals import cylinder_signals
 from crane.identification.hydraulics.orifice_coefficients import (
     METHODS,
     OrificeCoefficients,

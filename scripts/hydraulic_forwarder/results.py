@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from crane.common.samples import Array
+from crane.identification.hydraulics.cylinder_equations import EquationSides
 from crane.identification.hydraulics.cylinder_friction import CylinderFriction
 from crane.identification.hydraulics.orifice_coefficients import OrificeCoefficients
-from crane.identification.hydraulics.orifice_equations import EquationSides
 from crane.identification.hydraulics.valve_curve import ValveCurve
 from crane.identification.mechanics.identification_result import Identification
 from crane.identification.signals.signal_processing import Motion

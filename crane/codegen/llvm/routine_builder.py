@@ -42,17 +42,14 @@ class RoutineValue:
     operation: str
     operands: tuple
 
-    @property
-    def _is_zero(self) -> bool:
-        return self.kind == "integer" and self.operation == "constant" and not self.operands[0]
-
     def _arithmetic_operation(self, operator: str, other: "Operand") -> "RoutineValue":
         second = as_value(other, self.kind)
-        if self.kind == "integer" and self.operation == second.operation == "constant":
+        if self.kind == "integer" and self.operation == "constant":
             a, b = self.operands[0], second.operands[0]
-            return as_value({"+": a + b, "-": a - b, "*": a * b}[operator], "integer")
-        if operator == "+" and self._is_zero:
-            return second
+            if second.operation == "constant":
+                return as_value({"+": a + b, "-": a - b, "*": a * b}[operator], "integer")
+            if operator == "+" and a == 0:
+                return second
         return RoutineValue(self.kind, operator, (self, second))
 
     def _comparison_operation(self, operator: str, other: "Operand") -> "RoutineValue":
@@ -120,11 +117,9 @@ class ArrayPointer:
         """Pointer to an element or a part."""
         return ArrayPointer(self.name, self.offset + self._element_index(index), layout)
 
-    def row_pointer(
-        self, index: "int | RoutineValue", width: int, layout: Layout | None = None
-    ) -> "ArrayPointer":
+    def row_pointer(self, index: "int | RoutineValue", width: int) -> "ArrayPointer":
         """Pointer to a row."""
-        return self.element_pointer(as_value(index, "integer") * width, layout)
+        return self.element_pointer(as_value(index, "integer") * width)
 
     def _element_index(self, index: "int | RoutineValue | str") -> RoutineValue:
         if isinstance(index, str):

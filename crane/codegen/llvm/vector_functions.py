@@ -61,8 +61,9 @@ class _VectorFunctionWriter:
     """
 
     def __init__(self, name: str, width: int):
-        self._width, self._count = width, 0
+        self.name, self._width, self._count = name, width, 0
         self.kind, self.integer_type = f"<{width} x double>", f"<{width} x i64>"
+        self.truth_type = f"<{width} x i1>"
         self._head = f"define internal {self.kind} @{name}{width}({self.kind} %x) alwaysinline {{"
         self._lines: list[str] = []
 
@@ -72,36 +73,29 @@ class _VectorFunctionWriter:
         self._lines.append(f"  %t{self._count} = {text}")
         return f"%t{self._count}"
 
-    def float_constant(self, value: float) -> str:
-        """A vector of equal floats."""
-        return "<" + ", ".join([f"double {format_real(value)}"] * self._width) + ">"
+    def word(self, value: str | float | int) -> str:
+        """A register, or a vector of equal floats or integers."""
+        if isinstance(value, str):
+            return value
+        number = f"double {format_real(value)}" if isinstance(value, float) else f"i64 {value}"
+        return "<" + ", ".join([number] * self._width) + ">"
 
-    def integer_constant(self, value: int) -> str:
-        """A vector of equal integers."""
-        return "<" + ", ".join([f"i64 {value}"] * self._width) + ">"
+    def operation(self, name: str, a: str | float | int, b: str | float | int) -> str:
+        """Emit arithmetic, of floats where the name begins with f, else of integers."""
+        kind = self.kind if name.startswith("f") else self.integer_type
+        return self.emit(f"{name} {kind} {self.word(a)}, {self.word(b)}")
 
-    def float_operation(self, operation: str, a: str, b: str) -> str:
-        """Emit arithmetic of floats."""
-        return self.emit(f"{operation} {self.kind} {a}, {b}")
-
-    def integer_operation(self, operation: str, a: str, b: str) -> str:
-        """Emit arithmetic of integers."""
-        return self.emit(f"{operation} {self.integer_type} {a}, {b}")
-
-    def fma(self, a: str, b: str, c: str) -> str:
+    def fma(self, a: str | float, b: str | float, c: str | float) -> str:
         """Fused a b + c."""
-        float_type = self.kind
-        return self.emit(
-            f"call {float_type} @llvm.fma.v{self._width}f64({float_type} {a}, {float_type} {b}, "
-            f"{float_type} {c})"
-        )
+        operands = ", ".join(f"{self.kind} {self.word(x)}" for x in (a, b, c))
+        return self.emit(f"call {self.kind} @llvm.fma.v{self._width}f64({operands})")
 
     def polynomial(self, factors: tuple[float, ...], x: str) -> str:
         """Horner's scheme."""
-        total = self.float_constant(factors[0])
+        total: str | float = factors[0]
         for factor in factors[1:]:
-            total = self.fma(total, x, self.float_constant(factor))
-        return total
+            total = self.fma(total, x, factor)
+        return self.word(total)
 
     def bits(self, x: str) -> str:
         """Bit patterns of floats."""
@@ -111,12 +105,11 @@ class _VectorFunctionWriter:
         """Floats from bit patterns."""
         return self.emit(f"bitcast {self.integer_type} {x} to {self.kind}")
 
-    def emit_select(self, comparison: str, a: str, b: str, yes: str, no: str) -> str:
+    def select(self, comparison: str, a: str, b: float, yes: str | float, no: str | float) -> str:
         """Elementwise selection by a comparison of a and b."""
-        test = self.emit(f"fcmp {comparison} {self.kind} {a}, {b}")
-        return self.emit(
-            f"select <{self._width} x i1> {test}, {self.kind} {yes}, {self.kind} {no}"
-        )
+        test = self.emit(f"fcmp {comparison} {self.kind} {a}, {self.word(b)}")
+        chosen = f"{self.kind} {self.word(yes)}, {self.kind} {self.word(no)}"
+        return self.emit(f"select {self.truth_type} {test}, {chosen}")
 
     def absolute_value(self, x: str) -> str:
         """Absolute value."""
@@ -124,158 +117,106 @@ class _VectorFunctionWriter:
 
     def round_quotient(self, x: str, divisor: float) -> tuple[str, str]:
         """Nearest integer of x / divisor: in the lowest bits of an integer, and as a float."""
-        shifted = self.fma(
-            x, self.float_constant(1.0 / divisor), self.float_constant(_ROUNDING_SHIFT)
-        )
-        return self.bits(shifted), self.float_operation(
-            "fsub", shifted, self.float_constant(_ROUNDING_SHIFT)
-        )
+        shifted = self.fma(x, 1.0 / divisor, _ROUNDING_SHIFT)
+        return self.bits(shifted), self.operation("fsub", shifted, _ROUNDING_SHIFT)
 
     def subtract_multiple(self, x: str, multiple: str, units: tuple[float, ...]) -> str:
         """Remainder x - multiple (sum of units) with extra precision."""
         back = self.emit(f"fneg {self.kind} {multiple}")
         for unit in units:
-            x = self.fma(back, self.float_constant(unit), x)
+            x = self.fma(back, unit, x)
         return x
 
     def exponential(self, x: str) -> str:
         """e^x for results below 2^1023."""
         power, twos = self.round_quotient(x, math.log(2.0))
         r = self.subtract_multiple(x, twos, _LN2)
-        square = self.float_operation("fmul", r, r)
-        top = self.float_operation("fmul", r, self.polynomial(_EXP_P, square))
-        ratio = self.float_operation(
-            "fdiv", top, self.float_operation("fsub", self.polynomial(_EXP_Q, square), top)
+        square = self.operation("fmul", r, r)
+        top = self.operation("fmul", r, self.polynomial(_EXP_P, square))
+        ratio = self.operation(
+            "fdiv", top, self.operation("fsub", self.polynomial(_EXP_Q, square), top)
         )
-        mantissa = self.fma(self.float_constant(2.0), ratio, self.float_constant(1.0))
-        exponent = self.integer_operation("add", power, self.integer_constant(1023))
-        scale = self.from_bits(self.integer_operation("shl", exponent, self.integer_constant(52)))
-        return self.float_operation("fmul", mantissa, scale)
+        mantissa = self.fma(2.0, ratio, 1.0)
+        exponent = self.operation("shl", self.operation("add", power, 1023), 52)
+        return self.operation("fmul", mantissa, self.from_bits(exponent))
 
     def finish(self, result: str) -> str:
         """The complete function."""
-        return "\n".join(
-            [
-                self._head,
-                *self._lines,
-                f"  ret {self.kind} {result}",
-                "}",
-            ]
-        )
+        return "\n".join([self._head, *self._lines, f"  ret {self.kind} {result}", "}"])
 
 
-def _define_sine_cosine(name: str, width: int) -> str:
-    text = _VectorFunctionWriter(name, width)
+def _write_sine_cosine(text: _VectorFunctionWriter) -> str:
     quarter, turns = text.round_quotient("%x", _RIGHT_ANGLE[0])
     r = text.subtract_multiple("%x", turns, _RIGHT_ANGLE)
-    square = text.float_operation("fmul", r, r)
-    sine = text.fma(text.float_operation("fmul", r, square), text.polynomial(_SIN, square), r)
-    half = text.float_operation("fmul", square, text.float_constant(0.5))
-    near = text.float_operation("fsub", text.float_constant(1.0), half)
-    lost = text.float_operation(
-        "fsub", text.float_operation("fsub", text.float_constant(1.0), near), half
-    )
-    tail = text.fma(
-        text.float_operation("fmul", square, square), text.polynomial(_COS, square), lost
-    )
-    cosine = text.float_operation("fadd", near, tail)
-    if name == "cos":
-        quarter = text.integer_operation("add", quarter, text.integer_constant(1))
-    odd = text.emit(f"trunc {text.integer_type} {quarter} to <{width} x i1>")
-    chosen = text.emit(f"select <{width} x i1> {odd}, {text.kind} {cosine}, {text.kind} {sine}")
-    second = text.integer_operation("and", quarter, text.integer_constant(2))
-    sign = text.integer_operation("shl", second, text.integer_constant(62))
-    signed = text.from_bits(text.integer_operation("xor", text.bits(chosen), sign))
-    far = text.float_constant(math.nan)
-    return text.finish(
-        text.emit_select(
-            "olt", text.absolute_value("%x"), text.float_constant(2.0**48), signed, far
-        )
-    )
+    square = text.operation("fmul", r, r)
+    sine = text.fma(text.operation("fmul", r, square), text.polynomial(_SIN, square), r)
+    half = text.operation("fmul", square, 0.5)
+    near = text.operation("fsub", 1.0, half)
+    lost = text.operation("fsub", text.operation("fsub", 1.0, near), half)
+    tail = text.fma(text.operation("fmul", square, square), text.polynomial(_COS, square), lost)
+    cosine = text.operation("fadd", near, tail)
+    if text.name == "cos":
+        quarter = text.operation("add", quarter, 1)
+    odd = text.emit(f"trunc {text.integer_type} {quarter} to {text.truth_type}")
+    chosen = text.emit(f"select {text.truth_type} {odd}, {text.kind} {cosine}, {text.kind} {sine}")
+    sign = text.operation("shl", text.operation("and", quarter, 2), 62)
+    signed = text.from_bits(text.operation("xor", text.bits(chosen), sign))
+    return text.select("olt", text.absolute_value("%x"), 2.0**48, signed, math.nan)
 
 
-def _define_tanh(name: str, width: int) -> str:
-    text = _VectorFunctionWriter(name, width)
+def _write_tanh(text: _VectorFunctionWriter) -> str:
     size = text.absolute_value("%x")
-    square = text.float_operation("fmul", "%x", "%x")
-    ratio = text.float_operation(
+    square = text.operation("fmul", "%x", "%x")
+    ratio = text.operation(
         "fdiv", text.polynomial(_TANH_P, square), text.polynomial(_TANH_Q, square)
     )
-    small = text.fma(text.float_operation("fmul", size, square), ratio, size)
+    small = text.fma(text.operation("fmul", size, square), ratio, size)
     # beyond 20 it is 1; NaN stays
-    capped = text.emit_select(
-        "ogt", size, text.float_constant(20.0), text.float_constant(20.0), size
-    )
-    grown = text.float_operation(
-        "fadd",
-        text.exponential(text.float_operation("fadd", capped, capped)),
-        text.float_constant(1.0),
-    )
-    large = text.float_operation(
-        "fsub",
-        text.float_constant(1.0),
-        text.float_operation("fdiv", text.float_constant(2.0), grown),
-    )
-    found = text.emit_select("olt", size, text.float_constant(0.625), small, large)
-    sign = text.integer_operation("and", text.bits("%x"), text.integer_constant(-(2**63)))
-    return text.finish(text.from_bits(text.integer_operation("or", text.bits(found), sign)))
+    capped = text.select("ogt", size, 20.0, 20.0, size)
+    grown = text.operation("fadd", text.exponential(text.operation("fadd", capped, capped)), 1.0)
+    large = text.operation("fsub", 1.0, text.operation("fdiv", 2.0, grown))
+    found = text.select("olt", size, 0.625, small, large)
+    sign = text.operation("and", text.bits("%x"), -(2**63))
+    return text.from_bits(text.operation("or", text.bits(found), sign))
 
 
-def _define_exponential(name: str, width: int) -> str:
-    text = _VectorFunctionWriter(name, width)
+def _write_exponential(text: _VectorFunctionWriter) -> str:
     # beyond, the power of two leaves its range; what underflows is 0
-    most, least = text.float_constant(709.0), text.float_constant(-708.0)
-    low = text.emit_select("olt", "%x", least, least, "%x")
-    inside = text.emit_select("ogt", low, most, most, low)
-    found = text.emit_select(
-        "olt", "%x", least, text.float_constant(0.0), text.exponential(inside)
-    )
-    return text.finish(text.emit_select("ogt", "%x", most, text.float_constant(math.inf), found))
+    most, least = 709.0, -708.0
+    low = text.select("olt", "%x", least, least, "%x")
+    inside = text.select("ogt", low, most, most, low)
+    found = text.select("olt", "%x", least, 0.0, text.exponential(inside))
+    return text.select("ogt", "%x", most, math.inf, found)
 
 
-def _define_logarithm(name: str, width: int) -> str:
+def _write_logarithm(text: _VectorFunctionWriter) -> str:
     """With x = 2^k (1 + f), log x = k ln 2 + f - (f^2 / 2 - s (f^2 / 2 + R(s^2)))."""
-    text = _VectorFunctionWriter(name, width)
     # the power of two that leaves sqrt(1/2) <= 1 + f < sqrt(2)
-    above = text.integer_operation(
-        "sub", text.bits("%x"), text.integer_constant(_float_bits(math.sqrt(0.5)))
-    )
-    power = text.integer_operation("ashr", above, text.integer_constant(52))
-    down = text.integer_operation("shl", power, text.integer_constant(52))
-    mantissa = text.from_bits(text.integer_operation("sub", text.bits("%x"), down))
-    f = text.float_operation("fsub", mantissa, text.float_constant(1.0))
+    above = text.operation("sub", text.bits("%x"), _float_bits(math.sqrt(0.5)))
+    power = text.operation("ashr", above, 52)
+    down = text.operation("shl", power, 52)
+    mantissa = text.from_bits(text.operation("sub", text.bits("%x"), down))
+    f = text.operation("fsub", mantissa, 1.0)
     k = text.emit(f"sitofp {text.integer_type} {power} to {text.kind}")
-    s = text.float_operation("fdiv", f, text.float_operation("fadd", f, text.float_constant(2.0)))
-    square = text.float_operation("fmul", s, s)
-    rest = text.float_operation("fmul", square, text.polynomial(_LOG, square))
-    half = text.float_operation(
-        "fmul", text.float_operation("fmul", f, text.float_constant(0.5)), f
-    )
-    high, low = (text.float_constant(part) for part in _LN2_PARTS)
-    small = text.fma(
-        s, text.float_operation("fadd", half, rest), text.float_operation("fmul", k, low)
-    )
-    found = text.fma(
-        k, high, text.float_operation("fsub", f, text.float_operation("fsub", half, small))
-    )
-    normal = text.emit_select(
-        "oge", "%x", text.float_constant(2.0**-1022), found, text.float_constant(math.nan)
-    )
-    return text.finish(
-        text.emit_select(
-            "olt", "%x", text.float_constant(math.inf), normal, text.float_constant(math.nan)
-        )
-    )
+    s = text.operation("fdiv", f, text.operation("fadd", f, 2.0))
+    square = text.operation("fmul", s, s)
+    rest = text.operation("fmul", square, text.polynomial(_LOG, square))
+    half = text.operation("fmul", text.operation("fmul", f, 0.5), f)
+    high, low = _LN2_PARTS
+    small = text.fma(s, text.operation("fadd", half, rest), text.operation("fmul", k, low))
+    found = text.fma(k, high, text.operation("fsub", f, text.operation("fsub", half, small)))
+    normal = text.select("oge", "%x", 2.0**-1022, found, math.nan)
+    return text.select("olt", "%x", math.inf, normal, math.nan)
 
 
-_DEFINITIONS = {
-    "sin": _define_sine_cosine,
-    "cos": _define_sine_cosine,
-    "exp": _define_exponential,
-    "log": _define_logarithm,
-    "tanh": _define_tanh,
+_WRITERS = {
+    "sin": _write_sine_cosine,
+    "cos": _write_sine_cosine,
+    "exp": _write_exponential,
+    "log": _write_logarithm,
+    "tanh": _write_tanh,
 }
-VECTOR_FUNCTIONS = frozenset(_DEFINITIONS)
+VECTOR_FUNCTIONS = frozenset(_WRITERS)
 
 
 def define_functions(required: Collection[tuple[str, int]]) -> str:
@@ -285,6 +226,7 @@ def define_functions(required: Collection[tuple[str, int]]) -> str:
         kind = f"<{width} x double>"
         texts.append(f"declare {kind} @llvm.fma.v{width}f64({kind}, {kind}, {kind})")
         texts.append(f"declare {kind} @llvm.fabs.v{width}f64({kind})")
-    return "\n".join(
-        [*texts, *(_DEFINITIONS[name](name, width) for name, width in sorted(required))]
-    )
+    for name, width in sorted(required):
+        writer = _VectorFunctionWriter(name, width)
+        texts.append(writer.finish(_WRITERS[name](writer)))
+    return "\n".join(texts)

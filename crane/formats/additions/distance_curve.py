@@ -103,10 +103,14 @@ class DistanceCurve:
                 half.append(samples[k])
                 k += step
             if 0 <= k < len(samples):
-                beyond = self.values[k]
                 half.append(
                     last_closed_sample(
-                        self.machine, self.joint, half[-1], beyond, resolution, is_driven_at
+                        self.machine,
+                        self.joint,
+                        half[-1],
+                        self.values[k],
+                        resolution,
+                        is_driven_at,
                     )
                 )
         return start_index, DistanceCurve.from_samples(
@@ -217,7 +221,6 @@ def _scan_joint_range(
 def _samples_outwards(
     machine: Machine, joint: str, sample: RangeSample, values: Sequence[float]
 ) -> list[RangeSample]:
-    """Return configurations at successive coordinates, up to the last one that closes."""
     found: list[RangeSample] = []
     for value in values:
         configuration = _solve_at(machine, joint, value, sample[1])
@@ -355,8 +358,9 @@ def warn_about_strokes(machine: Machine, name: str) -> None:
     index, home = machine.active.index(name), machine.home
     tolerance, unreachable = _RESOLUTION * machine.upper[index], []
     for end in (float(machine.lower[index]), float(machine.upper[index])):
-        start = float(home[machine.column(name)]), home
-        last_stroke, _ = last_closed_sample(machine, name, start, end, tolerance)
+        last_stroke, _ = last_closed_sample(
+            machine, name, (float(home[machine.column(name)]), home), end, tolerance
+        )
         if abs(end - last_stroke) > tolerance:
             unreachable.append(f"{min(last_stroke, end):.4g} to {max(last_stroke, end):.4g} m")
     if unreachable:

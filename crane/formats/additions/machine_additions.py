@@ -176,7 +176,6 @@ def add_cylinder(
 
 
 def _choice_notes(distances: DistanceCurve, start_index: int, shares_load: bool) -> list[str]:
-    """Return notes on the choice of the driven joint and of the home configuration."""
     notes = []
     if distances.alternative_joints and not shares_load:
         notes.append(
@@ -318,7 +317,7 @@ def add_loops(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
         loaded = load(machine, packages=packages, arguments=arguments)
-        with use_load_options(loaded.packages, loaded.arguments):
+        with use_load_options(loaded.packages, loaded.arguments, trust_xacro=loaded.trusts_xacro):
             spec = read_machine_spec(machine)
     proposed_loops = propose_loops(spec, loaded.model, loaded.home)
     if not proposed_loops:

@@ -1,10 +1,11 @@
 """Search for loops that a description leaves open.
 
 There are three indications: frames that are named as the two ends of a loop (see
-`crane.formats.machine_file.open_loop_warning`), ends of bodies that coincide at home, and a barrel
-and a rod on two bodies that point at each other.
+`crane.formats.machine_file.structure_sections`), ends of bodies that coincide at home, and a
+barrel and a rod on two bodies that point at each other.
 """
 
+import itertools
 import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ from crane.common.samples import Array
 from crane.description.kinematic_tree import Joint, Vector, to_vector
 from crane.description.specification import LoopSpec, MachineSpec
 from crane.formats.additions.steel_cylinder import joints_between
-from crane.formats.machine_file.open_loop_warning import loop_end_pairs
+from crane.formats.machine_file.structure_sections import loop_end_pairs
 
 # largest gaps relative to the characteristic length, the second without a common normal
 _MAX_GAP_SHARE = 0.05
@@ -92,45 +93,46 @@ class _OpenLoopSearch:
         self.characteristic_length = float(np.linalg.norm(np.ptp(points, axis=0)))
         given = (link.inertial for link in spec.tree.links.values())
         self.largest_mass = max((one.mass for one in given if one is not None), default=0.0)
-        self.loop_frames = {frozenset((loop.predecessor, loop.successor)) for loop in spec.loops}
 
     def find_proposals(self) -> list[LoopProposal]:
         """Return all proposals, at most one for each pair of bodies."""
         proposed: list[LoopProposal] = []
         names = {loop.name for loop in self.spec.loops}
-        closed_bodies = {self._bodies_of(pair) for pair in self.loop_frames}
-        used_frames = {frame for pair in self.loop_frames for frame in pair}
+        loop_frames = [(loop.predecessor, loop.successor) for loop in self.spec.loops]
+        closed_bodies = {self._bodies_of(pair) for pair in loop_frames}
+        used_frames = {frame for pair in loop_frames for frame in pair}
 
         def frame_distance(proposal: LoopProposal) -> float:
             ends = proposal.loop.predecessor, proposal.loop.successor
             first, second = (self.placements[end].translation for end in ends)
             return float(np.linalg.norm(second - first))
 
-        for group in (self._named_proposals(), self._slide_proposals(), self._meeting_proposals()):
-            for proposal in sorted(group, key=frame_distance):
-                ends = {proposal.loop.predecessor, proposal.loop.successor}
-                if self._bodies_of(ends) in closed_bodies or ends & used_frames:
-                    continue
-                name, number = proposal.loop.name, 2
-                while name in names:
-                    name, number = f"{proposal.loop.name}_{number}", number + 1
-                names.add(name)
-                proposed.append(replace(proposal, loop=replace(proposal.loop, name=name)))
-                closed_bodies.add(self._bodies_of(ends))
-                used_frames |= ends
+        groups = self._named_proposals(), self._slide_proposals(), self._meeting_proposals()
+        for proposal in [x for group in groups for x in sorted(group, key=frame_distance)]:
+            ends = {proposal.loop.predecessor, proposal.loop.successor}
+            if self._bodies_of(ends) in closed_bodies or ends & used_frames:
+                continue
+            stem = proposal.loop.name
+            numbered = (f"{stem}_{number}" for number in itertools.count(2))
+            name = next(x for x in itertools.chain([stem], numbered) if x not in names)
+            names.add(name)
+            proposed.append(replace(proposal, loop=replace(proposal.loop, name=name)))
+            closed_bodies.add(self._bodies_of(ends))
+            used_frames |= ends
         return proposed
 
     def _named_proposals(self) -> Iterator[LoopProposal]:
         for name, first, second in loop_end_pairs(self.spec.tree):
-            if len(self._bodies_of((first, second))) == 2:
-                kind, axis = self._loop_type_and_axis(first, second)
-                if re.match(r"closed?_?loop", name, re.IGNORECASE):  # example-parallel-robots
-                    kind, axis = "spherical" if "3d" in name.lower() else "fixed", _Z
-                yield LoopProposal(
-                    LoopSpec(name, kind, first, second, axis, ""),
-                    self._gap(first, second),
-                    is_named=True,
-                )
+            if len(self._bodies_of((first, second))) < 2:
+                continue
+            kind, axis = self._loop_type_and_axis(first, second)
+            if re.match(r"closed?_?loop", name, re.IGNORECASE):  # example-parallel-robots
+                kind, axis = "spherical" if "3d" in name.lower() else "fixed", _Z
+            yield LoopProposal(
+                LoopSpec(name, kind, first, second, axis, ""),
+                self._gap(first, second),
+                is_named=True,
+            )
 
     def _slide_proposals(self) -> Iterator[LoopProposal]:
         """Yield loops between a barrel and a rod, each on its own pin."""
@@ -224,7 +226,6 @@ class _OpenLoopSearch:
         return inertial is None or inertial.mass <= _MAX_DUMMY_MASS * min(1.0, self.largest_mass)
 
     def _is_away_from_origin(self, link: str) -> bool:
-        """Whether a frame is not at the origin of its body."""
         return bool(
             np.abs(
                 self.placements[link].translation - self.placements[self.bodies[link]].translation
@@ -236,7 +237,6 @@ class _OpenLoopSearch:
         return frozenset(self.bodies[link] for link in pair)
 
     def _joints_between(self, first: str, second: str) -> list[Joint]:
-        """Return the movable joints of the tree between two links."""
         return sorted(
             joints_between(self.parent_joints, first, second), key=lambda joint: joint.name
         )

@@ -16,7 +16,7 @@ from crane.description.kinematic_tree import Inertial, Joint, Limits, Link, Vect
 from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
 from crane.description.specification import LoopSpec
 from crane.formats.machine_file.machine_writer import MachineDraft, loop_data
-from crane.formats.urdf_elements import add_joint, add_link, add_origin, format_numbers
+from crane.formats.xml_file import add_joint, add_link, add_origin, format_numbers
 from crane.machine.machine import Machine
 
 STEEL_DENSITY = 7850.0  # [kg/m3]
@@ -230,10 +230,7 @@ def _tube_inertia(start: float, end: float, inner: float, outer: float) -> pin.I
 
 
 def _total_inertial(*inertias: pin.Inertia) -> Inertial:
-    whole = inertias[0]
-    for part in inertias[1:]:
-        whole = whole + part
-    found = inertial_from_inertia(whole)
+    found = inertial_from_inertia(sum(inertias[1:], start=inertias[0]))
     assert found is not None
     return found
 
@@ -241,8 +238,11 @@ def _total_inertial(*inertias: pin.Inertia) -> Inertial:
 def _add_cylinder_visual(link: etree._Element, start: float, end: float, diameter: float) -> None:
     visual = etree.SubElement(link, "visual")
     add_origin(visual, ((start + end) / 2, 0, 0), (0, math.pi / 2, 0))
-    size = {"radius": format_numbers([diameter / 2]), "length": format_numbers([end - start])}
-    etree.SubElement(etree.SubElement(visual, "geometry"), "cylinder", size)
+    etree.SubElement(
+        etree.SubElement(visual, "geometry"),
+        "cylinder",
+        {"radius": format_numbers([diameter / 2]), "length": format_numbers([end - start])},
+    )
 
 
 _OFFSET_TOLERANCE = 1e-6  # relative to the cylinder's length
@@ -303,9 +303,10 @@ def add_barrel_and_rod(
         )
     )
     home = dict(zip(machine.joints, q.tolist(), strict=True))
-    pins = [f"{name}_pin"] if is_planar else [f"{name}_pin_y", f"{name}_pin_z"]
     draft.data["home"] = (
-        home | dict.fromkeys(pins, 0.0) | {name: length - cylinder.retracted_length}
+        home
+        | dict.fromkeys([f"{name}_pin"] if is_planar else [f"{name}_pin_y", f"{name}_pin_z"], 0.0)
+        | {name: length - cylinder.retracted_length}
     )
     return notes
 
@@ -318,13 +319,10 @@ def _plane_normal(
     jacobian = pin.computeJointJacobians(
         machine.model, data, machine.coordinates.configuration(q)
     ).reshape(6, -1)
-    revolute_axes, prismatic_axes = [], []
-    for joint in joints_between(machine.tree.parent_joints, points[0].link, points[1].link):
-        column = jacobian[:, machine.column(joint.name)]
-        if joint.kind == "revolute":
-            revolute_axes.append(column[3:])
-        else:
-            prismatic_axes.append(column[:3])
+    joints = joints_between(machine.tree.parent_joints, points[0].link, points[1].link)
+    columns = {joint.name: jacobian[:, machine.column(joint.name)] for joint in joints}
+    revolute_axes = [columns[joint.name][3:] for joint in joints if joint.kind == "revolute"]
+    prismatic_axes = [columns[joint.name][:3] for joint in joints if joint.kind == "prismatic"]
     if revolute_axes:
         normal = revolute_axes[0]
     else:
@@ -355,7 +353,6 @@ def _cylinder_urdf(
             Joint(f"{name}_pin_z", "revolute", cross, barrel, "", axis=_Z),
         ]
     links += [Link(barrel, "", cylinder.barrel_inertial), Link(rod, "", cylinder.rod_inertial)]
-    limits = Limits(0.0, cylinder.stroke, cylinder.max_force)
     slide = Joint(
         name,
         "prismatic",
@@ -364,7 +361,7 @@ def _cylinder_urdf(
         "",
         to_vector(np.array([cylinder.retracted_length, 0, 0])),
         axis=_X,
-        limits=limits,
+        limits=Limits(0.0, cylinder.stroke, cylinder.max_force),
     )
     for link in links:
         add_link(robot, link)

@@ -230,7 +230,6 @@ def _check_machine(
 
 
 def _format_group(findings: list[Finding]) -> str:
-    """Return findings of one kind as one line."""
     other_lines = [str(one.line) for one in findings[1:] if one.line]
     if len(findings) == 1:
         return str(findings[0])
@@ -240,7 +239,6 @@ def _format_group(findings: list[Finding]) -> str:
 
 
 def _next_command(command_arguments: str, spec: MachineSpec, closure: Closure) -> str:
-    """Return the suggested next command for a machine given as command line arguments."""
     if closure.home_search is not None and is_simulator_file(spec.path):
         return f"crane convert {command_arguments} {portable_file_name(spec.name)}"
     if closure.home_search is not None:

@@ -70,7 +70,6 @@ def check_mechanism(spec: MachineSpec, findings: Findings) -> Closure | None:
 def _report_with_gaps(
     spec: MachineSpec, model: pin.Model, initial_guess: Array, error: MechanismError
 ) -> None:
-    """Record an error; if loops stay open, record the gap of each."""
     gaps = {}
     if isinstance(error, OpenLoopError):
         gaps, error = (
@@ -121,7 +120,6 @@ def _loop_gaps(spec: MachineSpec, model: pin.Model, initial_guess: Array) -> dic
 
 
 def _warn_about_limits(spec: MachineSpec, closure: Closure) -> None:
-    """Warn of passive joints outside of their limits at home."""
     coordinates = closure.equations.coordinates
     is_within_limits = within_limits(closure.equations, closure.home)
     for column in closure.passive:

@@ -14,7 +14,7 @@ from lxml import etree
 from crane.common.errors import CraneWarning
 from crane.common.plausible_ranges import LONGEST
 from crane.common.samples import Array
-from crane.description.inertia_feasibility import inertia_problem
+from crane.description.kinematic_tree import inertia_problem
 from crane.description.specification import MachineSpec
 from crane.formats.visuals.urdf_shapes import MeshShape, UrdfShapes, Visual, read_shapes
 from crane.formats.xml_file import XmlFile
@@ -33,6 +33,14 @@ Bounds = tuple[Array, Array]
 _MAX_DEMAND_RATIO = 1.01  # of the flow of its valves to the flow of a pump
 _MAX_PRESSURE_RISE = 0.1  # of a line, relative to the pressure of its pump
 _LITRES_PER_MINUTE = 6e4  # in 1 m3/s
+_MISSING_INPUT_TEXTS = {  # by type of control that needs valves, or their open centres
+    "load-sensing": "senses the load of its valves and has none, so that it stays at its standby, "
+    "let it feed a valve",
+    "positive": "gives what its valves ask for and has none, so that it gives nothing, let it "
+    "feed a valve",
+    "negative": "senses the flow through open centres and no valve of it has one, so that it "
+    "always gives all, add 'centre' to its valves",
+}
 
 
 def read_numbers(element: etree._Element | None, key: str, count: int) -> Array | None:
@@ -43,15 +51,6 @@ def read_numbers(element: etree._Element | None, key: str, count: int) -> Array 
     except ValueError:
         return None
     return found if found.shape == (count,) and np.isfinite(found).all() else None
-
-
-def bounds_by_link(visuals: Sequence[Visual]) -> dict[str, Bounds]:
-    """Return lowest and highest corner (3,) [m] of the shapes of each link, in its frame."""
-    corners: dict[str, list[Array]] = {}
-    for visual in visuals:
-        corners.setdefault(visual.link, []).append(visual.bounding_corners())
-    points = {link: np.concatenate(found) for link, found in corners.items()}
-    return {link: (found.min(axis=0), found.max(axis=0)) for link, found in points.items()}
 
 
 _REVOLUTION = 2 * math.pi
@@ -73,7 +72,7 @@ def warn_about_implausible_values(files: Sequence[XmlFile], spec: MachineSpec | 
             continue
         joint_distances = _joint_distances(xml)
         # of visuals, or of collisions for links without visuals
-        bounds = bounds_by_link(shapes.shapes["collision"]) | bounds_by_link(
+        bounds = _bounds_by_link(shapes.shapes["collision"]) | _bounds_by_link(
             shapes.shapes["visual"]
         )
         for link in xml.root.iterfind("link"):
@@ -81,6 +80,15 @@ def warn_about_implausible_values(files: Sequence[XmlFile], spec: MachineSpec | 
             _warn_about_body(xml, link, joint_distances.get(name, 0.0), bounds.get(name))
     if spec is not None:
         _warn_about_home(spec)
+
+
+def _bounds_by_link(visuals: Sequence[Visual]) -> dict[str, Bounds]:
+    """Return lowest and highest corner (3,) [m] of the shapes of each link, in its frame."""
+    corners: dict[str, list[Array]] = {}
+    for visual in visuals:
+        corners.setdefault(visual.link, []).append(visual.bounding_corners())
+    points = {link: np.concatenate(found) for link, found in corners.items()}
+    return {link: (found.min(axis=0), found.max(axis=0)) for link, found in points.items()}
 
 
 def _warn(text: str) -> None:
@@ -329,24 +337,9 @@ def _pump_problems(hydraulics: Hydraulics) -> Iterator[tuple[str, str]]:
         key = f"supply {name}"
         if name == MAIN_PUMP and name not in connected:
             yield key, f"nothing is joined to '{name}', let it feed a valve: the others need none"
-        if supply.control == "load-sensing" and not valves:
-            yield (
-                key,
-                f"'{name}' senses the load of its valves and has none, so that it stays at its "
-                "standby, let it feed a valve or choose another control",
-            )
-        if supply.control == "positive" and not valves:
-            yield (
-                key,
-                f"'{name}' gives what its valves ask for and has none, so that it gives nothing, "
-                "let it feed a valve or choose another control",
-            )
-        if supply.control == "negative" and not any(x.centre > 0 for x in valves):
-            yield (
-                key,
-                f"'{name}' senses the flow through open centres and no valve of it has one, so "
-                "that it always gives all, add 'centre' to its valves or choose another control",
-            )
+        has_input = any(x.centre > 0 or supply.control != "negative" for x in valves)
+        if supply.control in _MISSING_INPUT_TEXTS and not has_input:
+            yield key, f"'{name}' {_MISSING_INPUT_TEXTS[supply.control]} or choose another control"
         has_controlled_pressure = supply.control != "fixed" and supply.relief > 0
         if has_controlled_pressure and supply.relief <= supply.pressure:
             yield (

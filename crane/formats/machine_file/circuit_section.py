@@ -6,7 +6,7 @@ import itertools
 import math
 import string
 import warnings
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,8 @@ from crane.common.plausible_ranges import implausible_value_text
 from crane.description.circuit_schema import AREA_KEYS, BORE_KEYS, ORIFICE_KEYS
 from crane.description.findings import FollowUpError, UnknownNames, error_recovery, report_error
 from crane.formats.machine_file.structure_sections import TreeBuilder
-from crane.formats.machine_file.yaml_parser import MAX_FILE_SIZE
 from crane.formats.machine_file.yaml_section import YamlSection
+from crane.formats.machine_file.yaml_text import MAX_FILE_SIZE
 from crane.hydraulics.circuit_elements import MAIN_PUMP, Supply
 from crane.hydraulics.components import (
     COUNTERBALANCE_KEYS,
@@ -70,16 +70,8 @@ def read_hydraulics(
     driving_joints = section.known_item_names("cylinders") + section.known_item_names("motors")
     check_joint = partial(check_active_joint, active)
 
-    def read_cylinder(joint: str, item: YamlSection) -> Cylinder:
-        return _read_cylinder(joint, item, tree, supply)
-
-    def read_motor(joint: str, item: YamlSection) -> Cylinder:
-        if joint in cylinders:
-            raise item.error_at(None, f"'{joint}' has a cylinder and a motor, keep one of them")
-        return _read_motor(joint, item, supply)
-
-    cylinders = section.read_map("cylinders", read_cylinder, check_joint)
-    cylinders |= section.read_map("motors", read_motor, check_joint)
+    cylinders = section.read_map("cylinders", partial(_read_cylinder, tree, supply), check_joint)
+    cylinders |= section.read_map("motors", partial(_read_motor, cylinders, supply), check_joint)
     valves = section.read_map("valves", _read_valve, check_joint)
     joints_by_component = {"cylinder": driving_joints, "valve": section.known_item_names("valves")}
     named_joints = (*driving_joints, *joints_by_component["valve"])
@@ -187,7 +179,6 @@ def read_component(
 def _warn_about_unit(
     section: YamlSection, key: str, value: float, is_rotary: bool = False
 ) -> None:
-    """Warn about a number that is possible and hardly in its SI unit."""
     text = implausible_value_text(key, value, is_rotary, section.schema.component)
     if text and math.isfinite(value):
         warnings.warn(
@@ -198,7 +189,6 @@ def _warn_about_unit(
 
 
 def _check_relief(section: YamlSection, supply: Supply | None, cylinder: Cylinder) -> None:
-    """A cylinder's relief beside the supply, which may have been refused."""
     if supply is None:
         return
     section.create(check_relief_pressure, supply, cylinder)
@@ -217,7 +207,7 @@ def _check_relief(section: YamlSection, supply: Supply | None, cylinder: Cylinde
 
 
 def _read_cylinder(
-    joint: str, item: YamlSection, tree: TreeBuilder, supply: Supply | None
+    tree: TreeBuilder, supply: Supply | None, joint: str, item: YamlSection
 ) -> Cylinder:
     if missing_limit := tree.missing_limit_text(joint):
         report_error(
@@ -259,8 +249,12 @@ def _read_cylinder(
     return cylinder
 
 
-def _read_motor(joint: str, item: YamlSection, supply: Supply | None) -> Cylinder:
+def _read_motor(
+    cylinders: Container[str], supply: Supply | None, joint: str, item: YamlSection
+) -> Cylinder:
     """A motor as a cylinder with equal areas; its joint turns slower by the gear."""
+    if joint in cylinders:
+        raise item.error_at(None, f"'{joint}' has a cylinder and a motor, keep one of them")
     values = item.values()
     size = {key: values.pop(key, 1.0) for key in ("displacement", "gear", "volume")}
     for key, value in size.items():
@@ -364,11 +358,6 @@ def _read_curve(item: YamlSection, key: str) -> tuple[float, OpeningCurve] | Non
         raise item.error_at(key, f"'{key}' of {item.title}: {error}") from None
 
 
-def curve_data(coefficient: float, curve: OpeningCurve) -> dict[str, object]:
-    """A curve as a machine file has it, to the last bit."""
-    return {"coefficient": coefficient, "shape": [list(point) for point in curve.points]}
-
-
 def _normalize_curve(points: Sequence[tuple[float, float]]) -> tuple[float, OpeningCurve]:
     coefficient = max((value for _, value in points), default=0.0)
     return coefficient, OpeningCurve(
@@ -384,7 +373,6 @@ def _read_pairs(item: YamlSection, key: str) -> Sequence[tuple[float, float]]:
 
 
 def _read_csv_table(path: Path) -> tuple[str, Sequence[tuple[float, float]]]:
-    """What a file has over |u|, and its points."""
     try:
         rows = list(
             csv.DictReader(
@@ -412,7 +400,6 @@ def _read_csv_table(path: Path) -> tuple[str, Sequence[tuple[float, float]]]:
 
 
 def _coefficient_factor(section: YamlSection, quantity: str) -> float:
-    """Coefficient per what is given."""
     if quantity == "coefficient":
         return 1.0
     if quantity == "flow":
@@ -420,5 +407,4 @@ def _coefficient_factor(section: YamlSection, quantity: str) -> float:
         if not drop > 0:
             raise InputError("'drop' is 0, give the pressure drop that the flows were measured at")
         return 1.0 / math.sqrt(drop)
-    discharge = section.number("discharge")
-    return discharge * math.sqrt(2.0 / section.number("density"))
+    return section.number("discharge") * math.sqrt(2.0 / section.number("density"))

@@ -104,19 +104,31 @@ def read_external_forces(
         with error_recovery():
             values = section.values()
             contact_law |= {key: values.pop(key) for key in CONTACT_LAW_KEYS if key in values}
-            if "profile" in section:
-                values["profile"] = tuple(map(tuple, section.rows("profile")))
-            ground = section.create(Ground, **values)
+            rows = section.rows("profile") if "profile" in section else ()
+            ground = section.create(Ground, profile=tuple(map(tuple, rows)), **values)
 
     def read_contact(item: YamlSection) -> Contact:
         frame = _read_moving_frame(item, tree)
         _check_section(top, item, "contacts without a ground", "ground", "{height: 0}")
         return item.create(Contact, frame, ground, **contact_law | item.values("frame"))
 
+    soil_section, soil = top.section("soil"), None
+    if soil_section is not None:
+        with error_recovery():
+            soil = _read_soil(soil_section)
+
+    def read_cutter(item: YamlSection) -> SoilCutting:
+        frame = _read_moving_frame(item, tree)
+        _check_section(top, item, "cutters without ground", "ground", "{height: 0}")
+        _check_section(top, item, "cutters without soil", "soil", "{kind: sandy loam}")
+        if soil is None:
+            raise FollowUpError("the soil is refused")
+        return item.create(SoilCutting, frame, soil, ground=ground, **item.values("frame"))
+
     return (
         *read_loads(top, tree),
         *top.read_items("contacts", read_contact),
-        *_read_cutters(top, tree, ground),
+        *top.read_items("cutters", read_cutter),
     )
 
 
@@ -133,7 +145,6 @@ def _read_moving_frame(item: YamlSection, tree: TreeBuilder) -> str:
 def _check_section(
     top: YamlSection, item: YamlSection, problem: str, key: str, example: str
 ) -> None:
-    """Raise where a section that an item needs is absent."""
     if key not in top:
         raise item.error_at(None, f"{problem}, add '{key}: {example}'")
 
@@ -156,25 +167,6 @@ def read_loads(
         return item.create(PhasedWrench if "phases" in item else Wrench, frame, **values)
 
     return top.read_items("loads", read_wrench)
-
-
-def _read_cutters(
-    top: YamlSection, tree: TreeBuilder, ground: Ground | None
-) -> tuple[SoilCutting, ...]:
-    section, soil = top.section("soil"), None
-    if section is not None:
-        with error_recovery():
-            soil = _read_soil(section)
-
-    def read_cutter(item: YamlSection) -> SoilCutting:
-        frame = _read_moving_frame(item, tree)
-        _check_section(top, item, "cutters without ground", "ground", "{height: 0}")
-        _check_section(top, item, "cutters without soil", "soil", "{kind: sandy loam}")
-        if soil is None:
-            raise FollowUpError("the soil is refused")
-        return item.create(SoilCutting, frame, soil, ground=ground, **item.values("frame"))
-
-    return top.read_items("cutters", read_cutter)
 
 
 def _read_soil(section: YamlSection) -> Soil:

@@ -78,8 +78,9 @@ class _SchemaDefinitions:
         excluded: dict[str, list[dict[str, Any]]] = {}
         for first, second, _ in section.exclusive:
             for key in first:
-                others_of_key = [{"required": [x]} for x in second if x != key]
-                excluded.setdefault(key, []).extend(others_of_key)
+                excluded.setdefault(key, []).extend(
+                    [{"required": [x]} for x in second if x != key]
+                )
         return {
             "type": ["object", "null"],
             "properties": {
@@ -91,7 +92,6 @@ class _SchemaDefinitions:
         }
 
     def _described(self, name: str, key: Key, is_partial: bool) -> dict[str, Any]:
-        """The value of a key with its text, unit, usual range and default."""
         text = key.text
         if isinstance(key, NumberKey) and key.units:
             text += f" [{key.units}]"
@@ -108,7 +108,6 @@ class _SchemaDefinitions:
         )
 
     def _value(self, name: str, key: Key, is_partial: bool) -> dict[str, Any]:
-        """The values that a key may have."""
         match key:
             case SectionKey():
                 return self.section(name, key.section, is_partial) | {"type": "object"}

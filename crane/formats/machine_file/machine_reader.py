@@ -1,26 +1,39 @@
 """Machine files and single URDFs, read and checked into a `MachineSpec`."""
 
+import math
 from collections.abc import Callable, Container, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from crane.common.errors import DescriptionError, suggest_names
+from crane.common.errors import DescriptionError, InputError, suggest_names
 from crane.common.package_search import load_options
-from crane.description.estimation_settings import EstimationSettings
+from crane.common.units import accepted_units
 from crane.description.external_forces import ExternalForce
 from crane.description.findings import UnknownNames, error_recovery, report_error
 from crane.description.ground_contact import Contact
 from crane.description.kinematic_tree import with_rotor_inertias
 from crane.description.machine_lookup import find_machine_file
 from crane.description.machine_schema import MACHINE
+from crane.description.sensors import (
+    SENSOR_PARAMETERS,
+    TIME,
+    VALVE_SIGNAL_PREFIX,
+    Sensor,
+    quantity_names,
+    quantity_unit,
+    signal_delay_error,
+)
 from crane.description.specification import (
     Chain,
+    EstimationSettings,
     LoopSpec,
     MachineSpec,
+    ParameterPrior,
     PayloadSpec,
     PIGains,
     Task,
+    TermValues,
     source_locations,
 )
 from crane.formats.machine_file.circuit_section import (
@@ -36,8 +49,6 @@ from crane.formats.machine_file.force_sections import (
     read_gas_springs,
     read_ropes,
 )
-from crane.formats.machine_file.identification_sections import read_estimation, read_sensors
-from crane.formats.machine_file.open_loop_warning import warn_about_open_loops
 from crane.formats.machine_file.structure_sections import (
     TreeBuilder,
     read_chains,
@@ -45,9 +56,11 @@ from crane.formats.machine_file.structure_sections import (
     read_drives,
     read_home,
     read_loops,
+    warn_about_open_loops,
 )
 from crane.formats.machine_file.task_section import read_tasks
 from crane.formats.machine_file.yaml_section import YamlSection, parse_with_base
+from crane.formats.machine_file.yaml_values import as_boolean, as_float
 from crane.formats.parallel_robots import is_parallel_robot, read_parallel_robot
 from crane.formats.robot_files import is_robot_file
 from crane.formats.urdf.urdf_reader import read_urdf
@@ -62,19 +75,18 @@ def read_machine_spec(name: str | Path) -> MachineSpec:
         DescriptionError: With file, line, what is wrong, and the names that exist.
     """
     path = find_machine_file(name)
-    spec = _read_by_format(path)
+    if is_robot_file(path):
+        spec = _read_robot(path)
+    elif path.suffix.lower() in (".xml", ".mjcf"):
+        from crane.formats.mjcf.mjcf_reader import read_mjcf  # few files are MJCF
+
+        spec = read_mjcf(path)
+    elif is_parallel_robot(path):
+        spec = read_parallel_robot(path)
+    else:
+        spec = _read_machine(path)
     warn_about_open_loops(spec)
     return spec
-
-
-def _read_by_format(path: Path) -> MachineSpec:
-    if is_robot_file(path):
-        return _read_robot(path)
-    if path.suffix.lower() in (".xml", ".mjcf"):
-        from crane.formats.mjcf.mjcf_reader import read_mjcf  # Pinocchio is in it
-
-        return read_mjcf(path)
-    return read_parallel_robot(path) if is_parallel_robot(path) else _read_machine(path)
 
 
 def _read_robot(path: Path) -> MachineSpec:
@@ -193,7 +205,6 @@ def _read_machine(path: Path) -> MachineSpec:
 def _read_supports(
     top: YamlSection, tree: TreeBuilder, external_forces: Sequence[ExternalForce]
 ) -> tuple[str, ...]:
-    """Links that the machine stands on."""
     names = top.names("supports")
     contacts = {force.frame for force in external_forces if isinstance(force, Contact)}
     for link in names:
@@ -229,7 +240,6 @@ def _read_pins(top: YamlSection, tree: TreeBuilder, loops: Sequence[LoopSpec]) -
 def _read_free_joints(
     top: YamlSection, tree: TreeBuilder, active: Container[str]
 ) -> tuple[str, ...]:
-    """Independent coordinates that nothing drives."""
     free: tuple[str, ...] = ()
     with error_recovery(harmless=True):
         free = top.names("free")
@@ -299,3 +309,78 @@ def _read_control(top: YamlSection, active: tuple[str, ...]) -> dict[str, PIGain
     if missing:
         raise top.error_at("control", f"no gains for {', '.join(missing)}, give kp and ki of each")
     return gains
+
+
+def read_estimation(top: YamlSection) -> EstimationSettings:
+    """Terms, prior knowledge and settings; an identification checks that the names exist."""
+    section = top.section("identification")
+    if section is None:
+        return EstimationSettings()
+    return EstimationSettings(
+        section.value_map("terms", _read_term),
+        section.value_map("prior", _read_prior),
+        section.number("bandwidth") if "bandwidth" in section else None,
+        section.value_map("slow", YamlSection.number),
+    )
+
+
+def estimation_data(settings: EstimationSettings) -> dict[str, Any]:
+    """The section as it is written."""
+    data = {
+        "terms": {name: _term_data(numbers) for name, numbers in settings.terms.items()},
+        "prior": {name: str(known) for name, known in settings.prior.items()},
+        "bandwidth": settings.bandwidth,
+        "slow": dict(settings.slow),
+    }
+    return {key: value for key, value in data.items() if value}
+
+
+def _read_term(section: YamlSection, name: str) -> TermValues | None:
+    """() of `on`, None of `off`."""
+    value = section.raw_value(name)
+    if (is_wanted := as_boolean(value)) is not None:
+        return () if is_wanted else None
+    if isinstance(value, str) and not math.isfinite(as_float(value)):
+        label = f"'{name}' of {section.title} is '{value}'"
+        raise section.error_at(name, f"{label}, give on, off, a number or a list of numbers")
+    return section.numbers(name) if isinstance(value, list) else (section.number(name),)
+
+
+def _read_prior(section: YamlSection, name: str) -> ParameterPrior:
+    try:
+        return ParameterPrior.parse(section.raw_value(name))
+    except InputError as error:
+        raise section.error_at(name, f"'{name}' of 'prior': {error}") from None
+
+
+def _term_data(values: TermValues | None) -> bool | float | list[float]:
+    if not values:
+        return values is not None
+    return values[0] if len(values) == 1 else list(values)
+
+
+def read_sensors(top: YamlSection, tree: TreeBuilder) -> dict[str, Sensor]:
+    """Sensors by the quantity that they measure."""
+
+    def read_sensor(name: str, item: YamlSection) -> Sensor:
+        unit = quantity_unit(tree.tree, name)
+        if unit is None:
+            known = suggest_names(quantity_names(tree.tree), name)
+            raise tree.unknown_name_error(
+                str(item.error_at(None, f"'{name}' is no quantity of this machine, {known}"))
+            )
+        units = accepted_units(unit)
+        if "unit" in item and (given := item.text("unit")) not in units:
+            raise item.error_at(
+                "unit", f"'{name}' is in [{given}], give {' or '.join(units) or 'no unit'}"
+            )
+        if name == TIME and any(key in item for key in SENSOR_PARAMETERS):
+            raise item.error_at(None, "time has a column and a unit, and no numbers of a sensor")
+        if name.startswith(VALVE_SIGNAL_PREFIX) and "delay" in item:
+            raise item.error_at("delay", str(signal_delay_error(name, name)))
+        try:
+            return Sensor(**item.values())
+        except InputError as error:
+            raise item.error_at(None, f"'{name}': {error}") from None
+
+    return top.read_map("sensors", read_sensor)

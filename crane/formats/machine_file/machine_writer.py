@@ -35,8 +35,7 @@ from crane.description.machine_schema import (
 from crane.description.sensors import SENSOR_PARAMETERS, SENSOR_PREFIX, quantity_unit
 from crane.description.specification import LoopSpec, Task
 from crane.formats.machine_file.force_sections import external_force_data, load_data
-from crane.formats.machine_file.identification_sections import estimation_data
-from crane.formats.machine_file.machine_reader import read_machine_spec
+from crane.formats.machine_file.machine_reader import estimation_data, read_machine_spec
 from crane.formats.machine_file.yaml_text import KeyPath, format_yaml
 from crane.formats.urdf.urdf_writer import (
     compound_drive_factors,
@@ -46,7 +45,7 @@ from crane.formats.urdf.urdf_writer import (
     rotor_inertias,
     with_floating_joints,
 )
-from crane.formats.urdf_elements import add_joint, add_link
+from crane.formats.xml_file import add_joint, add_link
 from crane.hydraulics.components import Cylinder, Valve
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.machine.machine import Machine
@@ -118,17 +117,16 @@ class MachineDraft:
         chains = [chain for chain in machine.chains if chain.name != "payload"]
         chain_of_attachment = {chain.attachment_name: chain.name for chain in chains[1:]}
         self._chain_of_link = _chains_by_link(tree, chains[0].name, chain_of_attachment)
+        robots = {chain.name: etree.Element("robot", name=chain.name) for chain in chains}
+        for link in tree.links.values():
+            add_link(robots[self._chain_of_link[link.name]], link)
+        for joint in tree.joints.values():
+            if joint.name not in chain_of_attachment:
+                add_joint(robots[self._chain_of_link[joint.child]], joint)
         for chain in chains:
-            robot = etree.Element("robot", name=chain.name)
-            for link in tree.links.values():
-                if self._chain_of_link[link.name] == chain.name:
-                    add_link(robot, link)
-            for joint in tree.joints.values():
-                is_attachment = joint.name in chain_of_attachment
-                if self._chain_of_link[joint.child] == chain.name and not is_attachment:
-                    add_joint(robot, joint)
-            copy_shapes(robot, machine, [chain.name])
-            self.add_chain(chain.name, robot, {"parent": chain.parent} if self.urdfs else {})
+            copy_shapes(robots[chain.name], machine, [chain.name])
+            parent = {"parent": chain.parent} if self.urdfs else {}
+            self.add_chain(chain.name, robots[chain.name], parent)
         load = _payload_urdf(machine)
         self._payload_file = None if load is None else (load.name, load.read_bytes())
         if self._payload_file is not None:
@@ -234,9 +232,10 @@ class MachineDraft:
         circuit = nonempty.get("hydraulics", {})
         if not circuit.get("oil", True):
             nonempty["hydraulics"] = {k: value for k, value in circuit.items() if k != "oil"}
-        header = "".join(f"# {format_one_line(line)}\n" for line in self._header_notes)
         (folder / file).write_text(
-            header + format_yaml(nonempty, self._line_notes), encoding="utf-8"
+            "".join(f"# {format_one_line(line)}\n" for line in self._header_notes)
+            + format_yaml(nonempty, self._line_notes),
+            encoding="utf-8",
         )
 
     def _path_from_file(self, file: str) -> str:
@@ -288,7 +287,7 @@ def _machine_data(machine: Machine) -> dict[str, Any]:
             for name, sensor in machine.sensors.items()
             if quantity_unit(machine.tree, name) is not None  # a joint that is locked has none
         },
-        "identification": estimation_data(machine),
+        "identification": estimation_data(machine.estimation),
     }
     data |= MACHINE.values_of(machine, *data)
     return {key: data[key] for key in MACHINE.keys if key in data}
@@ -337,7 +336,6 @@ def _hydraulics_data(circuit: Hydraulics) -> dict[str, Any]:
 
 
 def _motor_data(motor: Cylinder) -> dict[str, Any]:
-    """A motor from its values as a cylinder."""
     expected = {"area_b": motor.area_a, "hose_b": motor.hose_a}
     expected |= {
         name: key.default

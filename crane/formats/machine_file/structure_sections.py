@@ -4,14 +4,20 @@ The tree grows chain by chain, and knows whether names that others use are in it
 """
 
 import math
-from collections.abc import Container, Iterable, Iterator, Sequence
+import re
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from crane.common.errors import CraneError, DescriptionError, suggest_names
+import numpy as np
+import pinocchio as pin
+
+from crane.common.errors import CraneError, CraneWarning, DescriptionError, suggest_names
 from crane.description.findings import FollowUpError, error_recovery, report_error
 from crane.description.floating_bases import add_base_joints, check_freedoms
 from crane.description.force_elements import ForceElement, Friction
 from crane.description.kinematic_tree import Joint, Link, Tree, body_of
+from crane.description.pinocchio_conversion import se3_from_xyz_rpy
 from crane.description.specification import (
     AXISLESS_TYPES,
     LOOP_TYPES,
@@ -19,10 +25,17 @@ from crane.description.specification import (
     Coupling,
     Drive,
     LoopSpec,
+    MachineSpec,
     unit_vector,
 )
 from crane.formats.machine_file.yaml_section import YamlSection
 from crane.formats.urdf.urdf_reader import UrdfModel, read_urdf
+
+_LOOP_END_PATTERN = re.compile(
+    r"((?:closing_|closed?_?loop|loop_?clos).*?)_?([12AB])", re.IGNORECASE
+)
+_END_LABELS = ({"1", "2"}, {"A", "B"})
+_MAX_SHOWN = 4  # pairs in a line
 
 
 class TreeBuilder:
@@ -41,6 +54,7 @@ class TreeBuilder:
         self.is_complete = True
         self._all_joints: dict[str, Joint] = {}
         self._parent_joints: dict[str, Joint] = {}
+        self._root = ""
 
     @property
     def tree(self) -> Tree:
@@ -53,8 +67,17 @@ class TreeBuilder:
         Raises:
             DescriptionError: The frame is unknown, or a name is taken by an earlier chain.
         """
+        self._root = self._root or urdf.root_link
         with error_recovery():
-            self._attach_to_parent(chain, urdf)
+            if chain.parent is not None and chain.parent not in self.links:
+                raise self.unknown_name_error(
+                    f"{chain.source_location}: chain '{chain.name}' hangs from '{chain.parent}', "
+                    f"no frame of an earlier chain, {suggest_names(self.links, chain.parent)}",
+                    chain.parent,
+                )
+            attachments = [chain.attachment_joint(urdf.root_link)] * (chain.parent is not None)
+            for joint in self.filter_new_names(attachments):
+                self._add_part(joint)
         parts = list(urdf.tree)
         free = list(self.filter_new_names(parts))
         # what is not there goes by another name
@@ -68,23 +91,26 @@ class TreeBuilder:
             return
         floating_tree = add_base_joints(self.tree, freedoms)
         self.links, self._all_joints, self.joints = {}, {}, {}
+        self._root = floating_tree.root_link
         for part in floating_tree:
             self._add_part(part)
 
     def filter_new_names(self, parts: Iterable[Link | Joint]) -> Iterator[Link | Joint]:
         """Those whose names are not taken; the others are noted."""
         for part in parts:
-            earlier = self._find_same_name(part)
+            is_link = isinstance(part, Link)
+            earlier = (self.links if is_link else self._all_joints).get(part.name)
             if earlier is None:
                 yield part
                 continue
-            report_error(_duplicate_name_error(part, earlier))
+            report_error(
+                DescriptionError(
+                    f"{part.source_location}: {'link' if is_link else 'joint'} '{part.name}' is "
+                    f"also in {earlier.source_location}, rename one"
+                )
+            )
             if earlier.source_location == part.source_location:
                 return  # one file twice: the rest of it is there, too
-
-    def _find_same_name(self, part: Link | Joint) -> Link | Joint | None:
-        names = self.links if isinstance(part, Link) else self._all_joints
-        return names.get(part.name)
 
     def _add_part(self, part: Link | Joint) -> None:
         if isinstance(part, Link):
@@ -94,27 +120,10 @@ class TreeBuilder:
         if part.is_movable:
             self.joints[part.name] = part
 
-    def _attach_to_parent(self, chain: Chain, urdf: UrdfModel) -> None:
-        if chain.parent is None:
-            return
-        if chain.parent not in self.links:
-            raise self.unknown_name_error(
-                f"{chain.source_location}: chain '{chain.name}' hangs from '{chain.parent}', no "
-                f"frame of an earlier chain, {suggest_names(self.links, chain.parent)}",
-                chain.parent,
-            )
-        joint = chain.attachment_joint(urdf.root_link)
-        if (earlier := self._find_same_name(joint)) is not None:
-            raise _duplicate_name_error(joint, earlier)
-        self._add_part(joint)
-
     def unknown_name_error(self, message: str, name: str = "?") -> CraneError:
         """The error about a name, unless a chain is not there or the name has been refused."""
-        return (
-            FollowUpError(message)
-            if (not self.is_complete or not name)
-            else DescriptionError(message)
-        )
+        is_follow_up = not self.is_complete or not name
+        return FollowUpError(message) if is_follow_up else DescriptionError(message)
 
     def check_joint(self, joint: str, source_location: str) -> None:
         """Raise for a joint that does not exist or does not move."""
@@ -171,7 +180,7 @@ class TreeBuilder:
 
     def is_movable(self, link: str) -> bool:
         """Whether a link is not fixed to the world."""
-        return not self.is_complete or body_of(self._parent_joints, link) != self.tree.root_link
+        return not self.is_complete or body_of(self._parent_joints, link) != self._root
 
     def missing_limit_text(self, joint: str) -> str:
         """How a joint lacks a finite range, in words; empty if it has one, or is unknown."""
@@ -188,14 +197,6 @@ class TreeBuilder:
         parents = {joint.parent for joint in self._all_joints.values()}
         leaves = [name for name in self.links if name not in parents]
         return leaves[0] if len(leaves) == 1 else None
-
-
-def _duplicate_name_error(part: Link | Joint, earlier: Link | Joint) -> DescriptionError:
-    kind = "link" if isinstance(part, Link) else "joint"
-    return DescriptionError(
-        f"{part.source_location}: {kind} '{part.name}' is also in {earlier.source_location}, "
-        f"rename one"
-    )
 
 
 def read_chains(
@@ -268,69 +269,57 @@ def _read_chain(
 
 def read_loops(top: YamlSection, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
     """Joints that close the chains into loops."""
-    loops: dict[str, LoopSpec] = {}
-    for item in top.list_items("loops"):
-        with error_recovery():
-            loop = _read_loop(item, tree, loops)
-            loops[loop.name] = loop
-    return tuple(loops.values())
+    names: list[str] = []
 
-
-def _read_loop(section: YamlSection, tree: TreeBuilder, earlier_names: Container[str]) -> LoopSpec:
-    name, kind = section.text("name"), section.text("type")
-    label = f"loop '{name}'" if name else "a loop"
-    frames = []
-    for end in ("predecessor", "successor"):
-        frame = section.text(end)
-        if frame and frame not in tree.links and tree.is_complete:
-            report_error(
-                section.error_at(
-                    end,
-                    f"{label} has the unknown {end} '{frame}', {suggest_names(tree.links, frame)}",
+    def read_loop(section: YamlSection) -> LoopSpec:
+        name, kind = section.text("name"), section.text("type")
+        label = f"loop '{name}'" if name else "a loop"
+        frames = []
+        for end in ("predecessor", "successor"):
+            frame = section.text(end)
+            if frame and frame not in tree.links and tree.is_complete:
+                known = suggest_names(tree.links, frame)
+                report_error(
+                    section.error_at(end, f"{label} has the unknown {end} '{frame}', {known}")
                 )
-            )
-        frames.append(frame)
-    axis = None
-    with error_recovery():
-        axis = unit_vector(section.numbers("axis"))
-        if axis is None and kind in AXISLESS_TYPES:
-            axis = (0.0, 0.0, 1.0)
-        if axis is None:
-            problem = f"the axis of {label} is no direction"
-            raise section.error_at("axis", f"{problem}, give three numbers, not all zero")
-    if axis is None or kind not in LOOP_TYPES or not all(end in tree.links for end in frames):
-        raise FollowUpError(f"{label} is not complete")
-    loop = LoopSpec(name, kind, frames[0], frames[1], axis, section.source_location())
-    tree.check_loop(loop)
-    if name in earlier_names:
-        raise section.error_at("name", f"two loops are named '{name}', rename one")
-    return loop
+            frames.append(frame)
+        axis = None
+        with error_recovery():
+            axis = unit_vector(section.numbers("axis"))
+            if axis is None and kind in AXISLESS_TYPES:
+                axis = (0.0, 0.0, 1.0)
+            if axis is None:
+                problem = f"the axis of {label} is no direction"
+                raise section.error_at("axis", f"{problem}, give three numbers, not all zero")
+        if axis is None or kind not in LOOP_TYPES or not all(end in tree.links for end in frames):
+            raise FollowUpError(f"{label} is not complete")
+        loop = LoopSpec(name, kind, frames[0], frames[1], axis, section.source_location())
+        tree.check_loop(loop)
+        if name in names:
+            raise section.error_at("name", f"two loops are named '{name}', rename one")
+        names.append(name)
+        return loop
+
+    return top.read_items("loops", read_loop)
 
 
 def read_couplings(top: YamlSection, tree: TreeBuilder) -> tuple[Coupling, ...]:
     """Linear constraints of joints."""
-    found: dict[str, Coupling] = {}
-    for item in top.list_items("couplings"):
-        with error_recovery():
-            coupling = _read_coupling(item, tree, found)
-            found[coupling.name] = coupling
-    return tuple(found.values())
+    names: list[str] = []
 
+    def read_coupling(item: YamlSection) -> Coupling:
+        name, joints = item.text("name"), item.section("joints")
+        if name in names:
+            raise item.error_at("name", f"two couplings are named '{name}', rename one")
+        if joints is None or len(list(joints)) < 2:
+            raise item.error_at(
+                "joints", f"coupling '{name}' joins less than two joints, add some"
+            )
+        factors = item.value_map("joints", YamlSection.number, tree.check_joint)
+        names.append(name)
+        return Coupling(name, factors, item.number("offset"), item.source_location())
 
-def _read_coupling(
-    item: YamlSection, tree: TreeBuilder, earlier_names: Container[str]
-) -> Coupling:
-    name, joints = item.text("name"), item.section("joints")
-    if name in earlier_names:
-        raise item.error_at("name", f"two couplings are named '{name}', rename one")
-    if joints is None or len(list(joints)) < 2:
-        raise item.error_at("joints", f"coupling '{name}' joins less than two joints, add some")
-    return Coupling(
-        name,
-        item.value_map("joints", YamlSection.number, tree.check_joint),
-        item.number("offset"),
-        item.source_location(),
-    )
+    return top.read_items("couplings", read_coupling)
 
 
 def read_drives(top: YamlSection, tree: TreeBuilder) -> tuple[Drive, ...]:
@@ -353,3 +342,76 @@ def read_home(top: YamlSection, tree: TreeBuilder) -> tuple[dict[str, float], di
     home = top.value_map("home", YamlSection.number, tree.check_joint)
     locations = top.item_locations("home") if home else {}
     return home, {f"home {joint}": locations[joint] for joint in home}
+
+
+def warn_about_open_loops(spec: MachineSpec) -> None:
+    """Warn of pairs of frames that are named like the two ends of a loop that nothing closes.
+
+    onshape-to-robot, from whose files placo's examples are, cuts a loop into the frames
+    closing_NAME_1 and closing_NAME_2; example-parallel-robots into closedloopNAME_A and
+    closedloopNAME_B, of links or joints. Without the file that says so, such a machine is an open
+    tree: it loads and moves, and is another machine.
+    """
+    parent_joints = spec.tree.parent_joints
+
+    def bodies(*links: str) -> set[str]:
+        return {body_of(parent_joints, link) for link in links}
+
+    closed_pairs = [bodies(loop.predecessor, loop.successor) for loop in spec.loops]
+    pairs = [
+        ends
+        for _, *ends in loop_end_pairs(spec.tree)
+        if len(bodies(*ends)) == 2 and bodies(*ends) not in closed_pairs
+    ]
+    if not pairs:
+        return
+    pair_texts = [
+        f"{one} and {two}{_gap_text(parent_joints, one, two)}" for one, two in pairs[:_MAX_SHOWN]
+    ]
+    remainder_text = [f"{len(pairs) - _MAX_SHOWN} more"] if len(pairs) > _MAX_SHOWN else []
+    location = spec.tree.links[pairs[0][0]].source_location
+    warnings.warn(
+        f"{location}: nothing closes what looks like {len(pairs)} loop{'s' * (len(pairs) > 1)}, "
+        f"{', '.join(pair_texts + remainder_text)}: close them by crane add loops, paste what "
+        "crane check proposes into a machine file, or rename the frames",
+        CraneWarning,
+        stacklevel=2,
+    )
+
+
+def loop_end_pairs(tree: Tree) -> list[tuple[str, str, str]]:
+    """A name for each loop, and its two links, which have the names themselves or their joints."""
+    link_of_name = {name: name for name in tree.links}
+    for name, joint in tree.joints.items():
+        link_of_name.setdefault(name, joint.child)
+    ends: dict[str, dict[str, str]] = {}
+    for name, link in link_of_name.items():
+        if match := _LOOP_END_PATTERN.fullmatch(name):
+            ends.setdefault(match[1], {})[match[2].upper()] = link
+    return [
+        (
+            name.removeprefix("closing_"),
+            links_of_end[min(links_of_end)],
+            links_of_end[max(links_of_end)],
+        )
+        for name, links_of_end in ends.items()
+        if set(links_of_end) in _END_LABELS
+    ]
+
+
+def _gap_text(parent_joints: Mapping[str, Joint], first: str, second: str) -> str:
+    """How far two frames are apart with all joints at zero, in words."""
+    placements = []
+    for link in (first, second):
+        placement = pin.SE3.Identity()
+        while link in parent_joints:
+            joint = parent_joints[link]
+            placement = se3_from_xyz_rpy(joint.xyz, joint.rpy) * placement
+            link = joint.parent
+        placements.append(placement)
+    relative_placement = placements[0].actInv(placements[1])
+    if not np.isfinite(relative_placement.homogeneous).all():  # an origin is refused
+        return ""
+    distance = float(np.linalg.norm(relative_placement.translation))
+    angle = math.degrees(float(np.linalg.norm(pin.log3(relative_placement.rotation))))
+    return f" ({1e3 * distance:.3g} mm and {angle:.3g} deg apart at zero)"

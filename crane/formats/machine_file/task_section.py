@@ -4,7 +4,6 @@ import dataclasses
 import itertools
 from collections.abc import Sequence
 
-from crane.common.errors import DescriptionError
 from crane.description.findings import error_recovery
 from crane.description.machine_schema import MOTIONS
 from crane.description.specification import (
@@ -17,6 +16,8 @@ from crane.description.specification import (
 from crane.formats.machine_file.force_sections import read_loads
 from crane.formats.machine_file.structure_sections import TreeBuilder
 from crane.formats.machine_file.yaml_section import YamlSection
+
+_TIP_HINT = "name its frame under 'tip:'"
 
 
 def read_tasks(
@@ -43,16 +44,15 @@ def read_tasks(
                 lever_key, f"task '{name}' moves levers of no valve, add 'hydraulics'"
             )
         if tip is None and "tip" in item:
-            raise _missing_tip_error(name, item, "tip")
+            raise item.error_at("tip", f"task '{name}' moves the tip, {_TIP_HINT}")
         if has_phases:
             task = _read_phased_task(name, item, spaces, tree, home)
         elif "via" in item:
             task = _read_via_task(name, item, active, tip)
         else:
             task = _read_continuous_task(name, item, spaces)
-        description = item.text("description")
         return dataclasses.replace(
-            task, description=description, loads=read_loads(item, tree, has_phases)
+            task, description=item.text("description"), loads=read_loads(item, tree, has_phases)
         )
 
     return top.read_map("tasks", read_task)
@@ -69,19 +69,20 @@ def _read_continuous_task(
         raise item.error_at(None, f"task '{name}' has none of {MOTIONS}, give one")
     motion.check_keys(spaces[space])
     if space == "joystick":
-        levers = item.value_map(space, lambda part, joint: _read_lever(part, joint, duration))
         return Task(
-            name, "", duration, space, {}, levers, start=_read_start(name, item, spaces["active"])
+            name,
+            "",
+            duration,
+            space,
+            {},
+            item.value_map(space, lambda part, joint: _read_lever(part, joint, duration)),
+            start=_read_start(name, item, spaces["active"]),
         )
     coefficients = {}
     for coordinate in spaces[space]:
         with error_recovery():
             coefficients[coordinate] = motion.numbers(coordinate)
     return Task(name, "", duration, space, coefficients)
-
-
-def _missing_tip_error(name: str, item: YamlSection, key: str) -> DescriptionError:
-    return item.error_at(key, f"task '{name}' moves the tip, name its frame under 'tip:'")
 
 
 def _read_start(name: str, item: YamlSection, active: tuple[str, ...]) -> dict[str, float]:
@@ -126,7 +127,7 @@ def _read_via_task(name: str, item: YamlSection, active: tuple[str, ...], tip: s
     space, required = "active", active
     if not joint_names:
         if tip is None:
-            raise _missing_tip_error(name, item, "via")
+            raise item.error_at("via", f"task '{name}' moves the tip, {_TIP_HINT}")
         attitude = _attitude_coordinates(
             name, point_of_coordinate, list(zip(points, via_points, strict=True))
         )
@@ -135,15 +136,20 @@ def _read_via_task(name: str, item: YamlSection, active: tuple[str, ...], tip: s
         missing = [x for x in required if x not in via_points[i].point]
         if missing:
             raise points[i].error_at(None, f"the {which} {title} has no '{missing[0]}', add it")
-    ordered = tuple(
-        ViaPoint(one.time, {x: one.point[x] for x in required if x in one.point}, one.rates)
-        for one in via_points
+    return Task(
+        name,
+        "",
+        via_points[-1].time,
+        space,
+        {},
+        via=tuple(
+            ViaPoint(one.time, {x: one.point[x] for x in required if x in one.point}, one.rates)
+            for one in via_points
+        ),
     )
-    return Task(name, "", via_points[-1].time, space, {}, via=ordered)
 
 
 def _read_via_point(point: YamlSection, title: str) -> ViaPoint:
-    """A via point with the coordinates that it names."""
     time = point.number("time")
     coordinates = {x: point.number(x) for x in point if x not in ("time", "rates")}
     if not coordinates:
@@ -160,7 +166,6 @@ def _attitude_coordinates(
     point_of_coordinate: dict[str, YamlSection],
     points: Sequence[tuple[YamlSection, ViaPoint]],
 ) -> tuple[str, ...]:
-    """Coordinates of the attitude that the points of a task name."""
     groups = [
         group for group in ATTITUDE_COORDINATES if any(x in point_of_coordinate for x in group)
     ]

@@ -9,7 +9,7 @@ from crane.description.findings import UnknownNames, error_recovery, report_erro
 from crane.description.key_types import Key, ListKey, SectionKey, SectionSchema
 from crane.description.machine_lookup import bundled_machines
 from crane.description.machine_schema import ALL_ITEM, EXTENDS_KEY
-from crane.formats.machine_file.yaml_parser import LocatedMapping, format_value, parse_yaml_file
+from crane.formats.machine_file.yaml_text import LocatedMapping, format_value, parse_yaml_file
 from crane.formats.machine_file.yaml_values import YamlValues
 from crane.hydraulics.circuit_elements import CircuitPathError, ComponentParameterError
 

@@ -1,12 +1,18 @@
-"""The text of a machine file, with notes beside its numbers."""
+"""YAML of machine files: parsed into mappings that know their lines, and written with notes."""
 
+import errno
 from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import yaml
 
-from crane.common.errors import format_one_line
+from crane.common.errors import DescriptionError, format_one_line
+from crane.common.package_search import read_plain_file
+from crane.description.findings import report_error
 
+MAX_FILE_SIZE = 2_000_000  # bytes of a file; parsing ten million takes a minute
 KeyPath = tuple[str | int, ...]  # keys and indices down to a number
 
 
@@ -47,7 +53,14 @@ def format_yaml(data: Mapping[str, Any], notes: Mapping[KeyPath, str] | None = N
     lines, top = text.split("\n"), yaml.compose(text, yaml.SafeLoader)
     assert top is not None, "it was just written"
     for key_path, note in notes.items():
-        lines[_find_node(top, key_path).end_mark.line] += f"  # {format_one_line(note)}"
+        node: Any = top
+        for key in key_path:
+            node = (
+                node.value[key]
+                if isinstance(key, int)
+                else next(value for name, value in node.value if name.value == key)
+            )
+        lines[node.end_mark.line] += f"  # {format_one_line(note)}"
     return "\n".join(lines)
 
 
@@ -67,10 +80,142 @@ def _with_block_mappings(item: Any, key_path: KeyPath, block_paths: set[KeyPath]
     return item
 
 
-def _find_node(top: yaml.Node, key_path: KeyPath) -> yaml.Node:
-    for key in key_path:
-        if isinstance(key, int):
-            top = top.value[key]
-        else:
-            top = next(value for name, value in top.value if name.value == key)
-    return top
+class LocatedMapping(dict[str, Any]):
+    """A mapping that remembers file and line of each key."""
+
+    def __init__(self, file: Path, line: int):
+        super().__init__()
+        self.file, self.line = file, line
+        self.locations: dict[str, tuple[Path, int]] = {}
+
+    def copy_key(self, source: "LocatedMapping", key: str) -> None:
+        """Take over the value of a key, and where it stands."""
+        self[key], self.locations[key] = source[key], source.locations[key]
+
+    def update_from_variant(self, variant: "LocatedMapping") -> None:
+        """Put a variant's keys over these: mappings key by key, all else whole, empty ones off."""
+        for key, value in variant.items():
+            if isinstance(value, LocatedMapping) and isinstance(self.get(key), LocatedMapping):
+                self[key].update_from_variant(value)
+                self.locations[key] = variant.locations[key]
+            elif value is None:
+                self.pop(key, None)
+            else:
+                self.copy_key(variant, key)
+        self.file, self.line = variant.file, variant.line
+
+
+class _StrictConstructor(yaml.constructor.SafeConstructor):
+    """SafeConstructor with lines, and without silently taking the last of equal keys."""
+
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        """A value; what cannot be one (a 13th month, 0x without digits) is an error of YAML."""
+        try:
+            return super().construct_object(node, deep)
+        except (ValueError, KeyError, AttributeError, TypeError, OverflowError):
+            raise yaml.constructor.ConstructorError(
+                None,
+                None,
+                f"'{node.value}' is no value of its kind, quote it if it is text",
+                node.start_mark,
+            ) from None
+
+
+class _StrictLoader(_StrictConstructor, yaml.SafeLoader):
+    """Reads text, and says best what is wrong with it."""
+
+
+if yaml.__with_libyaml__:
+
+    class _FastLoader(_StrictConstructor, yaml.CSafeLoader):
+        """Reads text in a tenth of the time."""
+
+
+def _construct_mapping(loader: Any, node: yaml.MappingNode) -> LocatedMapping:
+    file = Path(loader.name)
+    data = LocatedMapping(file, node.start_mark.line + 1)
+    for key_node, value_node in node.value:
+        line = key_node.start_mark.line + 1
+        where = f"{file.name}:{line}"
+        if key_node.tag == "tag:yaml.org,2002:merge":
+            report_error(DescriptionError(f"{where}: '<<' is not supported, write the keys out"))
+            continue
+        key = loader.construct_object(key_node, deep=True)
+        if not isinstance(key, str):
+            hint = (
+                ", and decimals with a point"
+                if (isinstance(key, int) and not isinstance(key, bool))
+                else ""
+            )
+            problem = f"key {format_value(key)} is not a name, write names in quotes{hint}"
+            report_error(DescriptionError(f"{where}: {problem}"))
+            continue
+        if key in data:
+            first_line = data.locations[key][1]
+            problem = f"key '{key}' is there twice (first in line {first_line}), keep one"
+            report_error(DescriptionError(f"{where}: {problem}"))
+            continue
+        data[key] = loader.construct_object(value_node, deep=True)
+        data.locations[key] = file, line
+    return data
+
+
+_StrictConstructor.add_constructor("tag:yaml.org,2002:map", _construct_mapping)
+
+
+def format_value(value: Any) -> str:
+    """A value in an error: short, whatever it is."""
+    if isinstance(value, dict):
+        return "a mapping"
+    if isinstance(value, list | tuple | set):
+        return "a list"
+    if isinstance(value, bool):
+        return f"{value} (in YAML, yes, no, on and off mean true and false)"
+    text = repr(value) if isinstance(value, str) else str(value)
+    return text if len(text) < 60 else f"{text[:60]}..."
+
+
+def _compose(text: str) -> tuple[Any, yaml.Node | None]:
+    """What is in a text, and the loader that constructs it."""
+    if yaml.__with_libyaml__ and "\t" not in text:  # which PyYAML refuses in more places
+        with suppress(yaml.YAMLError):
+            fast_loader = _FastLoader(text)
+            return fast_loader, fast_loader.get_single_node()
+    loader = _StrictLoader(text)
+    return loader, loader.get_single_node()
+
+
+def parse_yaml_file(file: Path) -> LocatedMapping:
+    """The mapping in a YAML file.
+
+    Raises:
+        DescriptionError: The file is missing, not YAML, or no mapping.
+    """
+    try:
+        loader, node = _compose(read_plain_file(file, MAX_FILE_SIZE).decode("utf-8"))
+        loader.name = str(file)
+        data = None if node is None else loader.construct_document(node)
+    except UnicodeDecodeError:
+        raise DescriptionError(f"{file.name}: not UTF-8, save it as UTF-8 text") from None
+    except OSError as error:
+        if error.errno == errno.EFBIG:
+            error_text = f"{error.strerror}, which takes too long, shorten it"
+            raise DescriptionError(f"{file.name}: {error_text}") from None
+        raise DescriptionError(
+            f"{file}: cannot be read ({error.strerror}), check the path"
+        ) from None
+    except yaml.reader.ReaderError as error:
+        error_text = f"it holds the control character number {error.character}"
+        raise DescriptionError(f"{file.name}: not YAML, {error_text}, remove it") from None
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f":{mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or "broken"
+        raise DescriptionError(f"{file.name}{line}: not YAML, {problem}, mend it") from None
+    except RecursionError:
+        raise DescriptionError(f"{file.name}: nested too deep, simplify it") from None
+    if data is None:
+        raise DescriptionError(f"{file.name}: the file is empty, write a machine in it")
+    if not isinstance(data, LocatedMapping):
+        raise DescriptionError(f"{file.name}: not a machine file, write keys such as 'name:'")
+    return data

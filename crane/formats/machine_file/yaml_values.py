@@ -19,7 +19,7 @@ from crane.description.key_types import (
     SectionSchema,
     TextKey,
 )
-from crane.formats.machine_file.yaml_parser import LocatedMapping, format_value
+from crane.formats.machine_file.yaml_text import LocatedMapping, format_value
 
 _BOOLEAN_WORDS = {"on": True, "yes": True, "true": True, "off": False, "no": False, "false": False}
 
@@ -105,26 +105,10 @@ class YamlValues:
         return DescriptionError(f"{self.source_location(key)}: {problem}")
 
     def _value_error(self, key: str, value_text: str, hint: str) -> DescriptionError:
-        """An error about the value of a key."""
         return self.error_at(key, f"'{key}' of {self.title} is {value_text}, {hint}")
 
     def _key(self, name: str) -> Key:
-        """Type of the value of a key."""
         return self.schema.keys.get(name) or self.schema.others or Key()
-
-    def _get_value(self, key: str) -> Any:
-        """The value of a key, or its default.
-
-        Raises:
-            DescriptionError: The key is required and absent, or empty.
-        """
-        default = self._key(key).default
-        value = self._data.get(key, default)
-        if value is REQUIRED:
-            raise self.error_at(None, f"{self.title} has no '{key}', add it")
-        if value is None and default is not None:
-            raise self.error_at(key, f"'{key}' of {self.title} is empty, give its value")
-        return value
 
     def raw_value(self, key: str) -> Any:
         """A value, whatever it is.
@@ -132,10 +116,10 @@ class YamlValues:
         Raises:
             DescriptionError: There is none.
         """
-        value = self._get_value(key)
+        value = self._data.get(key, self._key(key).default)
         if value is None and key in self._data:
             raise self.error_at(key, f"'{key}' of {self.title} is empty, give its value")
-        if value is None:
+        if value is None or value is REQUIRED:
             raise self.error_at(None, f"{self.title} has no '{key}', add it")
         return value
 
@@ -158,12 +142,10 @@ class YamlValues:
             if reader is None or name in excluded:
                 continue
             alternatives = self.schema.alternatives(name)
-            if name in self._data or (
-                key.default is REQUIRED and not any(x in self._data for x in alternatives)
-            ):
-                value = reader(self, name)
-                if value is not None:
-                    found[key.attribute or name] = value
+            is_missing = key.default is REQUIRED and self._data.keys().isdisjoint(alternatives)
+            value = reader(self, name) if name in self._data or is_missing else None
+            if value is not None:
+                found[key.attribute or name] = value
         return found
 
     def check_exclusive_keys(self) -> None:
@@ -180,9 +162,10 @@ class YamlValues:
     def text(self, key: str) -> Any:
         """A non-empty string, None where there may be none; empty where its error is reported."""
         with error_recovery():
-            spec, value = self._key(key), self._get_value(key)
-            if value is spec.default:
-                return value
+            default = self._key(key).default
+            if default is not REQUIRED and self._data.get(key, default) is default:
+                return default
+            value = self.raw_value(key)
             if not isinstance(value, str) or not value.strip():
                 raise self._value_error(key, format_value(value), "give text (or quote it)")
             if not "".join(value.split()).isprintable():

@@ -24,14 +24,12 @@ class MjcfFrames:
 
     Attributes:
         used_names: Names of all links.
-        placements: Index of the body and placement on it, by frame.
-        source_locations: File and line by frame.
+        placements: Index of the body, placement on it, and file and line, by frame.
         link_of_site: Name of the link by site.
     """
 
     used_names: set[str]
-    placements: dict[str, tuple[int, pin.SE3]] = field(default_factory=dict)
-    source_locations: dict[str, str] = field(default_factory=dict)
+    placements: dict[str, tuple[int, pin.SE3, str]] = field(default_factory=dict)
     link_of_site: dict[int, str] = field(default_factory=dict)
 
     def add(self, name: str, body: int, placement: pin.SE3, source_location: str) -> str:
@@ -39,7 +37,7 @@ class MjcfFrames:
         while name in self.used_names:
             name += "_"
         self.used_names.add(name)
-        self.placements[name], self.source_locations[name] = (body, placement), source_location
+        self.placements[name] = body, placement, source_location
         return name
 
 
@@ -96,8 +94,9 @@ def read_equality_constraints(
         if kind == "CONNECT":
             pending_connects.append((name, source_location, ends[0], ends[1]))
         elif kind == "WELD":
-            fixes_rotation = model.eq_data[index, _TORQUE_SCALE_INDEX] != 0
-            loop_type = "fixed" if fixes_rotation else "spherical"
+            loop_type = (
+                "fixed" if (model.eq_data[index, _TORQUE_SCALE_INDEX] != 0) else "spherical"
+            )
             loops.append(_create_loop(name, loop_type, ends[0], ends[1], frames, source_location))
         elif kind in ("JOINT", "TENDON"):
             couplings.append(
@@ -188,9 +187,9 @@ def _combine_two_connects(
     ]
     is_one_axis = np.abs(axes[1] - axes[0]).max() < _DISTANCE_TOLERANCE * length[0]
     if all(first.link for first in first_ends) and is_one_axis:
-        for site in [second.link or "" for second in second_ends]:
-            if site.endswith("_axis"):  # only defines an axis, as in written files
-                frames.placements.pop(site, None)
+        # sites that only define an axis, as written files have them
+        for site in [x.link for x in second_ends if x.link and x.link.endswith("_axis")]:
+            frames.placements.pop(site, None)
         axis = axes[0] / length[0]
         nearest = np.round(axis)
         if np.abs(axis - nearest).max() < 1e-12:  # along an axis of the frame

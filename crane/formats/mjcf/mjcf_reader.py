@@ -59,6 +59,13 @@ class _MjcfReader:
         self.joints: dict[str, Joint] = {}
         self.body_links: list[str] = []  # name of the link by index of the body
         self.series_joints: dict[int, list[str]] = {}  # names of joints by joint of MuJoCo
+        self.texts: dict[str, str] = {}  # of <text> under <custom>, by name
+        for i, start in enumerate(mjcf.model.text_adr):
+            end = start + mjcf.model.text_size[i]
+            raw = bytes(mjcf.model.text_data[start:end]).split(b"\0")[0]
+            self.texts.setdefault(
+                mjcf.element_name("TEXT", i), raw.decode("utf-8", "replace").strip()
+            )
 
     def read_spec(self) -> MachineSpec:
         """Return the machine."""
@@ -70,8 +77,8 @@ class _MjcfReader:
             raise DescriptionError(f"{mjcf.file.name}: no joint moves in this file, add one")
         frames = self._read_frames()
         loops, couplings = read_equality_constraints(mjcf, frames, self.series_joints)
-        for link, (body, placement) in frames.placements.items():
-            self.links[link] = Link(link, frames.source_locations[link])
+        for link, (body, placement, source_location) in frames.placements.items():
+            self.links[link] = Link(link, source_location)
             self._add_fixed_joint(link, self.body_links[body], placement)
         effects = read_joint_effects(mjcf, self.series_joints, frames.link_of_site)
         drives = read_drives(mjcf, self.series_joints)
@@ -95,13 +102,13 @@ class _MjcfReader:
         for drive in drives if not active else ():
             # one joint of each drive: its other joints depend on that, or are other coordinates
             active += [x for x in drive.factors if x not in active][:1]
-        free = self._listed_joints("free")
+        free = tuple(self._listed_joints("free"))
         home, tip = self._read_home(), self._read_tip(tree)
         mjcf.warn_about_notes()
         home_locations = {f"home {joint}": self.joints[joint].source_location for joint in home}
         spec = MachineSpec(
-            name=self._custom_text("name") or mjcf.file.stem,
-            source=self._custom_text("source") or mjcf.file.name,
+            name=self.texts.get("name") or mjcf.file.stem,
+            source=self.texts.get("source") or mjcf.file.name,
             path=mjcf.file,
             chains=(chain,),
             tree=tree.tree,
@@ -114,7 +121,7 @@ class _MjcfReader:
             tip=tip,
             couplings=couplings,
             source_locations=source_locations(loops, couplings) | home_locations,
-            free=tuple(free),
+            free=free,
             drives=drives,
         )
         return with_rotation_vectors(spec)
@@ -131,9 +138,13 @@ class _MjcfReader:
         name = f"{link}_fixed"
         while name in self.joints or name in self.names:
             name += "_"
-        source_location = self.links[link].source_location
         self.joints[name] = Joint(
-            name, "fixed", parent, link, source_location, *xyz_rpy_from_se3(placement)
+            name,
+            "fixed",
+            parent,
+            link,
+            self.links[link].source_location,
+            *xyz_rpy_from_se3(placement),
         )
 
     def _read_body(self, body: int) -> None:
@@ -147,16 +158,12 @@ class _MjcfReader:
         rotation = inertia_pose.rotation
         tensor = rotation @ np.diag(model.body_inertia[body]) @ rotation.T
         first = model.body_jntadr[body]
-        joints = range(first, first + model.body_jntnum[body])
-        for joint in joints:
-            if self.mjcf.joint_type(joint) in ("BALL", "FREE"):
-                tensor = tensor + isotropic_rotor_inertia(self.mjcf, joint) * np.eye(3)
-        inertia = pin.Inertia(float(model.body_mass[body]), inertia_pose.translation, tensor)
         parent = self.body_links[model.body_parentid[body]]
         placement = pose(model.body_quat[body], model.body_pos[body])
         series_joints: list[Joint] = []
         previous_anchor = np.zeros(3)  # anchor of the previous joint, in the body's frame
-        for joint in joints:
+        for joint in range(first, first + model.body_jntnum[body]):
+            tensor = tensor + isotropic_rotor_inertia(self.mjcf, joint) * np.eye(3)
             if model.jnt_type[joint] == 0:
                 placement = pin.SE3.Identity()
             offset = pin.SE3(np.eye(3), model.jnt_pos[joint] - previous_anchor)
@@ -164,14 +171,14 @@ class _MjcfReader:
             new_joints = self._read_joint(joint, offset if series_joints else placement * offset)
             self.series_joints[joint] = [part.name for part in new_joints]
             series_joints += new_joints
+        inertia = pin.Inertia(float(model.body_mass[body]), inertia_pose.translation, tensor)
         self.links[name] = Link(name, source_location, inertial_from_inertia(inertia))
-        for i, part in enumerate(series_joints):
-            last = i == len(series_joints) - 1
-            child = name
-            if not last or previous_anchor.any():
-                child = self._unique_link_name(f"{name}_{i + 1}")
+        for i, part in enumerate(series_joints, start=1):
+            child, is_last = name, i == len(series_joints)
+            if not is_last or previous_anchor.any():
+                child = self._unique_link_name(f"{name}_{i}")
                 self.links[child] = Link(
-                    child, source_location, composite_joint=None if last else name
+                    child, source_location, composite_joint=None if is_last else name
                 )
             if part.name in self.joints:
                 raise DescriptionError(
@@ -211,7 +218,6 @@ class _MjcfReader:
         return [Joint(name, joint_type, "", "", source_location, *place, to_vector(axis), limits)]
 
     def _read_frames(self) -> MjcfFrames:
-        """Return the frames of the sites."""
         frames = MjcfFrames(used_names=set(self.links))
         model = self.model
         for site in range(model.nsite):
@@ -250,26 +256,16 @@ class _MjcfReader:
                 )
         return home
 
-    def _custom_text(self, name: str) -> str:
-        """Return a `<text>` under `<custom>`, "" if there is none."""
-        model = self.model
-        for index in range(model.ntext):
-            if self.mjcf.element_name("TEXT", index) == name:
-                start = model.text_adr[index]
-                raw = bytes(model.text_data[start : start + model.text_size[index]])
-                return raw.split(b"\0")[0].decode("utf-8", "replace").strip()
-        return ""
-
     def _listed_joints(self, name: str) -> list[str]:
         """Return the joints that a `<text>` lists, none if one of them is unknown."""
-        joints = [word for word in self._custom_text(name).split(", ") if word]
+        joints = [word for word in self.texts.get(name, "").split(", ") if word]
         if all(joint in self.joints for joint in joints):
             return joints
         self.mjcf.note_unsupported(f"the text '{name}', which names no joints", *joints)
         return []
 
     def _read_tip(self, tree: TreeBuilder) -> str | None:
-        if not (tip := self._custom_text("tip")):
+        if not (tip := self.texts.get("tip")):
             return tree.single_leaf_link()
         if tip in tree.links and tree.is_movable(tip):
             return tip

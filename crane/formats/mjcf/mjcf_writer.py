@@ -18,7 +18,7 @@ from crane.formats.urdf.urdf_writer import (
     solve_coupling,
     warn_about_unsupported,
 )
-from crane.formats.urdf_elements import finite_limits, format_numbers
+from crane.formats.xml_file import finite_limits, format_numbers
 from crane.machine.machine import Machine
 
 _HINGE_POINT_DISTANCE = 0.1  # [m] between the two points that define a hinge
@@ -126,8 +126,12 @@ class _MjcfWriter:
             if item.between is not None:
                 self._add_spatial_tendon(tendons, item, item.between)
         self.root.extend(part for part in (tendons, equality, actuator) if len(part))
-        keyframe = add(self.root, "keyframe")
-        add(keyframe, "key", name="home", qpos=format_numbers(self.home_coordinates))
+        add(
+            add(self.root, "keyframe"),
+            "key",
+            name="home",
+            qpos=format_numbers(self.home_coordinates),
+        )
         return format_document(self.root, origin_text(self.machine))
 
     def _add_texts(self) -> None:
@@ -180,8 +184,9 @@ class _MjcfWriter:
         if column in machine.coordinates.floating_base_columns:
             etree.SubElement(body, "freejoint", name=name)
             data = self.model.createData()
-            configuration = machine.coordinates.configuration(machine.home)
-            pin.forwardKinematics(self.model, data, configuration)
+            pin.forwardKinematics(
+                self.model, data, machine.coordinates.configuration(machine.home)
+            )
             *position, x, y, z, w = pin.SE3ToXYZQUAT(data.oMi[joint])  # in the world
             self.home_coordinates += [float(value) for value in (*position, w, x, y, z)]
             return
@@ -194,22 +199,19 @@ class _MjcfWriter:
         }
         if (limits := finite_limits(tree_joint.limits)) is not None:
             values |= {"limited": "true", "range": format_numbers(limits)}
-        if tree_joint.rotor_inertia:
-            values["armature"] = format_numbers([tree_joint.rotor_inertia])
         friction = machine.friction.get(name, Friction())
         joint_elements = [item for item in machine.forces if item.joint == name]
         stiffness = sum(item.stiffness for item in joint_elements)
-        damping = sum(item.damping for item in joint_elements) + friction.viscous
-        if damping:
-            values["damping"] = format_numbers([damping])
-        if friction.coulomb:
-            values["frictionloss"] = format_numbers([friction.coulomb])
+        effects = {
+            "armature": tree_joint.rotor_inertia,
+            "damping": sum(item.damping for item in joint_elements) + friction.viscous,
+            "frictionloss": friction.coulomb,
+            "stiffness": stiffness,
+        }
+        values |= {key: format_numbers([value]) for key, value in effects.items() if value}
         if stiffness:
             rest = sum(item.stiffness * item.rest for item in joint_elements) / stiffness
-            values |= {
-                "stiffness": format_numbers([stiffness]),
-                "springref": format_numbers([rest]),
-            }
+            values["springref"] = format_numbers([rest])
         etree.SubElement(body, "joint", values)
         self.home_coordinates.append(float(machine.home[column]))
 
@@ -249,11 +251,10 @@ class _MjcfWriter:
             )
         etree.SubElement(equality, "connect", {"name": f"{loop.name}_1", **sites})
         axis_offset = pin.SE3(np.eye(3), _HINGE_POINT_DISTANCE * np.array(loop.axis))
-        for i, (body, placement, _) in enumerate(ends, start=1):
-            end = ("predecessor", "successor")[i - 1]
-            sites[f"site{i}"] = self._add_site(
-                body, f"{loop.name}_{end}_axis", placement * axis_offset
-            )
+        for key, side, end in zip(
+            ("site1", "site2"), ("predecessor", "successor"), ends, strict=True
+        ):
+            sites[key] = self._add_site(end[0], f"{loop.name}_{side}_axis", end[1] * axis_offset)
         etree.SubElement(equality, "connect", {"name": f"{loop.name}_2", **sites})
 
     def _add_coupling(

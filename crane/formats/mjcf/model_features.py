@@ -70,8 +70,9 @@ class JointEffects:
             if value:
                 values[joint] = values.get(joint, 0.0) + value
         if square * stiffness:
-            spring = ForceElement(joint, stiffness=square * stiffness, rest=rest / factor)
-            self.springs.append(spring)
+            self.springs.append(
+                ForceElement(joint, stiffness=square * stiffness, rest=rest / factor)
+            )
 
     @property
     def friction(self) -> dict[str, Friction]:
@@ -146,13 +147,15 @@ def straight_tendon_sites(mjcf: MujocoFile, tendon: int) -> tuple[int, int] | No
 
 
 def isotropic_rotor_inertia(mjcf: MujocoFile, joint: int) -> float:
-    """Return the rotor inertia [kg m2] that a ball or free joint adds to its body, isotropic.
+    """Return the rotor inertia [kg m2] that a ball or free joint adds to its body, else 0.
 
     Rotors turn with the body against its parent, so they belong to the body if the parent is
     fixed.
     """
     model, dof = mjcf.model, int(mjcf.model.jnt_dofadr[joint])
-    rotor = float(model.dof_armature[dof + 3 * (mjcf.joint_type(joint) == "FREE")])
+    if (kind := mjcf.joint_type(joint)) not in ("BALL", "FREE"):
+        return 0.0
+    rotor = float(model.dof_armature[dof + 3 * (kind == "FREE")])
     if rotor and model.body_weldid[model.body_parentid[model.jnt_bodyid[joint]]]:
         mjcf.note_unsupported_elements(
             "armature of ball joints on moving bodies", "JOINT", [joint]
@@ -173,7 +176,6 @@ def _add_tendon_effects(
     slack_length, taut_length = (float(x) for x in model.tendon_lengthspring[tendon])
     is_spring, supported = slack_length == taut_length, set[str]()
     ends = straight_tendon_sites(mjcf, tendon)
-    is_along_joint = factors is not None and len(factors) == 1
     is_rope = ends is not None and slack_length == 0
     if (is_spring or is_rope) and tendon not in nonzero_rows(model, "tendon_stiffnesspoly"):
         supported.add("stiffness")
@@ -181,7 +183,7 @@ def _add_tendon_effects(
         supported.add("damping")
     stiffness *= "stiffness" in supported
     damping *= "damping" in supported
-    if factors is not None and is_along_joint:
+    if factors is not None and len(factors) == 1:
         supported |= {"friction", "armature"}
         ((joint, factor),) = factors.items()
         effects.add_along(
@@ -255,14 +257,14 @@ def read_drives(mjcf: MujocoFile, series_joints: Mapping[int, Sequence[str]]) ->
             tendon = fixed_tendon_factors(mjcf, target) or {}
             name = mjcf.name("TENDON", target)
             factors = {series_joints[joint][0]: factor for joint, factor in tendon.items()}
+        elif kind == "JOINT" and len(series_joints[target]) > 1:
+            used_joints = {joint for drive in found.values() for joint in drive.factors}
+            factors = _multi_freedom_factors(mjcf, actuator, series_joints[target], used_joints)
         elif kind == "JOINT":
             factors = dict.fromkeys(series_joints[target], 1.0)
-            if len(factors) > 1:
-                used_joints = {joint for drive in found.values() for joint in drive.factors}
-                factors = _multi_freedom_factors(mjcf, actuator, [*factors], used_joints)
-            if len(factors) == 1:
-                (name,) = factors
-                factors = {name: 1.0}
+        if kind == "JOINT" and len(factors) == 1:
+            (name,) = factors
+            factors = {name: 1.0}
         if factors:
             found.setdefault(name, Drive(name, factors))
         else:

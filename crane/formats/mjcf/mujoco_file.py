@@ -82,27 +82,24 @@ def _count_elements(
 
 
 def _check_sizes(xml: XmlFile, element: etree._Element) -> None:
-    keys, maximum = _SIZE_ATTRIBUTES.get(element.tag, ((), 0))
+    keys, maximum = _SIZE_ATTRIBUTES.get(element.tag, ((), math.inf))
     product = math.prod(max(abs(x), 1.0) for key in keys for x in _read_numbers(element, key))
-    if keys and product > maximum:
-        given = " ".join(f'{key}="{element.get(key)[:20]}"' for key in keys if element.get(key))
-        raise _size_error(xml, element, given, maximum)
-    maximum = _MAX_ATTRIBUTE_VALUES.get(element.tag, 0)
-    if not maximum or (element.tag != "size" and not element.get("builtin")):
-        return
-    for key in ("params",) if element.tag == "mesh" else element.keys():
-        if max(_read_numbers(element, key), default=0.0) > maximum and (
-            key not in _UNCHECKED_ATTRIBUTES
-        ):
-            raise _size_error(xml, element, f'{key}="{element.get(key)[:20]}"', maximum)
-
-
-def _size_error(
-    xml: XmlFile, element: etree._Element, attributes: str, maximum: float
-) -> DescriptionError:
-    return xml.error_at(
-        element, f"{attributes} of <{element.tag}> is too large, make it at most {maximum}"
-    )
+    sizes: list[tuple[tuple[str, ...], float, float]] = [(keys, product, maximum)]
+    if element.tag == "size" or (element.tag in _MAX_ATTRIBUTE_VALUES and element.get("builtin")):
+        maximum = _MAX_ATTRIBUTE_VALUES[element.tag]
+        sizes += [
+            ((key,), max(_read_numbers(element, key), default=0.0), maximum)
+            for key in (("params",) if element.tag == "mesh" else element.keys())
+            if key not in _UNCHECKED_ATTRIBUTES
+        ]
+    for keys, size, maximum in sizes:
+        if size > maximum:
+            given = " ".join(
+                f'{key}="{element.get(key)[:20]}"' for key in keys if element.get(key)
+            )
+            raise xml.error_at(
+                element, f"{given} of <{element.tag}> is too large, make it at most {maximum}"
+            )
 
 
 def _read_numbers(element: etree._Element, key: str) -> list[float]:
@@ -357,8 +354,9 @@ def nonzero_rows(model: Any, field: str) -> list[int]:
     values = getattr(model, field, None)
     if values is None or not np.size(values):
         return []
-    is_nonzero = np.any(np.reshape(values, (len(values), -1)), axis=1)
-    return [int(row) for row in np.flatnonzero(is_nonzero)]
+    return [
+        int(row) for row in np.flatnonzero(np.any(np.reshape(values, (len(values), -1)), axis=1))
+    ]
 
 
 def pose(quaternion: np.ndarray, position: np.ndarray) -> pin.SE3:

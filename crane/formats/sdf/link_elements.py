@@ -15,8 +15,8 @@ from crane.description.kinematic_tree import Inertial
 from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
 from crane.formats.sdf.frame_poses import SdfFramePoses
 from crane.formats.sdf.model_scope import ModelScope, NoteFunction, SdfElement
-from crane.formats.urdf_elements import TENSOR_ATTRIBUTES, add_inertial, add_origin
-from crane.formats.visuals.mesh_files import find_mesh_file, read_meshes
+from crane.formats.visuals.urdf_shapes import find_mesh_file, read_meshes
+from crane.formats.xml_file import TENSOR_ATTRIBUTES, add_inertial, add_origin
 
 _DEFAULT_DENSITY = 1000.0  # [kg/m3], default of SDF
 
@@ -55,8 +55,9 @@ def add_link_inertial(
     else:
         placement, _ = inertial_element.read_pose()
         tensor = (tensor_element.number(key, float(key[1] == key[2])) for key in TENSOR_ATTRIBUTES)
-        mass = inertial_element.number("mass", 1.0)
-        inertial = Inertial(mass, *xyz_rpy_from_se3(placement), tuple(tensor))
+        inertial = Inertial(
+            inertial_element.number("mass", 1.0), *xyz_rpy_from_se3(placement), tuple(tensor)
+        )
     add_inertial(element, inertial)
 
 
@@ -111,8 +112,9 @@ def solid_inertia(shape: SdfElement, density: float) -> pin.Inertia:
     if tag == "cylinder":
         return pin.Inertia.FromCylinder(mass, radius, length)
     if tag == "capsule":  # its length is between the centres of the spheres
-        sphere_mass = density * 4 / 3 * math.pi * radius**3
-        return pin.Inertia.FromCapsule(mass + sphere_mass, radius, length)
+        return pin.Inertia.FromCapsule(
+            mass + (density * 4 / 3 * math.pi * radius**3), radius, length
+        )
     transverse_factor = 3 / 80 * (4 * radius**2 + length**2)  # a cone with its tip at length / 2
     moments = mass / 3 * np.diag([transverse_factor, transverse_factor, 0.3 * radius**2])
     return pin.Inertia(mass / 3, np.array([0.0, 0.0, -length / 4]), moments)
@@ -229,7 +231,6 @@ def add_shapes(
 
 
 def _geometry_shape(item: SdfElement) -> SdfElement | None:
-    """Return the shape in the `<geometry>` of a visual or collision."""
     geometry = item.single_child("geometry")
     tags = [] if geometry is None else [x.tag for x in geometry.element if isinstance(x.tag, str)]
     return geometry.single_child(tags[0]) if geometry is not None and tags else None

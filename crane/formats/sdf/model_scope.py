@@ -101,8 +101,9 @@ class SdfElement:
 
     def parse_numbers(self, count: int, description: str) -> tuple[float, ...]:
         """Return the numbers in the text of this element."""
-        text = self.element.text or ""
-        return self.xml.parse_numbers(self.element, text, f"{description} of {self.label}", count)
+        return self.xml.parse_numbers(
+            self.element, self.element.text or "", f"{description} of {self.label}", count
+        )
 
     def direction(self, tag: str) -> np.ndarray:
         """Return the unit vector (3,) of a child, z without one.
@@ -145,7 +146,6 @@ class ModelScope:
         item: Its element; for an included model the element in the included file.
         prefix: Prefix of the names of its links in the whole machine.
         parent: The scope that contains it.
-        version: SDF version of its file.
         links: Links by name.
         joints: Joints by name.
         frames: Frames by name.
@@ -156,7 +156,6 @@ class ModelScope:
     item: SdfElement
     prefix: str
     parent: "ModelScope | None"
-    version: tuple[int, int]
     links: dict[str, SdfElement] = field(default_factory=dict)
     joints: dict[str, SdfElement] = field(default_factory=dict)
     frames: dict[str, SdfElement] = field(default_factory=dict)
@@ -228,7 +227,7 @@ class ModelReader:
         if len(worlds) > 1:
             raise self.xml.error_at(worlds[1], f"{len(worlds)} worlds in one file, keep one")
         top = SdfElement(self.xml, worlds[0] if worlds else root, "the world")
-        scope = ModelScope(top, "", None, _parse_version(root.get("version", "")))
+        scope = ModelScope(top, "", None)
         self._read_children(scope, scope.item, 0)
         if not scope.models:
             raise self.xml.error_at(
@@ -237,12 +236,15 @@ class ModelReader:
         return scope
 
     def _read_children(self, scope: ModelScope, item: SdfElement, depth: int) -> None:
+        self._model_count += 1
+        if depth > _MAX_DEPTH or self._model_count > _MAX_MODELS:
+            raise item.error("models include each other without end, break it")
         parts_by_tag = {"link": scope.links, "joint": scope.joints, "frame": scope.frames}
         for child in item.element:
             tag = child.tag
             part = item.wrap(child, f"{tag} '{child.get('name', '')}'")
             if tag == "model":
-                self._add_model(scope, part, None, scope.version, depth)
+                self._add_model(scope, part, None, depth)
             elif tag == "include":
                 self._read_include(scope, item.wrap(child, "an include"), depth)
             if tag not in parts_by_tag:
@@ -259,13 +261,9 @@ class ModelReader:
         parent_scope: ModelScope,
         item: SdfElement,
         include: SdfElement | None,
-        version: tuple[int, int],
         depth: int,
     ) -> None:
-        self._model_count += 1
-        if depth > _MAX_DEPTH or self._model_count > _MAX_MODELS:
-            raise item.error("models include each other without end, break it")
-        scope = ModelScope(item, "", parent_scope, version, include_element=include)
+        scope = ModelScope(item, "", parent_scope, include_element=include)
         name = scope.name
         if not name:
             raise item.error('a model has no name, add name="..."')
@@ -289,7 +287,14 @@ class ModelReader:
                 f"there is no model '{uri}', say where it is: --packages FOLDER, packages=[...] "
                 "in Python",
             )
-        xml = self._open_file(file.resolve())
+        file = file.resolve()
+        if file not in self._files:
+            self._files[file] = XmlFile(file)
+        xml = self._files[file]
+        if xml.root.tag != "sdf":
+            raise xml.error_at(
+                xml.root, f"an SDF starts with <sdf>, this file with <{xml.root.tag}>"
+            )
         models = xml.root.findall("model")
         if len(models) != 1:
             if scope.parent is None and (xml.root.find("light") is not None):
@@ -301,38 +306,28 @@ class ModelReader:
         if include.element.get("merge", "").lower() in ("true", "1"):
             self._merge_model(scope, item, include, depth)
             return
-        self._add_model(scope, item, include, _parse_version(xml.root.get("version", "")), depth)
+        self._add_model(scope, item, include, depth)
 
     def _merge_model(
         self, scope: ModelScope, item: SdfElement, include: SdfElement, depth: int
     ) -> None:
         """Add the parts of a model to the including model, with a frame for its pose."""
-        if depth > _MAX_DEPTH:
-            raise item.error("models include each other without end, break it")
         name = f"_merged__{include.text('name') or item.name}__model__"
-        version = _parse_version(item.xml.root.get("version", ""))
-        inner = ModelScope(item, scope.prefix, scope, version, include_element=include)
+        inner = ModelScope(item, scope.prefix, scope, include_element=include)
         self._read_children(inner, SdfElement(item.xml, item.element, item.label, name), depth + 1)
         placed = inner.pose_element
         scope.frames[name] = SdfElement(
             placed.xml, placed.element, placed.label, include.base_frame, inner
         )
-        for own_parts, merged_parts in (
-            (scope.links, inner.links), (scope.joints, inner.joints), (scope.frames, inner.frames),
-        ):  # fmt: skip
-            for key, part in merged_parts.items():
-                if own_parts.setdefault(key, part) is not part:
-                    raise include.error(f"merging brings a second '{key}', rename one")
+        merged_parts = [
+            *((scope.links, x) for x in inner.links.items()),
+            *((scope.joints, x) for x in inner.joints.items()),
+            *((scope.frames, x) for x in inner.frames.items()),
+        ]
+        for own_parts, (key, part) in merged_parts:
+            if own_parts.setdefault(key, part) is not part:
+                raise include.error(f"merging brings a second '{key}', rename one")
         scope.models |= inner.models
-
-    def _open_file(self, file: Path) -> XmlFile:
-        if file not in self._files:
-            self._files[file] = xml = XmlFile(file)
-            if xml.root.tag != "sdf":
-                raise xml.error_at(
-                    xml.root, f"an SDF starts with <sdf>, this file with <{xml.root.tag}>"
-                )
-        return self._files[file]
 
 
 def _file_from_config(folder: Path) -> Path:
@@ -341,12 +336,13 @@ def _file_from_config(folder: Path) -> Path:
     for element in XmlFile(config).root.iterfind("sdf") if config.is_file() else ():
         file = folder / (element.text or "").strip()
         if file.is_file():
-            existing[_parse_version(element.get("version", ""))] = file
+            existing[sdf_version(element)] = file
     return existing[max(existing)] if existing else folder / "model.sdf"
 
 
-def _parse_version(text: str) -> tuple[int, int]:
-    major, _, minor = text.strip().partition(".")
+def sdf_version(element: etree._Element) -> tuple[int, int]:
+    """Return the SDF version that an element names, by default 1.6."""
+    major, _, minor = element.get("version", "").strip().partition(".")
     try:
         return int(major), int(minor.partition(".")[0])
     except ValueError:

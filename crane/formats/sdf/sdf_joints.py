@@ -14,7 +14,7 @@ import pinocchio as pin
 from crane.common.errors import suggest_names
 from crane.description.kinematic_tree import Limits, parse_limit
 from crane.formats.sdf.frame_poses import SdfFramePoses, find_link
-from crane.formats.sdf.model_scope import ModelScope, SdfElement
+from crane.formats.sdf.model_scope import ModelScope, SdfElement, sdf_version
 
 WORLD_NODE = "::world"  # not a possible name of a link
 _SINGLE_FREEDOM_TYPES = {
@@ -138,10 +138,10 @@ class SdfJoints:
     def _read_joint(self, scope: ModelScope, joint: SdfElement) -> None:
         kind = joint.attribute("type")
         if kind not in JOINT_TYPES:
-            problem = "no type"
-            if kind:
-                problem = f"the type '{kind}', {suggest_names(JOINT_TYPES, kind)}"
-            raise joint.error(f"{joint.label} has {problem}")
+            problem = f"the type '{kind}'" if kind else "no type"
+            raise joint.error(
+                f"{joint.label} has {problem}, {suggest_names(JOINT_TYPES, kind or None)}"
+            )
         name = f"{scope.prefix}{joint.name}"
         ends = self._end_node(scope, joint, "parent"), self._end_node(scope, joint, "child")
         if ends[0] == ends[1]:
@@ -149,8 +149,9 @@ class SdfJoints:
         placement_in_scope = self._frames.element_pose(
             scope, joint, "" if ends[1] == WORLD_NODE else joint.text("child")
         )
-        scope_pose = self._frames.nested_model_pose(self._top, scope, scope.item)
-        placement = scope_pose * placement_in_scope
+        placement = (
+            self._frames.nested_model_pose(self._top, scope, scope.item) * placement_in_scope
+        )
         tags = [] if kind in _AXISLESS_TYPES else ["axis"]
         if kind in (*_TWO_FREEDOM_TYPES, "gearbox"):
             tags = ["axis", "axis2"]
@@ -159,8 +160,11 @@ class SdfJoints:
         if kind == "gearbox":
             reference = self._end_node(scope, joint, "gearbox_reference_body")
             first, second = (np.asarray(placement.rotation @ axis.direction) for axis in axes)
-            ratio = joint.number("gearbox_ratio", 1.0)
-            self.gearboxes.append(Gearbox(reference, ends, (first, second), ratio, joint))
+            self.gearboxes.append(
+                Gearbox(
+                    reference, ends, (first, second), joint.number("gearbox_ratio", 1.0), joint
+                )
+            )
         elif kind in _TWO_FREEDOM_TYPES:
             parts = [f"{name}_1", f"{name}_2"]
             self._freedom_names[name] = parts
@@ -228,7 +232,7 @@ class SdfJoints:
         child = axis.single_child("xyz")
         frame_name = "" if child is None else child.attribute("expressed_in")
         is_in_model_frame = axis.text("use_parent_model_frame").lower() in ("true", "1")
-        if not frame_name and (scope.version <= (1, 4) or is_in_model_frame):
+        if not frame_name and (sdf_version(axis.xml.root) <= (1, 4) or is_in_model_frame):
             frame_name = "__model__"
         if not frame_name:
             return xyz
@@ -258,8 +262,11 @@ class SdfJoints:
 
     def _read_mimic(self, scope: ModelScope, joint: SdfElement) -> None:
         """Read axes that mimic an axis of another joint."""
-        own_freedoms = self._freedom_names.get(f"{scope.prefix}{joint.name}", [])
-        for name, tag in zip(own_freedoms, ("axis", "axis2"), strict=False):
+        for name, tag in zip(
+            self._freedom_names.get(f"{scope.prefix}{joint.name}", []),
+            ("axis", "axis2"),
+            strict=False,
+        ):
             axis = joint.single_child(tag)
             mimic = None if axis is None else axis.single_child("mimic")
             if mimic is None:

@@ -37,14 +37,15 @@ from crane.formats.sdf.spanning_tree import (
     ground_edges,
     spanning_tree,
 )
-from crane.formats.urdf_elements import (
+from crane.formats.xml_file import (
+    XmlFile,
     add_friction,
     add_joint,
     add_origin,
     finite_limits,
     format_numbers,
+    set_source_location,
 )
-from crane.formats.xml_file import XmlFile, set_source_location
 
 _IDENTITY_TOLERANCE = 1e-15
 _MAX_SHOWN_NAMES = 4  # of unsupported elements in a warning
@@ -89,34 +90,31 @@ def translate_to_urdf(xml: XmlFile) -> tuple[XmlFile, tuple[ForceElement, ...]]:
 
 def _choose_model(xml: XmlFile, world: ModelScope) -> ModelScope:
     """Return the only movable model, or the model that the load argument `model` names."""
-    model_name = load_options().arguments.get("model")
+    model_name, problem = load_options().arguments.get("model"), "none of its models moves"
     names = list(world.models)
-    if model_name is not None:
-        if model_name in world.models:
-            return world.models[model_name]
-        raise DescriptionError(
-            f"{xml.file.name}: no model '{model_name}', {suggest_names(names, model_name)}"
+    candidates = [name for name in names if model_name in (None, name)]
+    if not candidates:
+        problem = f"no model '{model_name}', {suggest_names(names, model_name)}"
+    elif len(candidates) > 1:
+        problem += f" ({', '.join(names)})"
+        candidates = [
+            name
+            for name, model in world.models.items()
+            if not model.is_static
+            and any(
+                joint.element.get("type") != "fixed"
+                for scope in model.nested_scopes()
+                for joint in scope.joints.values()
+            )
+        ]
+    if len(candidates) == 1:
+        return world.models[candidates[0]]
+    if candidates:
+        problem = (
+            f"{len(candidates)} models move ({', '.join(candidates)}), choose one: "
+            "--arg model:=NAME, arguments={'model': NAME} in Python"
         )
-    if len(names) == 1:
-        return world.models[names[0]]
-    moving = [
-        name
-        for name, model in world.models.items()
-        if not model.is_static
-        and any(
-            joint.element.get("type") != "fixed"
-            for scope in model.nested_scopes()
-            for joint in scope.joints.values()
-        )
-    ]
-    if len(moving) == 1:
-        return world.models[moving[0]]
-    if not moving:
-        raise DescriptionError(f"{xml.file.name}: none of its models moves ({', '.join(names)})")
-    raise DescriptionError(
-        f"{xml.file.name}: {len(moving)} models move ({', '.join(moving)}), choose one: "
-        "--arg model:=NAME, arguments={'model': NAME} in Python"
-    )
+    raise DescriptionError(f"{xml.file.name}: {problem}")
 
 
 class _SdfTranslation:
@@ -174,20 +172,22 @@ class _SdfTranslation:
         if self._initial_positions:
             state = etree.SubElement(self._robot, "group_state", name="home", group="all")
             for name, axis in self._initial_positions:
-                initial = etree.SubElement(state, "joint", name=name, value=repr(axis.initial))
-                self._set_source_location(initial, axis.item)
+                self._set_source_location(
+                    etree.SubElement(state, "joint", name=name, value=repr(axis.initial)),
+                    axis.item,
+                )
         self._notes.warn_about_notes()
         return XmlFile(self._xml.file, self._robot, self._locations), tuple(self._springs)
 
-    def _set_source_location(self, element: etree._Element, item: SdfElement) -> etree._Element:
+    def _set_source_location(self, element: etree._Element, item: SdfElement) -> None:
         for inner in element.iter(etree.Element):
             set_source_location(inner, item.source_location, self._locations)
-        return element
 
     def _add_links(self, edges: list[SdfJointEdge]) -> None:
         self._ground_link = self._unique_link_name("world")
-        ground = etree.SubElement(self._robot, "link", name=self._ground_link)
-        self._set_source_location(ground, self._top.item)
+        self._set_source_location(
+            etree.SubElement(self._robot, "link", name=self._ground_link), self._top.item
+        )
         bodies = _rigid_bodies(edges)
         for name, link in self._links.items():
             scope = self._scopes[name]
@@ -213,9 +213,10 @@ class _SdfTranslation:
         parent, child = (edge.parent, edge.child) if is_forward else (edge.child, edge.parent)
         axis = edge.axis
         placement = xyz_rpy_from_se3(self._link_poses[parent].actInv(edge.placement))
-        kind = {"ball": "spherical"}.get(edge.kind, edge.kind)
         ends = self._link_name(parent), self._joint_child_link(edge, child)
-        joint = Joint(edge.name, kind, *ends, "", *placement)
+        joint = Joint(
+            edge.name, {"ball": "spherical"}.get(edge.kind, edge.kind), *ends, "", *placement
+        )
         if axis is not None:
             direction = to_vector(axis.direction if is_forward else -axis.direction)
             joint = dataclasses.replace(joint, axis=direction, limits=axis.limits)
@@ -239,8 +240,9 @@ class _SdfTranslation:
             return self._link_name(link)
         name = self._unique_link_name(f"{edge.name}_frame")
         self._set_source_location(etree.SubElement(self._robot, "link", name=name), edge.item)
-        placement = xyz_rpy_from_se3(offset)
-        fixed = Joint(f"{name}_fixed", "fixed", name, self._link_name(link), "", *placement)
+        fixed = Joint(
+            f"{name}_fixed", "fixed", name, self._link_name(link), "", *xyz_rpy_from_se3(offset)
+        )
         self._set_source_location(add_joint(self._robot, fixed), edge.item)
         return name
 
@@ -253,12 +255,11 @@ class _SdfTranslation:
     def _add_mimics(self, followers: list[CoupledCoordinate], joints: set[str]) -> None:
         elements = {joint.get("name"): joint for joint in self._robot.iterfind("joint")}
         for follower in followers:
-            for name in (follower.name, follower.leader):
-                if name not in joints:
-                    raise follower.item.error(
-                        f"{follower.item.label}: joint '{name}' is coupled and closes a loop of "
-                        "coupled joints, leave one of them out",
-                    )
+            if missing := [x for x in (follower.name, follower.leader) if x not in joints]:
+                raise follower.item.error(
+                    f"{follower.item.label}: joint '{missing[0]}' is coupled and closes a loop of "
+                    "coupled joints, leave one of them out",
+                )
             joint = elements[follower.name]
             if joint.find("mimic") is not None:
                 raise follower.item.error(f"joint '{follower.name}' follows two others, keep one")
@@ -271,26 +272,27 @@ class _SdfTranslation:
     def _add_loops(self, loop_edges: list[SdfJointEdge], tree: list[SdfJointEdge]) -> None:
         bodies = _rigid_bodies(tree)
         for edge in loop_edges:
-            if bodies.representative(edge.parent) == bodies.representative(edge.child):
-                if edge.kind != "fixed":
-                    raise edge.item.error(
-                        f"{edge.item.label} joins '{edge.parent}' and '{edge.child}', which are "
-                        "one body: leave it out",
-                    )
+            is_one_body = bodies.representative(edge.parent) == bodies.representative(edge.child)
+            if is_one_body and edge.kind == "fixed":
                 continue
-            kind = {"ball": "spherical"}.get(edge.kind, edge.kind)
+            if is_one_body:
+                raise edge.item.error(
+                    f"{edge.item.label} joins '{edge.parent}' and '{edge.child}', which are one "
+                    "body: leave it out",
+                )
+            kind, axis = {"ball": "spherical"}.get(edge.kind, edge.kind), edge.axis
             loop = etree.SubElement(self._robot, "loop", name=edge.name, type=kind)
             for tag, link in (("predecessor", edge.parent), ("successor", edge.child)):
                 end = etree.SubElement(loop, tag, link=self._link_name(link))
                 add_origin(end, *xyz_rpy_from_se3(self._link_poses[link].actInv(edge.placement)))
-            if edge.axis is not None:
-                etree.SubElement(loop, "axis", xyz=format_numbers(edge.axis.direction))
-                if finite_limits(edge.axis.limits) is not None:
-                    self._notes.note_unsupported("limits of joints that close loops", edge.name)
-                if edge.axis.damping or edge.axis.friction or edge.axis.stiffness:
-                    self._notes.note_unsupported(
-                        "friction and springs of joints that close loops", edge.name
-                    )
+            if axis is not None:
+                etree.SubElement(loop, "axis", xyz=format_numbers(axis.direction))
+            if axis is not None and finite_limits(axis.limits) is not None:
+                self._notes.note_unsupported("limits of joints that close loops", edge.name)
+            if axis is not None and (axis.damping or axis.friction or axis.stiffness):
+                self._notes.note_unsupported(
+                    "friction and springs of joints that close loops", edge.name
+                )
             self._set_source_location(loop, edge.item)
 
 

@@ -71,25 +71,19 @@ def breadth_first(
     edges: Sequence[SdfJointEdge], bodies: DisjointSets, root: str
 ) -> list[SdfJointEdge]:
     """Return joints that join sets of nodes, the nearest to the root first, and join the sets."""
-    edges_by_node: dict[str, list[SdfJointEdge]] = {}
+    edges_by_node: dict[str, list[tuple[SdfJointEdge, str]]] = {}  # with the other end
     for edge in edges:
-        for end in (edge.parent, edge.child):
-            edges_by_node.setdefault(bodies.representative(end), []).append(edge)
+        parent, child = bodies.representative(edge.parent), bodies.representative(edge.child)
+        edges_by_node.setdefault(parent, []).append((edge, child))
+        edges_by_node.setdefault(child, []).append((edge, parent))
     found: list[SdfJointEdge] = []
-    seen: set[str] = set()
     for start in (bodies.representative(root), *edges_by_node):
-        pending = [] if start in seen else [start]
-        seen.add(start)
+        pending = [start]
         for node in pending:
-            for edge in edges_by_node.get(node, ()):
-                ends = bodies.representative(edge.parent), bodies.representative(edge.child)
-                other_end = ends[ends[0] == node]
-                if other_end not in seen:
-                    seen.add(other_end)
+            for edge, other_end in edges_by_node.get(node, ()):
+                if bodies.join(edge.parent, edge.child):
                     pending.append(other_end)
                     found.append(edge)
-    for edge in found:
-        bodies.join(edge.parent, edge.child)
     return found
 
 
@@ -115,8 +109,11 @@ def gear_couplings(
             _gear_angle(edges, gear, bodies, link, direction)
             for link, direction in zip(gear.links, gear.directions, strict=True)
         )
-        multiplier = -gear.ratio * first_sign / second_sign
-        found.append(CoupledCoordinate(second, first, multiplier, 0.0, gear.item))
+        found.append(
+            CoupledCoordinate(
+                second, first, -gear.ratio * first_sign / second_sign, 0.0, gear.item
+            )
+        )
     return found
 
 

@@ -11,13 +11,13 @@ from lxml import etree
 from crane.common.errors import CraneWarning, suggest_names
 from crane.description.findings import FollowUpError, error_recovery, is_strict, report_error
 from crane.description.force_elements import Friction
-from crane.description.inertia_feasibility import inertia_problem
 from crane.description.kinematic_tree import (
     MULTI_FREEDOM_TYPES,
     Inertial,
     Joint,
     Limits,
     Link,
+    inertia_problem,
     joint_freedoms,
     joint_series,
     parse_limit,
@@ -53,9 +53,9 @@ def read_link(xml: XmlFile, name: str, element: etree._Element, is_moved: bool) 
 
 def _read_inertial(xml: XmlFile, label: str, inertial: etree._Element, is_moved: bool) -> Inertial:
     mass_tag, tensor_tag = (xml.single_child(inertial, tag, label) for tag in ("mass", "inertia"))
-    for tag, link_inertial in (("mass", mass_tag), ("inertia", tensor_tag)):
-        if link_inertial is None:
-            report_error(xml.error_at(inertial, f"the inertial of {label} has no <{tag}>, add it"))
+    for tag in ("mass", "inertia"):
+        if inertial.find(tag) is None:
+            xml.report(inertial, f"the inertial of {label} has no <{tag}>, add it")
     com, rpy = xml.placement(inertial, label)
     if mass_tag is None or tensor_tag is None:
         raise FollowUpError(f"{label} has no inertia")
@@ -98,8 +98,7 @@ def read_joint(
     """
     label, kind = f"joint '{name}'", element.get("type")
     xyz, rpy = xml.placement(element, label)
-    place = xml.source_location(element)
-    joint = Joint(name, kind, *end_links, place, xyz, rpy, is_cut=is_cut)
+    joint = Joint(name, kind, *end_links, xml.source_location(element), xyz, rpy, is_cut=is_cut)
     if kind == "fixed":
         return joint
     return dataclasses.replace(
@@ -117,8 +116,7 @@ def read_multi_freedom_joint(
     label, kind = f"joint '{name}'", element.get("type")
     for tag in ("dynamics", "mimic"):
         if (found := xml.single_child(element, tag, label)) is not None:
-            problem = f"{label} is {kind}, for which <{tag}> has no meaning, remove it"
-            report_error(xml.error_at(found, problem))
+            xml.report(found, f"{label} is {kind}, for which <{tag}> has no meaning, remove it")
     axis = xml.direction(element, label, (1.0, 0.0, 0.0))
     placement = xml.placement(element, label)
     return joint_series(
@@ -130,7 +128,7 @@ def _read_maximum(xml: XmlFile, element: etree._Element, key: str, label: str) -
     """Read effort or velocity of a `<limit>`, infinite if it has none."""
     if element.get(key) is None:
         return math.inf
-    value: float = xml.number(element, key, f"the limit of {label}")
+    value = xml.number(element, key, f"the limit of {label}")
     if value < 0:
         raise xml.error_at(element, f"the {key} limit of {label} is negative, make it positive")
     return parse_limit(value) if math.isfinite(value) else math.inf
@@ -167,14 +165,15 @@ def read_limits(xml: XmlFile, name: str, joint: etree._Element) -> Limits:
     if lower == upper == 0 and not any(found.values()):
         _warn_about_missing_limits(xml, element, f"all limits of {label} are 0")
         return Limits(source_location=limits.source_location)
-    problem = ""
     if lower > upper:
-        problem = f"the limits of {label} are reversed ({lower:g} > {upper:g}), swap them"
+        xml.report(
+            element, f"the limits of {label} are reversed ({lower:g} > {upper:g}), swap them"
+        )
     if lower == upper:
-        both = f"lower and upper limit of {label} are both {lower:g}"
-        problem = f"{both}, widen them or make it fixed"
-    if problem:
-        report_error(xml.error_at(element, problem))
+        xml.report(
+            element,
+            f"lower and upper limit of {label} are both {lower:g}, widen them or make it fixed",
+        )
     return dataclasses.replace(limits, lower=parse_limit(lower), upper=parse_limit(upper))
 
 
@@ -231,11 +230,11 @@ def read_graph(
     parents: dict[str, tuple[str, str]] = {}  # link -> parent, joint
     for name, (parent, child) in end_links.items():
         if child in parents:
-            problem = (
+            xml.report(
+                joints[name],
                 f"link '{child}' has two parents, joints '{parents[child][1]}' and '{name}': "
-                "keep one and close the other as a loop"
+                "keep one and close the other as a loop",
             )
-            report_error(xml.error_at(joints[name], problem))
             cut_joints.add(name)
         elif child:
             parents[child] = (parent, name)
@@ -243,19 +242,20 @@ def read_graph(
     joined_count = len(parents)
     while (repeated_link := _link_in_cycle(parents, links)) is not None:
         closing_joint = parents[repeated_link][1]
-        problem = (
+        xml.report(
+            joints[closing_joint],
             f"link '{repeated_link}' is its own ancestor: cut the ring of joints "
-            f"{_loop_text(parents, repeated_link)} at '{closing_joint}' and close it as a loop"
+            f"{_loop_text(parents, repeated_link)} at '{closing_joint}' and close it as a loop",
         )
-        report_error(xml.error_at(joints[closing_joint], problem))
         cut_joints.add(closing_joint)
         del parents[repeated_link]
     # joints with errors, each of which may have had one of the roots as its child
     unplaced_count = len(xml.root.findall("joint")) - joined_count
     if len(roots) - unplaced_count > 1:
         listed = ", ".join(roots[:4]) + (", ..." if len(roots) > 4 else "")
-        problem = f"{len(roots)} links have no parent ({listed}): join all but one"
-        report_error(xml.error_at(links[roots[1]], problem))
+        xml.report(
+            links[roots[1]], f"{len(roots)} links have no parent ({listed}): join all but one"
+        )
     for name in cut_joints:
         end_links[name] = _NO_ENDS
     return end_links, roots[0] if roots else next(iter(links)), cut_joints
@@ -269,8 +269,7 @@ def _read_end_links(
     kind = joint.get("type")
     if kind not in kinds:
         problem = f"the type '{kind}', which is not supported" if kind else "no type"
-        hint = suggest_names(kinds, kind or None)
-        report_error(xml.error_at(joint, f"{label} has {problem}, {hint}"))
+        xml.report(joint, f"{label} has {problem}, {suggest_names(kinds, kind or None)}")
         similar = get_close_matches(kind or "", kinds, 1, 0.75)
         joint.set("type", similar[0] if similar else "revolute")
         limit = joint.find("limit")
@@ -281,8 +280,7 @@ def _read_end_links(
     _, parent = read_end_link(xml, joint, "parent", label, links, " link")
     _, child = read_end_link(xml, joint, "child", label, links, " link")
     if parent and parent == child:
-        problem = f"{label} joins link '{parent}' to itself, change one end"
-        report_error(xml.error_at(joint, problem))
+        xml.report(joint, f"{label} joins link '{parent}' to itself, change one end")
         return _NO_ENDS
     return parent, child
 

@@ -70,14 +70,15 @@ def _read_loop(
     label, source_location = f"loop '{name}'", xml.source_location(element)
     kind = element.get("type", "")
     if kind not in _LOOP_TYPES:
-        report_error(_loop_type_error(xml, element, label, kind, _LOOP_TYPES))
+        report_error(_type_error(xml, element, label, kind, _LOOP_TYPES))
     end_joints = []
     for end in ("predecessor", "successor"):
         tag, link = read_end_link(xml, element, end, label, links)
         frame = f"{name}_{end}"
         if frame in links:
-            problem = f"link '{frame}' has the name of a frame of {label}, rename one"
-            report_error(xml.error_at(links[frame], problem))
+            xml.report(
+                links[frame], f"link '{frame}' has the name of a frame of {label}, rename one"
+            )
         if tag is None:
             continue
         xyz, rpy = xml.placement(tag, f"the {end} of {label}")
@@ -92,12 +93,12 @@ def _read_loop(
     ), end_joints
 
 
-def _loop_type_error(
+def _type_error(
     xml: XmlFile, element: etree._Element, label: str, kind: str, known_types: Iterable[str]
 ) -> CraneError:
-    problem = f"the unknown type '{kind}'" if kind else "no type"
     hint = suggest_names(known_types, kind.removesuffix("_joint") or None)
-    return xml.error_at(element, f"{label} has {problem}, {hint}")
+    problem = f"the unknown type '{kind}', {hint}" if kind else f"no type, {hint}"
+    return xml.error_at(element, f"{label} has {problem}")
 
 
 def read_end_link(
@@ -124,13 +125,11 @@ def read_end_link(
     child = xml.single_child(element, tag, label)
     link = "" if child is None else child.get("link", "").strip()
     if not link:
-        problem = f'{label} has no {tag}{noun}, add <{tag} link="..."/>'
-        report_error(xml.error_at(element, problem))
+        xml.report(element, f'{label} has no {tag}{noun}, add <{tag} link="..."/>')
     elif link not in links and "link" in xml.unnamed_kinds:
         report_error(FollowUpError(f"link '{link}' may be the one without a name"))
     elif link not in links:
-        hint = suggest_names(links, link)
-        report_error(xml.error_at(child, f"{label} has the unknown {tag} '{link}', {hint}"))
+        xml.report(child, f"{label} has the unknown {tag} '{link}', {suggest_names(links, link)}")
     return child, link if link in links else ""
 
 
@@ -144,36 +143,30 @@ def independent_joints(
     Raises:
         DescriptionError: The attribute is neither true nor false, or belongs to a fixed joint.
     """
-    marked_joints = {
-        name: joint for name, joint in joints.items() if "independent" in joint.attrib
-    }
-    for name, joint in marked_joints.items():
-        value = joint.get("independent").lower()  # files of the authors of URDF+ have "True"
+    marks: dict[str, bool] = {}
+    for name, joint in joints.items():
+        value = joint.get("independent", "").lower()  # files of the authors of URDF+ have "True"
+        is_fixed = joint.get("type") == "fixed"
+        if "independent" not in joint.attrib:
+            continue
         if value not in ("true", "false"):
-            problem = f"independent=\"{value}\" of joint '{name}' is neither true nor false"
-            report_error(xml.error_at(joint, problem))
-            value = "true"
-        if value == "true" and joint.get("type") == "fixed":
-            problem = f"joint '{name}' is fixed and independent, keep one of the two"
-            report_error(xml.error_at(joint, problem))
-            value = "false"
-        joint.set("independent", value)
-    if not marked_joints:
+            xml.report(
+                joint, f"independent=\"{value}\" of joint '{name}' is neither true nor false"
+            )
+        elif value == "true" and is_fixed:
+            xml.report(joint, f"joint '{name}' is fixed and independent, keep one of the two")
+        marks[name] = value != "false" and not is_fixed
+    if not marks:
         return None
-    values = {joint.get("independent") for joint in marked_joints.values()}
-    if values == {"true", "false"} or (values == {"false"} and xml.root.find("loop") is None):
+    if False in marks.values() and (any(marks.values()) or xml.root.find("loop") is None):
         # by URDF+ joints without a mark are independent, too
-        marked_joints = {
-            name: joint
+        marks = {
+            name: marks.get(name, joint.find("mimic") is None and joint.get("type") != "fixed")
             for name, joint in joints.items()
-            if name in marked_joints
-            or (joint.find("mimic") is None and joint.get("type") != "fixed")
         }
     names: list[str] = []
-    for name, joint in marked_joints.items():
-        kind = joint.get("type")
-        if joint.get("independent") == "false":
-            continue
+    for name in (name for name, is_independent in marks.items() if is_independent):
+        kind = joints[name].get("type")
         if kind in MULTI_FREEDOM_TYPES:
             names += [f"{name}_{x[0]}" for x in joint_freedoms(kind, (0.0, 0.0, 1.0))]
         else:
@@ -229,7 +222,7 @@ def _convert_to_loop(xml: XmlFile, element: etree._Element) -> None:
             "a continuous joint about parent_axis, and close to that, with revolute",
         )
     if base_type not in _CONSTRAINT_TYPES:
-        raise _loop_type_error(xml, element, label, kind, _CONSTRAINT_TYPES)
+        raise _type_error(xml, element, label, kind, _CONSTRAINT_TYPES)
     element.set("type", _CONSTRAINT_TYPES[base_type])
     _check_axes(xml, element, label)
     for end, tag in _END_TAGS.items():
@@ -298,8 +291,7 @@ def read_coupling(
     label = f"coupling '{name}'"
     kind = element.get("type", _COUPLING_TYPES[0])
     if kind not in _COUPLING_TYPES:
-        hint = suggest_names(_COUPLING_TYPES, kind)
-        raise xml.error_at(element, f"{label} has the unknown type '{kind}', {hint}")
+        raise _type_error(xml, element, label, kind, _COUPLING_TYPES)
     parents = {
         child: (parent, joint) for joint, (parent, child) in end_links.items() if parent and child
     }

@@ -1,18 +1,19 @@
 """Strict reading of URDF files, with errors where other readers ignore mistakes."""
 
 import dataclasses
-from collections.abc import Callable, Collection, Container, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Collection, Container, Mapping, Sequence, Set
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from pathlib import Path
 
 from lxml import etree
 
-from crane.common.errors import suggest_names
+from crane.common.errors import CraneWarning, suggest_names
 from crane.description.findings import (
     FollowUpError,
     error_recovery,
     record_parsed_file,
-    report_error,
 )
 from crane.description.force_elements import ForceElement, Friction
 from crane.description.kinematic_tree import MULTI_FREEDOM_TYPES, Joint, Link, Tree
@@ -28,12 +29,12 @@ from crane.formats.urdf.link_joint_elements import (
     read_multi_freedom_joint,
 )
 from crane.formats.urdf.loop_elements import (
+    CONSTRAINT_HINT,
     independent_joints,
     read_constraints,
     read_coupling,
     read_loops,
 )
-from crane.formats.urdf.unknown_elements import warn_about_unknown_elements
 from crane.formats.xml_file import XmlFile
 
 _CHILDREN = {
@@ -73,6 +74,28 @@ _ATTRIBUTES = {
     "dynamics": {"damping", "friction"},
 }
 _CLOSED_ELEMENTS = {"origin", "axis", "mass", "inertia"}
+# Elements of simulators, controllers and planners (ROS, SRDF, Gazebo, Drake, PyBullet, MuJoCo,
+# PR2). Elements with a namespace belong to other programs, too.
+_FOREIGN_ELEMENTS = {
+    "robot": {
+        "sensor", "ros2_control", "mujoco", "group", "chain", "virtual_joint", "passive_joint",
+        "disable_collisions", "disable_default_collisions", "enable_collisions", "frame",
+        "self_collision_checking", "link_sphere_approximation", "collision_filter_group",
+        "actuator", "plugin", "version", "author", "license",
+    },
+    "link": {
+        "sensor", "contact", "contact_coefficients", "audio_source", "gravity", "kinematic",
+        "surface", "self_filter", "self_collision_checking", "collision_checking", "gazebo", "map",
+    },
+    "joint": {
+        "joint_properties", "map", "gazebo", "sensor", "hardwareInterface", "transmission",
+        "actuator", "mechanicalReduction", "rotor",
+    },
+    "collision": {"verbose", "contact_coefficients", "surface", "contact", "map"},
+    "visual": {"map"},
+}  # fmt: skip
+_MAX_WARNINGS = 3  # for one file
+_MIN_SIMILARITY = 0.6  # of a suggested name
 # elements of drafts of URDF+
 _OBSOLETE_ELEMENTS = {"loop_constraint": "loop", "joint_constraint": "coupling"}
 
@@ -132,7 +155,7 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
     record_parsed_file(xml)
     _check_elements(xml, edit)
     links, joints = _elements_by_name(xml, "link"), _elements_by_name(xml, "joint")
-    warn_about_unknown_elements(xml, _CHILDREN, _ATTRIBUTES, joints)
+    _warn_about_unknown_elements(xml, joints)
     if not links:
         raise xml.error_at(xml.root, "no <link> in this file, add one")
     end_links, root, cut = read_graph(xml, links, joints)
@@ -162,14 +185,13 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
         if (same_named := joints.get(frame.name)) is None:
             parts.append(frame)
         else:
-            problem = f"joint '{frame.name}' has the name of a loop's, rename it"
-            report_error(xml.error_at(same_named, problem))
+            xml.report(same_named, f"joint '{frame.name}' has the name of a loop's, rename it")
     couplings = _read_mimics(xml, joints, independent_names)
     for name, element in _elements_by_name(xml, "coupling").items():
         with error_recovery():
             couplings += (read_coupling(xml, name, element, joints, end_links, links),)
     tree = Tree({}, {}).with_parts(*parts)
-    home, home_lines = read_home(xml, {joint.name for joint in tree.moving_joints})
+    home, home_lines = _read_home(xml, {joint.name for joint in tree.moving_joints})
     return UrdfModel(
         file,
         xml.root.get("name") or file.stem,
@@ -181,7 +203,7 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
         couplings,
         home,
         home_lines,
-        read_tip(xml, links),
+        _read_tip(xml, links),
         is_complete=not xml.unnamed_kinds,
         springs=springs,
     )
@@ -198,8 +220,9 @@ def _check_elements(xml: XmlFile, edit: Callable[[XmlFile], None] | None) -> Non
         edit(xml)
     for tag, replacement_tag in _OBSOLETE_ELEMENTS.items():
         for element in xml.root.iterfind(tag):
-            problem = f"<{tag}> is not read, URDF+ has <{replacement_tag}> for it: write one"
-            report_error(xml.error_at(element, problem))
+            xml.report(
+                element, f"<{tag}> is not read, URDF+ has <{replacement_tag}> for it: write one"
+            )
 
 
 def _read_joint_series(
@@ -217,8 +240,7 @@ def _read_joint_series(
     for part in series_parts:
         kind, used_names = ("link", links) if isinstance(part, Link) else ("joint", joints)
         if part.name in used_names:
-            problem = f"its {kind} '{part.name}' is there already, rename one"
-            report_error(xml.error_at(joints[name], problem))
+            xml.report(joints[name], f"its {kind} '{part.name}' is there already, rename one")
         else:
             found.append(part)
     return found
@@ -276,29 +298,23 @@ def _elements_by_name(xml: XmlFile, kind: str) -> dict[str, etree._Element]:
         name = element.get("name", "").strip()
         if not name:
             xml.unnamed_kinds.add(kind)
-            report_error(xml.error_at(element, f'a {kind} has no name, add name="..."'))
+            xml.report(element, f'a {kind} has no name, add name="..."')
         elif name in found:
             xml.unnamed_kinds.add(kind)
             first = xml.source_location(found[name]).rpartition(":")[2]
-            problem = f"{kind} '{name}' is there twice (first in line {first}), rename one"
-            report_error(xml.error_at(element, problem))
+            xml.report(
+                element, f"{kind} '{name}' is there twice (first in line {first}), rename one"
+            )
         else:
             found[name] = element
     return found
 
 
-def read_home(xml: XmlFile, joints: Collection[str]) -> tuple[dict[str, float], dict[str, str]]:
+def _read_home(xml: XmlFile, joints: Collection[str]) -> tuple[dict[str, float], dict[str, str]]:
     """Read `<group_state name="home">`, an element of SRDF.
-
-    Args:
-        xml: The file.
-        joints: Names of the moving joints.
 
     Returns:
         Coordinates, and their files and lines, by joint.
-
-    Raises:
-        DescriptionError: A joint is unknown, fixed, repeated or has no number.
     """
     home: dict[str, float] = {}
     source_locations: dict[str, str] = {}
@@ -315,29 +331,17 @@ def read_home(xml: XmlFile, joints: Collection[str]) -> tuple[dict[str, float], 
     return home, source_locations
 
 
-def read_tip(xml: XmlFile, links: Mapping[str, etree._Element]) -> str | None:
-    """Read the link of `<end_effector name="tip" parent_link="LINK"/>`, an element of SRDF.
-
-    Args:
-        xml: The file.
-        links: The `<link>` elements by name.
-
-    Returns:
-        The link, None if there is no such element.
-
-    Raises:
-        DescriptionError: The link is unknown.
-    """
+def _read_tip(xml: XmlFile, links: Mapping[str, etree._Element]) -> str | None:
+    """Read the link of `<end_effector name="tip" parent_link="LINK"/>`, an element of SRDF."""
     tips = [x for x in xml.root.iterfind("end_effector") if x.get("name", "").strip() == "tip"]
     if not tips:
         return None
     link = str(tips[0].get("parent_link", "")).strip()
     if link not in links:
         problem = (
-            f"is the unknown link '{link}'" if link else ('has no link, write parent_link="LINK"')
+            f"is the unknown link '{link}'" if link else 'has no link, write parent_link="LINK"'
         )
-        hint = suggest_names(links, link or None)
-        raise xml.error_at(tips[0], f"the tip {problem}, {hint}")
+        raise xml.error_at(tips[0], f"the tip {problem}, {suggest_names(links, link or None)}")
     return link
 
 
@@ -346,10 +350,84 @@ def _read_coordinate(
 ) -> tuple[str, float]:
     name = joint.get("name", "").strip()
     if name not in joints:
-        hint = suggest_names(joints, name)
-        problem = f"home names the joint '{name}', which is unknown or does not move, {hint}"
-        raise xml.error_at(joint, problem)
+        raise xml.error_at(
+            joint,
+            f"home names the joint '{name}', which is unknown or does not move, "
+            f"{suggest_names(joints, name)}",
+        )
     value = xml.number(joint, "value", f"home of '{name}'")
     if name in earlier_names:
         raise xml.error_at(joint, f"home of '{name}' is there twice, keep one")
     return name, value
+
+
+def _warn_about_unknown_elements(xml: XmlFile, joints: Mapping[str, etree._Element]) -> None:
+    """Warn of unknown elements, which are left out, and of incomplete limits.
+
+    Equal elements have one warning, at the first of them, with their number.
+    """
+    found: dict[tuple[str, str], list[etree._Element]] = {}
+    known_tags = set().union(*_CHILDREN.values())  # a misplaced known element is an error
+    read_elements = [xml.root]
+    for element in read_elements:
+        tags = _CHILDREN[element.tag]
+        read_elements += [x for x in element if x.tag in tags and x.tag in _CHILDREN]
+        known = known_tags | _FOREIGN_ELEMENTS.get(element.tag, set())
+        other = [x for x in element if isinstance(x.tag, str) and x.tag not in known]
+        for child in [x for x in other if not x.tag.startswith("{")]:
+            found.setdefault((element.tag, child.tag), []).append(child)
+    groups = [
+        (elements, parent, _suggest_element(tag, _CHILDREN[parent]))
+        for (parent, tag), elements in found.items()
+    ]
+    groups.sort(key=lambda item: item[2].startswith("known"))  # likely mistakes first
+    for elements, parent, hint in groups[:_MAX_WARNINGS]:
+        _warn_about_elements(
+            xml,
+            elements,
+            f"unknown <{elements[0].tag}> in <{parent}>",
+            f", it is left out, {hint}",
+        )
+    if remaining := [elements[0] for elements, _, _ in groups[_MAX_WARNINGS:]]:
+        listed = ", ".join(f"<{element.tag}>" for element in remaining[:_MAX_WARNINGS])
+        dots = ", ..." if len(remaining) > _MAX_WARNINGS else ""
+        problem = f"{len(remaining)} more unknown elements ({listed}{dots}) are left out"
+        _warn_about_elements(xml, remaining[:1], problem, "")
+    incomplete = []
+    for name, joint in joints.items():
+        limit = joint.find("limit")
+        if limit is None or joint.get("type") == "fixed":
+            continue
+        missing = [key for key in ("effort", "velocity") if limit.get(key) is None]
+        if missing:
+            incomplete.append(
+                (limit, f"the limit of joint '{name}' has no {' and no '.join(missing)}")
+            )
+    if incomplete:
+        hint = ", nothing is limited then: add it, 1e9 for no limit"
+        _warn_about_elements(xml, [limit for limit, _ in incomplete], incomplete[0][1], hint)
+
+
+def _suggest_element(tag: str, tags: Set[str]) -> str:
+    if tag == "constraint":
+        return CONSTRAINT_HINT
+    element_of_attribute = {
+        name: other for other in sorted(tags) for name in sorted(_ATTRIBUTES.get(other, ()))
+    }
+    similar = get_close_matches(
+        tag.lower(), [*sorted(tags), *element_of_attribute], 1, _MIN_SIMILARITY
+    )
+    if not similar:
+        return suggest_names(tags)
+    if similar[0] in tags:
+        return f"did you mean <{similar[0]}>?"
+    return f'did you mean {similar[0]}="..." of <{element_of_attribute[similar[0]]}>?'
+
+
+def _warn_about_elements(
+    xml: XmlFile, elements: list[etree._Element], problem: str, hint: str
+) -> None:
+    count = f" ({len(elements)} such in this file)" if len(elements) > 1 else ""
+    warnings.warn(
+        f"{xml.source_location(elements[0])}: {problem}{count}{hint}", CraneWarning, stacklevel=4
+    )

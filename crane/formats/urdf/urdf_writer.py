@@ -18,14 +18,14 @@ from crane.common.errors import CraneWarning, InputError, format_one_line
 from crane.description.kinematic_tree import Tree
 from crane.description.specification import Coupling, LoopSpec
 from crane.formats.robot_files import open_robots
-from crane.formats.urdf_elements import (
+from crane.formats.visuals.urdf_shapes import find_mesh_file
+from crane.formats.xml_file import (
     add_friction,
     add_joint,
     add_link,
     add_origin,
     format_numbers,
 )
-from crane.formats.visuals.mesh_files import find_mesh_file
 from crane.machine.machine import Machine
 
 
@@ -75,8 +75,9 @@ def write_urdf_plus(machine: Machine, path: str | Path) -> None:
     for name, value in zip(machine.joints, machine.home, strict=True):
         etree.SubElement(state, "joint", name=name, value=format_numbers([value]))
     if machine.tip is not None:
-        tip = {"name": "tip", "parent_link": machine.tip, "group": "all"}
-        etree.SubElement(robot, "end_effector", tip)
+        etree.SubElement(
+            robot, "end_effector", {"name": "tip", "parent_link": machine.tip, "group": "all"}
+        )
     copy_shapes(robot, machine)
     with replace_file(path) as temporary_file:
         temporary_file.write_bytes(format_document(robot, origin_text(machine)))
@@ -86,8 +87,9 @@ def write_urdf_plus(machine: Machine, path: str | Path) -> None:
         "rotor inertias": rotor_inertias(machine),
         "drives along several joints": compound_drive_factors(machine),
     }
-    unsupported = [name for name, section in sections.items() if section]
-    warn_about_unsupported(machine, "URDF+", unsupported)
+    warn_about_unsupported(
+        machine, "URDF+", [name for name, section in sections.items() if section]
+    )
 
 
 def _add_joint_friction(element: etree._Element, machine: Machine, joint: str) -> None:
@@ -224,16 +226,16 @@ def copy_shapes(
     materials: dict[str, etree._Element] = {}
     with open_robots(machine, chains) as sources:
         shapes = [
-            (xml.file.parent, link.get("name", "").strip(), shape)
+            (targets[link.get("name", "").strip()], xml.file.parent, shape)
             for xml in sources
             for link in xml.root.iterfind("link")
+            if link.get("name", "").strip() in targets
             for shape in (*link.iterfind("visual"), *link.iterfind("collision"))
         ]
         for material in (x for xml in sources for x in xml.root.iterfind("material")):
             materials.setdefault(material.get("name", ""), copy.deepcopy(material))
-        for folder, name, shape in shapes:
-            if name in targets:
-                targets[name].append(_with_mesh_paths(shape, folder, uris))
+        for target, folder, shape in shapes:
+            target.append(_with_mesh_paths(shape, folder, uris))
     for material in reversed(materials.values()):
         robot.insert(0, material)
 

@@ -1,6 +1,6 @@
 """A process that reads mesh files, so that a damaged file can crash only this process.
 
-`crane.formats.visuals.mesh_files` runs it and sends a JSON object {"files": paths, "triangles":
+`crane.formats.visuals.urdf_shapes` runs it and sends a JSON object {"files": paths, "triangles":
 largest number in all files}. For each file the process writes a line of JSON, {"parts":
 [{"vertices": V, "faces": F, "colour": [r, g, b, a] or null}, ...], "alone": whether no other file
 was opened for it} or {"wrong": "message"}, then the arrays of each part: V 3 float64, F 3 int64.
@@ -9,11 +9,12 @@ Time and memory are limited, because mesh readers trust the sizes that a damaged
 It imports nothing of the package, which would take longer than reading most meshes.
 """
 
+import contextlib
 import json
 import os
 import sys
 import warnings
-from typing import Any, BinaryIO
+from typing import Any
 
 MAX_MEMORY, MAX_SECONDS = 2 << 30, 20  # [bytes], [s] of computing per file
 MAX_TRIANGLES = 4_000_000  # in all files; a page with as many has 300 MB
@@ -37,12 +38,8 @@ def main() -> None:
     # trimesh does not need these to read, and importing them takes longer than most meshes
     for name in ("networkx", "rtree", "scipy", "shapely"):
         sys.modules[name] = None  # type: ignore[assignment]
-    try:
+    with contextlib.suppress(ImportError):  # `_read_mesh` raises it again
         import trimesh  # noqa: F401  before time is counted
-    except ImportError as error:
-        for _ in files:
-            _send_answer(output, {"wrong": str(error)}, [])
-        return
     for file in files:
         limit_resources()
         try:
@@ -53,7 +50,10 @@ def main() -> None:
         except Exception as error:  # readers raise anything for malformed files
             message = " ".join(str(error).split()) or type(error).__name__
             header, arrays = {"wrong": message[:80]}, []
-        _send_answer(output, header, arrays)
+        output.write(json.dumps(header).encode() + b"\n")
+        for array in arrays:
+            output.write(array.tobytes())
+        output.flush()
 
 
 def limit_resources() -> None:
@@ -67,13 +67,6 @@ def limit_resources() -> None:
     for kind, limit in ((resource.RLIMIT_CPU, time_limit), (resource.RLIMIT_AS, MAX_MEMORY)):
         hard_limit = resource.getrlimit(kind)[1]
         resource.setrlimit(kind, (limit if hard_limit < 0 else min(limit, hard_limit), hard_limit))
-
-
-def _send_answer(output: BinaryIO, header: dict[str, Any], arrays: list[Any]) -> None:
-    output.write(json.dumps(header).encode() + b"\n")
-    for array in arrays:
-        output.write(array.tobytes())
-    output.flush()
 
 
 def _read_mesh(file: str, max_triangles: int) -> tuple[dict[str, Any], list[Any]]:
@@ -125,23 +118,18 @@ def _read_mesh(file: str, max_triangles: int) -> tuple[dict[str, Any], list[Any]
     parts: list[dict[str, Any]] = []
     arrays: list[Any] = []
     for colour, colour_parts in by_colour.items():
-        first = np.cumsum([0, *(len(vertices) for vertices, _ in colour_parts)])
-        vertices = np.concatenate([vertices for vertices, _ in colour_parts])
-        faces = np.concatenate(
-            [x + start for start, (_, x) in zip(first, colour_parts, strict=False)]
-        )
-        parts.append({"vertices": len(vertices), "faces": len(faces), "colour": colour})
-        arrays += [vertices, faces]
+        joined = trimesh.util.append_faces(*zip(*colour_parts, strict=True))
+        parts.append({"vertices": len(joined[0]), "faces": len(joined[1]), "colour": colour})
+        arrays += joined
     return {"parts": parts, "alone": not SiblingFileResolver.asked}, arrays
 
 
 def _part_colour(part: Any) -> tuple[float, ...] | None:
     """Return the colour of a part, None if it has no readable one."""
     try:
-        if not part.visual.defined:
-            return None
         material = getattr(part.visual, "material", part.visual)
-        colour = tuple(min(max(float(x) / 255, 0.0), 1.0) for x in material.main_color)
+        components = material.main_color if part.visual.defined else ()
+        colour = tuple(min(max(float(x) / 255, 0.0), 1.0) for x in components)
     except MemoryError:
         raise
     except Exception:  # such as a damaged texture

@@ -1,5 +1,6 @@
 """Calibration of machines: parameters fitted to recordings through the simulation."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from crane.common.errors import CraneError, InputError, RecordingError, check_na
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
-from crane.description.parameter_units import parameter_unit
+from crane.description.machine_parameters import parameter_unit
 from crane.description.sensors import (
     PRESSURE_PREFIX,
     SENSOR_PREFIX,
@@ -156,19 +157,19 @@ def calibrate(
             CalibrationProblem(machine, [*unknowns, *extras], cases), progress
         )
     estimate = estimate_with_profiles(search, len(problem.unknowns))
-    calibration = replace(
-        _calibration_result(problem, search, estimate, initial_residuals, units),
-        unobserved_parameters=tuple(excluded),
-    )
+    tests = []
     if not automatic:
         applicable_extras = [x for x in extras if dict(x.members).get(x.name, x.start) == x.start]
-        calibration = replace(
-            calibration, score_tests=tuple(score_tests(search, applicable_extras, estimate.z))
-        )
+        tests = score_tests(search, applicable_extras, estimate.z)
+    with warnings.catch_warnings(action="ignore"):
+        fitted = variants.machine(problem.changes(estimate.z))
+    found = _calibration_result(problem, fitted, search, estimate, initial_residuals, units)
     known = dict(machine.sensors) | dict(cases[0].known_sensors)
     return replace(
-        calibration,
-        machine=_machine_with_sensors(calibration.machine, known, columns, calibration.changes),
+        found,
+        machine=_machine_with_sensors(fitted, known, columns, found.changes),
+        score_tests=tuple(tests),
+        unobserved_parameters=tuple(excluded),
     )
 
 
@@ -242,6 +243,7 @@ def _read_case(
 
 def _calibration_result(
     problem: CalibrationProblem,
+    fitted: Machine,
     search: LevenbergMarquardt,
     estimate: CalibrationEstimate,
     initial_residuals: list[Array],
@@ -254,12 +256,12 @@ def _calibration_result(
     correlation = covariance[: len(unknowns), : len(unknowns)] / np.outer(divisors, divisors)
     pairs = np.argwhere(np.abs(np.tril(correlation, -1)) > _MAX_CORRELATION).tolist()
     correlated = [(unknowns[j].name, unknowns[i].name, float(correlation[i, j])) for i, j in pairs]
-    fitted = []
+    parameters = []
     for i, unknown in enumerate(unknowns):
         value, scale = values[unknown.name], unknown.scale
         bound = z[i] <= search.low[i] + 1e-9 or z[i] >= search.high[i] - 1e-9
         size = max(abs(value), abs(unknown.start)) if not unknown.sensor else np.inf
-        fitted.append(
+        parameters.append(
             FittedParameter(
                 unknown.name,
                 unknown.start,
@@ -288,8 +290,8 @@ def _calibration_result(
         for k, name in enumerate(case.sensors)
     ]
     return Calibration(
-        problem.fitted_machine(z),
-        tuple(fitted),
+        fitted,
+        tuple(parameters),
         tuple(channels),
         problem.changes(z),
         tuple(sorted(correlated, key=lambda pair: -abs(pair[2]))),

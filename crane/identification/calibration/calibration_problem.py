@@ -26,12 +26,12 @@ from crane.simulation.recorded_run import read_simulation
 from crane.simulation.recorded_run import record_run as recording_of
 from crane.simulation.recording_replay import ReplayInputs
 from crane.simulation.sensitivity.rate_formulas import observed_frames
-from crane.simulation.sensitivity.simulated_motion import SimulationProblem
+from crane.simulation.sensitivity.simulated_motion import SimulatedMotion
 from crane.simulation.sensitivity.simulation_constants import (
     SimulationConstants,
     simulation_constants_of,
 )
-from crane.simulation.sensitivity.variational_integration import integrate_sensitivities
+from crane.simulation.sensitivity.variational_integration import VariationalIntegrator
 from crane.simulation.simulation_run import simulate
 from crane.simulation.simulation_setup import initial_motion
 
@@ -87,11 +87,6 @@ class CalibrationProblem:
         for unknown, value in zip(self.unknowns, self.values(z).values(), strict=True):
             found |= unknown.changes(value)
         return found
-
-    def fitted_machine(self, z: Array) -> Machine:
-        """The machine and its sensors with the changed parameters."""
-        with warnings.catch_warnings(action="ignore"):
-            return self._variants.machine(self.changes(z))
 
     def simulated_machine(self, z: Array, friction_smoothing: float) -> Machine:
         """The machine for simulation, with changed parameters and smoothed friction."""
@@ -169,7 +164,6 @@ class CalibrationProblem:
     def _fitted_sensor(
         self, case: RecordingCase, name: str, values: Mapping[str, float]
     ) -> Sensor:
-        """Sensor with its fitted parameters."""
         known = case.known_sensors.get(name, Sensor())
         names = [f"{SENSOR_PREFIX}{name}.{what}" for what in SENSOR_PARAMETER_DEFAULTS]
         fitted = {x: values[x] for x in names if x in values}
@@ -259,25 +253,21 @@ class CalibrationProblem:
         links = [link for link, _ in observed_frames(machine, case.sensors)]
         initial = initial_motion(machine, inputs.initial)
 
-        def setup(times: Array) -> tuple[SimulationConstants, SimulationConstants]:
-            base = simulation_constants_of(dynamics, drive, initial, links, times)
-            every = [
-                self._setup_derivative(case, z, i, friction_smoothing, base, links, times, machine)
-                for i in simulated_unknowns
-            ]
-            return base, SimulationConstants(*(np.array(x) for x in zip(*every, strict=True)))
-
-        motion = SimulationProblem(dynamics, drive, initial, steps, step)
         with warnings.catch_warnings(action="ignore"):
-            run_motion, derivatives = integrate_sensitivities(
+            motion = SimulatedMotion(dynamics, drive, initial, steps, step)
+            constants = simulation_constants_of(dynamics, drive, initial, links, motion.time)
+            setup = (friction_smoothing, constants, links, motion.time, machine)
+            every = [self._setup_derivative(case, z, i, *setup) for i in simulated_unknowns]
+            integrator = VariationalIntegrator(
                 motion,
                 case.sensors,
-                setup,
+                constants,
+                SimulationConstants(*(np.array(x) for x in zip(*every, strict=True))),
                 np.ones(len(simulated_unknowns)),
                 self.derivative_tolerance,
             )
-            run_time = run_motion.time[::2]
-            run = recording_of(machine, drive, run_time, run_motion.parts, "")
+            derivatives, run_time = integrator.integrate(), motion.time[::2]
+            run = recording_of(machine, drive, run_time, motion.parts, "")
         curve = CubicSpline(run_time, read_simulation(machine, run, case.sensors))
         readings, sensor_derivatives = self._sensor_readings(case, curve, z)
         jacobian = np.zeros((*readings.shape, self.unknown_count))

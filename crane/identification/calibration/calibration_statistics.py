@@ -133,7 +133,10 @@ def evaluate_profile_ends(
     for i, width in enumerate(half_widths):
         free = (z > search.low) & (z < search.high)
         free[i] = True
-        path = _profile_direction(H, free, i)
+        inverse = np.linalg.pinv(H[np.ix_(free, free)], rcond=1e-13, hermitian=True)
+        k = int(free[:i].sum())
+        path = np.zeros(len(z))
+        path[free] = inverse[:, k] / inverse[k, k]
         free[i] = False
         rises = [np.nan, np.nan]
         for k, side in enumerate((-1.0, 1.0)):
@@ -179,16 +182,6 @@ def _cost_and_gradient(search: LevenbergMarquardt, z: Array) -> tuple[float, Arr
     ), search.jacobian.T @ residuals + prior_gradient
 
 
-def _profile_direction(H: Array, free: NDArray[np.bool_], i: int) -> Array:
-    """Direction (p,) of the profile of an unknown; unknowns that are not free are constant."""
-    indices = np.flatnonzero(free)
-    inverse = np.linalg.pinv(H[np.ix_(indices, indices)], rcond=1e-13, hermitian=True)
-    k = int(np.flatnonzero(indices == i)[0])
-    direction = np.zeros(len(free))
-    direction[indices] = inverse[:, k] / inverse[k, k]
-    return direction
-
-
 def correlated_directions(
     names: Sequence[str], correlation: Array, half_widths: Array
 ) -> list[dict[str, float]]:
@@ -199,10 +192,17 @@ def correlated_directions(
         correlation: (n, n) correlations; 0 if a variance is zero.
         half_widths: (n,) half widths of their intervals.
     """
+    from scipy.sparse.csgraph import connected_components
+
     if len(correlation) < 2:
         return []
+    count, labels = connected_components(np.abs(correlation) > _PAIR_CORRELATION)
+    groups = [np.flatnonzero(labels == label).tolist() for label in range(count)]
+    inverse = np.linalg.pinv(correlation, rcond=1e-12, hermitian=True)
+    inflated = np.sqrt(np.maximum(np.diag(inverse), 0.0)) > _MIN_INFLATION
+    singles = [group[0] for group in groups if len(group) == 1 and inflated[group[0]]]
     found = []
-    for group in filter(None, _correlated_groups(correlation)):
+    for group in [*(group for group in groups if len(group) > 1), *([singles] if singles else [])]:
         sizes, directions = np.linalg.eigh(correlation[np.ix_(group, group)])
         v = directions[:, -1]
         v = v * np.sign(v[0]) / np.abs(v).max()
@@ -211,18 +211,6 @@ def correlated_directions(
         if sizes[-1] > _MIN_SHARED_EIGENVALUE and len(parts) > 1:
             found.append(parts)
     return found
-
-
-def _correlated_groups(correlation: Array) -> list[list[int]]:
-    """Groups of linked parameters, each in at most one group."""
-    from scipy.sparse.csgraph import connected_components
-
-    count, labels = connected_components(np.abs(correlation) > _PAIR_CORRELATION)
-    groups = [np.flatnonzero(labels == label).tolist() for label in range(count)]
-    inverse = np.linalg.pinv(correlation, rcond=1e-12, hermitian=True)
-    inflated = np.sqrt(np.maximum(np.diag(inverse), 0.0)) > _MIN_INFLATION
-    singles = [group[0] for group in groups if len(group) == 1 and inflated[group[0]]]
-    return [*(group for group in groups if len(group) > 1), singles]
 
 
 @dataclass(frozen=True)

@@ -179,8 +179,9 @@ class LevenbergMarquardt:
                 smallest = _MIN_RELATIVE_SCALE * float(np.abs(x).max())
                 digits[name] = max(digits.get(name, _MIN_SCALE), smallest)
                 unit = units[name] = case.table.units[name]
-                spread = float(np.std(x[case.train_mask]))
-                variation[unit] = max(variation.get(unit, 1e-12), spread)
+                variation[unit] = max(
+                    variation.get(unit, 1e-12), float(np.std(x[case.train_mask]))
+                )
         bounds = {}
         for name, squares in variances.items():
             least = max(float(np.sqrt(np.mean(squares))), digits[name])

@@ -108,8 +108,7 @@ def recording_case(
     if not sensors:
         raise InputError(f"{name}: nothing of it can be compared with the machine")
     file_time = table_column(table, TIME)
-    after_start, before_end = file_time >= window[0] - 1e-9, file_time <= window[1] + 1e-9
-    train_mask = np.logical_and(after_start, before_end)
+    train_mask = (file_time >= window[0] - 1e-9) & (file_time <= window[1] + 1e-9)
     if len(train_mask) < MIN_SAMPLES:
         raise InputError(f"{name}: {len(train_mask)} instants, give at least {MIN_SAMPLES}")
     measured = np.column_stack([table_column(table, x) for x in sensors])
@@ -124,10 +123,11 @@ def recording_case(
         )
 
     if inputs.initial:
-        pairs = zip(machine.active, joint_units, strict=True)
-        start_std += [initial_std(joint, kind, _START_POSITION_STD[kind]) for joint, kind in pairs]
-    if inputs.initial:  # joints at rest start at rest
         start_std += [
+            initial_std(joint, kind, _START_POSITION_STD[kind])
+            for joint, kind in zip(machine.active, joint_units, strict=True)
+        ]
+        start_std += [  # joints at rest start at rest
             _START_VELOCITY_STD[kind] if v else 0.0
             for kind, v in zip(joint_units, inputs.initial[1], strict=True)
         ]

@@ -156,10 +156,8 @@ def _build_unknown(
 
 
 def _read_bounds(name: str, given: object) -> tuple[float | None, float | None, float | None]:
-    if given is None:
-        return None, None, None
-    if isinstance(given, int | float):
-        return float(given), None, None
+    if given is None or isinstance(given, int | float):
+        given = given, None, None
     if not isinstance(given, Sequence) or len(given) != 3:
         raise InputError(f"'{name}': give a start, or (start, low, high)")
     start, low, high = (None if x is None else float(x) for x in given)

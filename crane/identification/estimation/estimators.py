@@ -181,37 +181,31 @@ class RegressionProblem:
             e[rows] -= W @ theta
         return e
 
-    def estimate(self, per_group: bool = True) -> Estimate:
+    def estimate(self, per_group: bool = True, is_robust: bool = False) -> Estimate:
         """Alternate between the estimate and the noise until convergence.
 
         Args:
             per_group: Whether each group has its own noise.
+            is_robust: Whether rows are reweighted by their residuals, see `huber`.
         """
-        theta = np.zeros(len(self.mean))
-        s = self._noise(theta, per_group)
-        for round_ in range(_MAX_ITERATIONS):
-            before = theta
-            theta, _, A = self._solve(self.plain, s)
-            if round_ and np.abs(A @ (theta - before)).max() < _CONVERGENCE_TOLERANCE:
-                break
-            s = self._noise(theta, per_group)
-        return self.evaluate_estimate(theta, self.residuals(theta), s, math.inf)
-
-    def huber_estimate(self) -> Estimate:
-        """Iteratively reweighted estimate, see `huber`."""
-        e, R = self.y, self.plain
-        s, theta = self._robust_group_noise(e), np.zeros(len(self.mean))
+        theta, e, R = np.zeros(len(self.mean)), self.y, self.plain
+        s = self._robust_group_noise(e) if is_robust else self._noise(theta, per_group)
         for round_ in range(_MAX_ITERATIONS):
             before = theta
             theta, _, A = self._solve(R, s)
-            e = self.residuals(theta)
+            e = self.residuals(theta) if is_robust else e
             if round_ and np.abs(A @ (theta - before)).max() < _CONVERGENCE_TOLERANCE:
                 break
-            s = self._robust_group_noise(e)
-            clip = _HUBER_THRESHOLD * s[self.groups]
-            shares = np.minimum(1, clip / np.maximum(np.abs(e), self.min_noise))
-            R = triangular_factors(self.W, self.y, self.groups, np.sqrt(shares))
-        return self.evaluate_estimate(theta, e, s, _HUBER_THRESHOLD)
+            if is_robust:
+                s = self._robust_group_noise(e)
+                clip = _HUBER_THRESHOLD * s[self.groups]
+                shares = np.minimum(1, clip / np.maximum(np.abs(e), self.min_noise))
+                R = triangular_factors(self.W, self.y, self.groups, np.sqrt(shares))
+            else:
+                s = self._noise(theta, per_group)
+        if is_robust:
+            return self.evaluate_estimate(theta, e, s, _HUBER_THRESHOLD)
+        return self.evaluate_estimate(theta, self.residuals(theta), s, math.inf)
 
     def _solve(self, group_factors: Array, s: Array) -> tuple[Array, Array, Array]:
         """theta, R (p, p) of the weighted instruments with the rows of the prior, and Q^T W.
@@ -404,7 +398,7 @@ def huber(
 
     Arguments and errors as for `least_squares`.
     """
-    return RegressionProblem(W, None, y, groups, samples, prior).huber_estimate()
+    return RegressionProblem(W, None, y, groups, samples, prior).estimate(is_robust=True)
 
 
 def instrumental_variables(

@@ -136,8 +136,9 @@ class Jackknife:
         longest = _MIN_CORRELATION_TIMES * np.mean([noise.correlation_time for noise in noises])
         span = int(samples[-1] - samples[0]) + 1
         wanted = int(np.clip(span / longest, _MIN_SEGMENTS, _MAX_SEGMENTS))
-        starts = samples[np.arange(wanted) * len(samples) // wanted]
-        self._segment_starts = np.unique(starts)  # an instant belongs to one segment
+        self._segment_starts = np.unique(
+            samples[np.arange(wanted) * len(samples) // wanted]
+        )  # an instant belongs to one segment
         self._H = np.zeros((len(self._segment_starts), size, size))
         self._c = np.zeros((len(self._segment_starts), size))
         self.degrees_of_freedom = len(self._c) - 1

@@ -73,6 +73,8 @@ class PulseSignals(ValveCommand):
         self._low, self._high = low, high
         self._joint_columns = [machine.column(joint) for joint in circuit.joints]
         valves = list(circuit.valves.values())
+        cylinders = [circuit.cylinders[joint] for joint in circuit.joints]
+        self._areas = np.array([(x.area_a, x.area_b) for x in cylinders])
         self._neutral = np.array([valve.neutral for valve in valves])
         self._signal_ranges = np.array([valve.full - valve.neutral for valve in valves])
         self._dead_bands = np.array([valve.dead_band for valve in valves])
@@ -104,14 +106,16 @@ class PulseSignals(ValveCommand):
         opening, share = self._plan[slot].T
         x = q[self._joint_columns]
         circuit = self._circuit
-        speeds = np.empty((len(x), 2))  # at full opening, forwards and backwards
-        for i, joint in enumerate(circuit.joints):
-            cylinder, valve = circuit.cylinders[joint], circuit.valves[joint]
-            force = cylinder.area_a * pressures[i][0] - cylinder.area_b * pressures[i][1]
-            speeds[i] = [
-                full_opening_speed(cylinder, valve, circuit.supply, force, side)
+        forces = (self._areas * pressures * [1.0, -1.0]).sum(axis=1)
+        speeds = np.array([  # at full opening, forwards and backwards
+            [
+                full_opening_speed(
+                    circuit.cylinders[joint], circuit.valves[joint], circuit.supply, force, side
+                )
                 for side in (False, True)
             ]
+            for joint, force in zip(circuit.joints, forces.tolist(), strict=True)
+        ])  # fmt: skip
         self._pulse_durations = share * self.period
         openings = np.array(
             [
@@ -119,7 +123,9 @@ class PulseSignals(ValveCommand):
                 for i, y in enumerate(opening)
             ]
         )
-        openings *= min(1.0, self._max_flow / max(self._pump_flow(openings, speeds), 1e-30))
+        sides = np.arange(len(openings)), (openings < 0).astype(int)
+        flow = (np.abs(openings) * speeds[sides] * self._areas[sides]).sum()
+        openings *= min(1.0, self._max_flow / max(flow, 1e-30))
         u = self._dead_bands + (1.0 - self._dead_bands) * np.abs(openings)
         return np.where(openings, np.copysign(u, openings), 0.0)
 
@@ -158,16 +164,6 @@ class PulseSignals(ValveCommand):
         dead = self._dead_bands[i]
         u = dead + (1.0 - dead) * opening
         return float(opening * (self._pulse_durations[i] - (u + dead) / self._rate))
-
-    def _pump_flow(self, openings: Array, speeds: Array) -> float:
-        """Demand of pump flow [m3/s]."""
-        total = 0.0
-        for y, speed, cylinder in zip(
-            openings, speeds, self._circuit.cylinders.values(), strict=True
-        ):
-            area = cylinder.area_b if y < 0 else cylinder.area_a
-            total += abs(y) * speed[int(y < 0)] * area
-        return total
 
 
 def full_opening_speed(
@@ -261,10 +257,8 @@ class ExchangeAlgorithm:
             trial_plan = self._random_plan(rng)
             if plan is not None and trial >= random_trial_count:
                 trial_plan = self._exchange_slot(plan, trial_plan, rng)
-            if (run := self._simulate_within_limits(trial_plan)) is not None:
-                cost = self._cost(run)
-                if cost < lowest_cost and (unsmoothed_run := self._verified_run(run)) is not None:
-                    plan, best, lowest_cost = trial_plan, unsmoothed_run, cost
+            if (found := self._improved_run(trial_plan, lowest_cost)) is not None:
+                plan, (best, lowest_cost) = trial_plan, found
             if progress is not None:
                 progress((trial + 1) / trials)
         if best is None:
@@ -315,37 +309,30 @@ class ExchangeAlgorithm:
         )
         return replay_signals(machine, simulated_run)
 
-    def _simulate_within_limits(self, plan: Array) -> Recording | None:
-        """Run of a plan, None if it exceeds the limits."""
+    def _improved_run(self, plan: Array, lowest_cost: float) -> tuple[Recording, float] | None:
+        """Run without smoothed friction, and its cost.
+
+        None if the cost is not lower, or if the run, that with smoothed friction or perturbed
+        machines exceed the limits.
+        """
+        limits = self._limits
         try:
             run = self._simulate_plan(plan)
-        except CraneError as error:
-            self._rejection_reason = str(error)
-            return None
-        if reason := self._limits.exceeded_limit(run):
-            self._rejection_reason = f"for {reason}"
-            return None
-        return run
-
-    def _cost(self, run: Recording) -> float:
-        try:
+            if reason := limits.exceeded_limit(run):
+                self._rejection_reason = f"for {reason}"
+                return None
             rows = self._information.information_root(run, estimate_start=False)
-        except CraneError as error:
-            self._rejection_reason = str(error)
-            return np.inf
-        singular_values = np.asarray(np.linalg.svd(rows, compute_uv=False), dtype=np.float64)
-        return float(self._criterion(singular_values))
-
-    def _verified_run(self, run: Recording) -> Recording | None:
-        """Run without smoothed friction, None if it or perturbed machines exceed the limits."""
-        try:
+            singular_values = np.asarray(np.linalg.svd(rows, compute_uv=False), dtype=np.float64)
+            cost = float(self._criterion(singular_values))
+            if not cost < lowest_cost:
+                return None
             unsmoothed_run = replay_signals(self._information.machine, run)
-            stroke_margins = self._limits.worst_case_stroke_margins(run)
+            stroke_margins = limits.worst_case_stroke_margins(run)
         except CraneError as error:
             self._rejection_reason = str(error)
             return None
-        reason = self._limits.exceeded_limit(unsmoothed_run)
+        reason = limits.exceeded_limit(unsmoothed_run)
         if not reason and stroke_margins.min() <= 0:
             reason = "a stroke with deviating parameters"
         self._rejection_reason = f"for {reason}"
-        return None if reason else unsmoothed_run
+        return None if reason else (unsmoothed_run, cost)

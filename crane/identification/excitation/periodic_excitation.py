@@ -1,6 +1,6 @@
 """Design of periodic excitation trajectories for the identification of a machine."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from crane.identification.excitation.fourier_trajectory import FourierTrajectory
 from crane.identification.excitation.trajectory_optimizer import (
     COARSE_SAMPLES,
     QUANTITIES,
+    Progress,
     TrajectoryLimits,
     TrajectoryOptimizer,
     joint_values,
@@ -49,8 +50,6 @@ _MAX_SAMPLES = 4_000_000  # samples of the recording
 # of characteristic velocities, smoothing of friction in the optimization
 _FRICTION_SMOOTHING = 5e-4
 _MAX_MEMORY = 1e9  # [bytes] for the motions of an optimization
-
-Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -327,7 +326,6 @@ def _optimize_best(
 
 
 def _with_smooth_friction(machine: Machine) -> Machine:
-    """The machine with smoothed friction in place of stiction."""
     rates = machine.closure.units / machine.closure.characteristic_time
     laws = {
         joint: replace(law, smoothing=_FRICTION_SMOOTHING * float(rates[machine.column(joint)]))

@@ -1,7 +1,7 @@
 """Design of valve signals for the calibration of a machine."""
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from crane.common.units import format_quantity, format_table
 from crane.control.valve_commands import require_circuit
 from crane.description.sensors import VALVE_SIGNAL_PREFIX
 from crane.identification.calibration.unknowns import Unknown
-from crane.identification.excitation.exchange_algorithm import ExchangeAlgorithm
+from crane.identification.excitation.exchange_algorithm import ExchangeAlgorithm, Progress
 from crane.identification.excitation.fisher_information import CRITERIA, InformationMeasures
 from crane.identification.excitation.signal_information import SignalInformation, SignalLimits
 from crane.machine.machine import Machine
@@ -28,8 +28,6 @@ from crane.recordings.timeseries import Table
 _MAX_STD_SHARE = 0.5  # standard deviation per scale, above which a parameter is unidentifiable
 _MIN_DURATION, _MIN_STEP = 2.0, 1e-3  # least duration and step [s]
 _MAX_STEP = 0.05  # largest step [s] that resolves a pulse
-
-Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -156,7 +156,7 @@ class SignalInformation:
         start_count = problem.unknown_count - count
         prior = np.hstack([np.eye(start_count), np.zeros((start_count, count))])
         stacked = np.vstack([np.roll(J, start_count, axis=1), prior])
-        return _triangular_factor(stacked)[start_count:, start_count:]
+        return np.asarray(np.linalg.qr(stacked, mode="r"))[start_count:, start_count:]
 
     def measures(self, run: Recording) -> InformationMeasures:
         """Information measures of a recording of a run; standard deviations in SI units."""
@@ -165,7 +165,7 @@ class SignalInformation:
         is_identifiable = np.linalg.norm(rows, axis=0) > _MIN_SENSITIVITY
         std = np.full(len(rows), np.inf)
         if is_identifiable.any():
-            root = _triangular_factor(rows[:, is_identifiable])
+            root = np.asarray(np.linalg.qr(rows[:, is_identifiable], mode="r"))
             std[is_identifiable] = information_measures(root, np.eye(len(root)), 0.0).std
         return replace(result, std=std * [unknown.scale for unknown in self.unknowns])
 
@@ -173,11 +173,6 @@ class SignalInformation:
         problem = CalibrationProblem(self.machine, self.unknowns, cases)
         problem.smooth = self._has_stiction
         return problem
-
-
-def _triangular_factor(matrix: Array) -> Array:
-    """Triangular factor R of a QR factorization."""
-    return np.asarray(np.linalg.qr(matrix, mode="r"), dtype=np.float64)
 
 
 class SignalLimits:

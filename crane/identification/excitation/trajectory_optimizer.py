@@ -260,8 +260,8 @@ class TrajectoryOptimizer:
             x, reason = self.scale_to_limits(table.ravel())
             if not reason:
                 vectors.append(x)
-                if len(vectors) == _RANDOM_COUNT:
-                    break
+            if len(vectors) == _RANDOM_COUNT:
+                break
         if not vectors:
             raise InputError(
                 f"'{self._machine.name}' has no reference within its limits in {_MAX_TRIALS} "

@@ -31,7 +31,6 @@ _REST_SPEED_SHARE = 1e-3  # of the largest speed, below which a joint does not s
 _SLIDING_FACTOR = 3.0  # smoothing velocities, above which the sign of the speed is fully developed
 _STEADY_SHARE = 0.05  # largest change of a steady speed
 _MAX_SAMPLES = 4000  # samples
-_STANDSTILL_SHARE = 0.01  # of the fastest speed
 _STRIBECK_GRID_SIZE = 40  # stribeck velocities tried before the fit
 
 

@@ -1,7 +1,7 @@
 """Identification of bulk modulus and orifice coefficients by equations (29) to (32).
 
 Equations are those of the electro-hydraulic forwarder paper (IROS 2012); see
-`crane.identification.hydraulics.orifice_equations` for them.
+`crane.identification.hydraulics.cylinder_equations` for them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,17 +18,15 @@ from crane.identification.estimation.estimators import (
     instrumental_variables,
     least_squares,
 )
-from crane.identification.hydraulics.cylinder_signals import (
+from crane.identification.hydraulics.cylinder_equations import (
     SIGNAL_NAMES,
     CylinderSignals,
-    cylinder_and_valve,
-    cylinder_signals,
-    noise_std,
-)
-from crane.identification.hydraulics.orifice_equations import (
     EquationSides,
     OrificeEquations,
     chamber_terms,
+    cylinder_and_valve,
+    cylinder_signals,
+    noise_std,
 )
 from crane.identification.signals.signal_processing import differentiate
 from crane.machine.machine import Machine
@@ -163,7 +161,7 @@ def identify_orifices(
 
     Args:
         machine: Machine with hydraulics; of its valve only the opening and the margin are used.
-        recordings: One or several recordings, see `cylinder_signals.cylinder_signals`.
+        recordings: One or several recordings, see `cylinder_signals`.
         joint: The cylinder's.
         method: "weak", "chambers" or "ls".
         window: Length of the test functions [s], at least 64 steps; about a period of the oil's

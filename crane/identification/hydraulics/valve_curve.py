@@ -20,7 +20,7 @@ from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
 from crane.identification.estimation import estimators
-from crane.identification.hydraulics.cylinder_signals import (
+from crane.identification.hydraulics.cylinder_equations import (
     channel_values,
     cylinder_and_valve,
     joint_velocity,

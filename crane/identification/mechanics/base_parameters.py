@@ -75,12 +75,11 @@ class BaseParameters(OneLineRepr):
         """Text of each base parameter, such as "link7.mx + 0.22 payload.m"."""
         out = []
         for row, first in zip(self.grouping, self.independent, strict=True):
-            others = []
-            for i, (share, name) in enumerate(zip(row, self.names, strict=True)):
-                if share != 0 and i != first:
-                    factor = "" if abs(abs(share) - 1) < 1e-9 else f"{abs(share):.6g} "
-                    others.append(f"{'-' if share < 0 else '+'} {factor}{name}")
-            out.append(" ".join([self.names[first], *others]))
+            text = self.names[first]
+            for i in np.setdiff1d(np.flatnonzero(row), [first]):
+                factor = "" if abs(abs(row[i]) - 1) < 1e-9 else f"{abs(row[i]):.6g} "
+                text += f" {'-' if row[i] < 0 else '+'} {factor}{self.names[i]}"
+            out.append(text)
         return tuple(out)
 
     def values(self, parameters: Array) -> Array:

@@ -163,8 +163,9 @@ def solve_feasible(
         model = model + R[:, 10 * b : 10 * b + 10] @ maps[b] @ cp.vec(x - np.eye(4), order="F")
         cost += 2 * prior_weight[b] * scale**2 * (cp.trace(x) - cp.log_det(x) - 4)
         constraints.append(x >> _MIN_EIGENVALUE * np.eye(4))
-    problem = cp.Problem(cp.Minimize(cp.sum_squares(scale * model) + cost), constraints)
-    _solve_convex_problem(problem)
+    _solve_convex_problem(
+        cp.Problem(cp.Minimize(cp.sum_squares(scale * model) + cost), constraints)
+    )
     others = start + unit * z.value
     others[bounded] = np.maximum(others[bounded], 0)  # rounding errors
     inertias = [L @ (0.5 * (x.value + x.value.T)) @ L.T for L, x in zip(factors, X, strict=True)]

@@ -9,7 +9,7 @@ from scipy.linalg import qr
 
 from crane.common.errors import InputError, check_name
 from crane.common.samples import Array, as_number, as_sample
-from crane.description.estimation_settings import ParameterPrior
+from crane.description.specification import ParameterPrior
 from crane.identification.estimation.estimators import Estimate, Prior
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.feasible_parameters import body_size, body_units
@@ -93,11 +93,10 @@ def weak_directions(
             break
         largest = np.argsort(-np.abs(vector))[:_MAX_NAMED]
         sign = np.sign(vector[largest[0]])
+        named = [i for i in largest[1:] if abs(vector[i]) >= _MIN_NAMED_SHARE]
         words = ""
-        for i in largest:
+        for i in (largest[0], *named):
             share = float(sign * vector[i])
-            if words and abs(share) < _MIN_NAMED_SHARE:
-                break
             words += f" {'-' if share < 0 else '+'} {abs(share):.2f} {names[i]}"
         found.append((float(np.sqrt(value)), words.removeprefix(" + ")))
     return found
@@ -181,8 +180,9 @@ def prior_from_names(
             where, _, kind = model.names[i].rpartition(".")
             law = model.machine.friction.get(where) if kind.endswith("_offset") else None
             reference = abs(mean[i]) or float(getattr(law, kind.removesuffix("_offset"), 0.0))
-            size = what.std * (reference if what.relative else 1.0)
-            std[i] = size or (parameter_sizes[i] or 1.0)
+            std[i] = (what.std * (reference if what.relative else 1.0)) or (
+                parameter_sizes[i] or 1.0
+            )
         place = name.rpartition(".")[0]
         if not bodies and not others and not fnmatch.filter(model.machine.locked_joints, place):
             check_name(name, (*model.bodies, *model.names[count:]), f"prior '{name}' is unknown")
@@ -262,12 +262,7 @@ def check_identifiable(names: Sequence[str], W: Array, prior: Prior) -> None:
     if rank == len(unknown_columns):
         return
     # the null space shows the dependent parameters
-    square = triangle[:rank, :rank]
-    rest = (
-        np.linalg.solve(square, triangle[:rank, rank:])
-        if rank
-        else np.zeros((0, len(unknown_columns)))
-    )
+    rest = np.linalg.solve(triangle[:rank, :rank], triangle[:rank, rank:])
     shares = np.concatenate([np.abs(rest).max(axis=1), np.ones(len(unknown_columns) - rank)])
     undetermined = sorted(unknown_columns[pivots[shares > 1e-6]])
     listed = ", ".join(names[i] for i in undetermined[:_MAX_LISTED]) + ", ..." * (

@@ -14,8 +14,10 @@ from crane.common.atomic_output import portable_file_name
 from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.description.force_elements import Friction
+from crane.description.kinematic_tree import Inertial
 from crane.dynamics.dynamics import Dynamics
-from crane.formats.visuals.mesh_files import find_mesh_file
+from crane.formats.visuals.urdf_shapes import find_mesh_file
+from crane.formats.xml_file import add_inertial
 from crane.identification.mechanics.feasible_parameters import (
     body_parameters,
     pseudo_inertia,
@@ -32,20 +34,11 @@ from crane.identification.mechanics.model_terms import (
 from crane.machine.machine import Machine
 
 SpeedRanges = Mapping[str, tuple[float, float]]
-_FRICTION_PARAMETERS = tuple(item.name for item in fields(Friction))
+FRICTION_PARAMETERS = tuple(item.name for item in fields(Friction))
 _SPEED_COUNT = 100  # speeds of a comparison of laws, in each direction
 _MAX_STRIBECK_SHARE = 0.3  # largest Stribeck velocity, relative to the largest speed
 _STRIBECK_GRID_SIZE = 30  # Stribeck velocities of the search
 _FLATNESS_TOLERANCE = 1e-6  # smallest eigenvalue of the scaled pseudo-inertia of a flat body
-# fmt: skip
-_INERTIA_INDICES = {
-    "ixx": (0, 0),
-    "ixy": (0, 1),
-    "ixz": (0, 2),
-    "iyy": (1, 1),
-    "iyz": (1, 2),
-    "izz": (2, 2),
-}
 _URDF_TEMPLATE = """<?xml version="1.0"?>
 <!-- The rotor of the motor that turns with {words}: its angle is theirs on the joints' side. -->
 <robot name="{name}">
@@ -104,7 +97,7 @@ def _exact_law(
     model: IdentificationModel, name: str, terms: list[FrictionTerm], values: Mapping[str, float]
 ) -> Friction | None:
     found = {each.removeprefix(f"{name}."): values[each] for term in terms for each in term.names}
-    if not found.keys() <= set(_FRICTION_PARAMETERS) or found.get("stiction", 0.0) < 0:
+    if not found.keys() <= set(FRICTION_PARAMETERS) or found.get("stiction", 0.0) < 0:
         return None
     # a joint without described friction is identified with an unsmoothed sign
     law = model.machine.friction.get(name, Friction(smoothing=0.0))
@@ -253,12 +246,10 @@ def replace_inertials(
 def _inertial_element(body: Array) -> etree._Element:
     """Element <inertial> of ten parameters about the link origin."""
     inertia = pin.Inertia.FromDynamicParameters(body)
-    inertial = etree.Element("inertial")
-    xyz = " ".join(map(repr, inertia.lever.tolist()))
-    etree.SubElement(inertial, "origin", xyz=xyz, rpy="0 0 0")
-    etree.SubElement(inertial, "mass", value=repr(float(inertia.mass)))
-    tensor = {key: repr(float(inertia.inertia[at])) for key, at in _INERTIA_INDICES.items()}
-    etree.SubElement(inertial, "inertia", tensor)
+    tensor = tuple(inertia.inertia[np.triu_indices(3)].tolist())
+    link, com = etree.Element("link"), tuple(inertia.lever.tolist())
+    add_inertial(link, Inertial(float(inertia.mass), com, (0.0, 0.0, 0.0), tensor))
+    inertial = link[0]
     inertial.text = inertial[0].tail = inertial[1].tail = "\n      "
     inertial[2].tail = inertial.tail = "\n    "
     return inertial

@@ -258,7 +258,6 @@ def _check_forces(
     equations: RegressionEquations,
     trust: bool,
 ) -> None:
-    """Check the forces of recordings against the model."""
     modelled, first = equations.compare(equations.base.values(model.nominal)).modelled, 0
     for motion, thinned in zip(motions, equations.thinned_motions(), strict=True):
         here = modelled[first : first + len(thinned.time)]
@@ -321,15 +320,15 @@ def prepare_motions(
         raise InputError("no recording is given, give at least one")
     motions = []
     for number, one in enumerate(sources, start=1):
+        which = f"{role or 'recording'} {number} of {len(sources)}: "
+        if isinstance(one, Motion):
+            motions.append(one)
+            continue
         try:
-            if not isinstance(one, Motion):
-                one = smoothed_motion(machine, one, trust=trust, progress=progress)
+            motions.append(smoothed_motion(machine, one, trust=trust, progress=progress))
         except RecordingError as error:
-            if not role and len(sources) == 1:
-                raise
-            which = f"{role or 'recording'} {number} of {len(sources)}"
-            raise RecordingError(f"{which}: {error}") from None
-        motions.append(one)
+            is_only = not role and len(sources) == 1
+            raise RecordingError(str(error) if is_only else f"{which}{error}") from None
     return motions
 
 

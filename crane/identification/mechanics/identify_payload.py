@@ -99,32 +99,21 @@ def identify_payload(
     moves_one_way = travel[0] < _MIN_RETURN_SHARE * travel[1]
     one_way_drives = [x for x, one_way in zip(names, moves_one_way, strict=True) if one_way]
     case = _PayloadCase(machine, frame, motion, method, names, one_way_drives)
-    first, reason = None, ""
-    try:
-        first = case.estimate_body(10 if inertia else 4, trust, progress)
-        if not case.is_uncertain(first):
-            low, high = first.interval()[0].tolist()
-            is_significant = not low <= 0 <= high
-            com = np.nan_to_num(first.com)
-            _check_mass(first, trust)
-            return replace(
-                first,
-                static_mass=static_mass(machine, frame, motion, first.friction_corrections, com)
-                if is_significant
-                else None,
-            )
-    except _UnidentifiableMassError as error:
-        reason = str(error)
+    first = case.estimate_body(10 if inertia else 4, trust, progress)
+    if first is not None and not case.is_uncertain(first):
+        low, high = first.interval()[0].tolist()
+        _check_mass(first, trust)
+        if low <= 0 <= high:  # not significant
+            return first
+        com = np.nan_to_num(first.com)
+        held_mass = static_mass(machine, frame, motion, first.friction_corrections, com)
+        return replace(first, static_mass=held_mass)
     point = case.estimate_point_mass(progress)
     if point is None or case.is_uncertain(point):
         held_mass = static_mass(machine, frame, motion, {}, np.zeros(3))
-        _raise_unidentifiable(one_way_drives, first or point, reason, held_mass)
+        _raise_unidentifiable(one_way_drives, first or point, held_mass)
     _check_mass(point, trust)
     return point
-
-
-class _UnidentifiableMassError(RecordingError):
-    """The motion does not determine the mass."""
 
 
 @dataclass(frozen=True)
@@ -165,12 +154,8 @@ class _PayloadCase:
 
     def estimate_body(
         self, parameter_count: int, trust: bool, progress: Progress | None
-    ) -> PayloadEstimate:
-        """Estimate a load with 10 or 4 parameters.
-
-        Raises:
-            _UnidentifiableMassError: The motion does not determine the mass.
-        """
+    ) -> PayloadEstimate | None:
+        """Estimate a load with 10 or 4 parameters; None if nothing determines its mass."""
         model = self.model(parameter_count)
         # the weight determines the load: smoothing of accelerations does not limit the bandwidth
         motion = replace(self.motion, passband=math.inf)
@@ -190,9 +175,7 @@ class _PayloadCase:
         )
         combinations, directions = _identifiable_moments(base)
         if not combinations[:, 0].any():
-            raise _UnidentifiableMassError(
-                "this motion does not determine the mass, move all joints"
-            )
+            return None
         mass, *first = (combinations.T @ estimate.values).tolist()
         com = np.where(combinations[:, 1:].any(axis=0), np.array(first) / mass, np.nan)
         derivatives = np.eye(4)  # of mass and com by mass and first moments
@@ -216,7 +199,13 @@ class _PayloadCase:
     def estimate_point_mass(self, progress: Progress | None) -> PayloadEstimate | None:
         """Estimate a mass at the frame's origin; None if its weight loads no moving drive."""
         motion, model = low_passed_motion(self.motion), self.model(1)
-        if not self._weight_loads_drive(motion):
+        load = PayloadTerm(self.machine, self.frame, 1)
+        q = motion.q[:: max(1, len(motion.q) // 100)]
+        at = IdentificationModel(self.machine, [load]).samples(q, 0 * q, 0 * q)
+        drive_indices = [self.machine.active.index(joint) for joint in self.moving_drives]
+        weight = np.abs(load.columns(at)[:, drive_indices, 0]).max(initial=0.0)
+        length = self.machine.closure.characteristic_length
+        if weight <= _IDENTIFIABLE_TOLERANCE * _GRAVITY * length:
             return None
         try:
             equations, base = build_equations(
@@ -260,18 +249,6 @@ class _PayloadCase:
         if estimate.static_mass is not None:  # the difference of both estimates is an uncertainty
             covariance[0, 0] += (estimate.static_mass[0] - estimate.mass) ** 2
         return estimate
-
-    def _weight_loads_drive(self, motion: Motion) -> bool:
-        """Whether the weight of a point mass loads a moving drive."""
-        load = PayloadTerm(self.machine, self.frame, 1)
-        q = motion.q[:: max(1, len(motion.q) // 100)]
-        at = IdentificationModel(self.machine, [load]).samples(q, 0 * q, 0 * q)
-        drive_indices = [self.machine.active.index(joint) for joint in self.moving_drives]
-        weight = np.abs(load.columns(at)[:, drive_indices, 0])
-        return bool(
-            weight.max(initial=0.0)
-            > _IDENTIFIABLE_TOLERANCE * _GRAVITY * self.machine.closure.characteristic_length
-        )
 
     def _force_comparison(self, equations: RegressionEquations, values: Array) -> ForceComparison:
         load_forces = equations.forces - equations.offset
@@ -340,11 +317,10 @@ def _check_mass(estimate: PayloadEstimate, trust: bool) -> None:
 def _raise_unidentifiable(
     one_way_drives: Sequence[str],
     estimate: PayloadEstimate | None,
-    reason: str,
     held_mass: tuple[float, float] | None,
 ) -> NoReturn:
     if estimate is None:
-        raise RecordingError(reason)
+        raise RecordingError("this motion does not determine the mass, move all joints")
     low, high = estimate.interval()[0].tolist()
     text = f"this recording does not determine the mass ({low:.3g} to {high:.3g} kg): "
     if one_way_drives:

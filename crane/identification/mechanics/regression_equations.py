@@ -129,9 +129,13 @@ class RegressionEquations:
         self.samples = instant.astype(np.int32)
         used_joints = np.cumsum(self.is_moving.any(axis=0)) - 1
         self.groups = used_joints.astype(np.int8)[joint]
-        self.time = _concatenate_times(
-            [part.motion.time[:: part.thinning] for part in self._filtered_motions]
-        )
+        times: list[Array] = []  # shifted to follow each other
+        end = 0.0
+        for part in self._filtered_motions:
+            time = part.motion.time[:: part.thinning]
+            times.append(time if not times else end + (time - time[0]) + (time[1] - time[0]))
+            end = times[-1][-1]
+        self.time = np.concatenate(times)
         self.forces, self.offset = np.empty((2, *self.is_moving.shape))
         wanted = _BLOCK_BYTES // (8 * len(model.names) * len(model.machine.active))
         self._blocks, first = list[_EquationBlock](), 0
@@ -152,11 +156,9 @@ class RegressionEquations:
             W = self._block_cache.get(number)
             if W is None:
                 W = self._compute_block(number)
-                if (
-                    sum(one.nbytes for one in self._block_cache.values()) + W.nbytes
-                    <= _CACHE_BYTES
-                ):
-                    self._block_cache[number] = W
+            cached_bytes = sum(one.nbytes for one in self._block_cache.values())
+            if cached_bytes + W.nbytes <= _CACHE_BYTES:
+                self._block_cache[number] = W
             if self._progress is not None:
                 self._progress((done + 1) / len(self._blocks))
             yield self._blocks[number].instants, W
@@ -204,8 +206,7 @@ class RegressionEquations:
 
     def _sides(self, at: MotionSamples) -> tuple[Array, Array]:
         """W (N, n, r) and known forces (N, n)."""
-        W = self._model.regressor(at)[:, :, self.base.independent]
-        return W, self._model.known_forces(at)
+        return self._model.regressor(at)[:, :, self.base.independent], self._model.known_forces(at)
 
     def _free_joint_rows(self, samples: MotionSamples, values: Array) -> tuple[Array, Array]:
         """W (N, n, r) and known forces (N, n) with rows of free joints at parameters b.
@@ -355,14 +356,6 @@ class RegressionEquations:
 def is_long_enough(motion: Motion, bandwidth: float) -> bool:
     """Whether a motion is long enough for a low-pass [Hz]."""
     return bandwidth * float(motion.time[-1] - motion.time[0]) >= _MIN_PERIODS
-
-
-def _concatenate_times(times: Sequence[Array]) -> Array:
-    """Instants of motions, shifted to follow each other."""
-    out = [times[0]]
-    for time in times[1:]:
-        out.append(out[-1][-1] + (time - time[0]) + (time[1] - time[0]))
-    return np.concatenate(out)
 
 
 class ProjectedRegressor:

@@ -11,7 +11,6 @@ from crane.common.samples import Array
 from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.dynamics.dynamics import Dynamics
 from crane.identification.signals.signal_processing import (
-    Derivatives,
     Motion,
     Progress,
     check_gaps,
@@ -103,11 +102,17 @@ def smoothed_motion(
     found = differentiate(time, columns[:, :n], derivatives, cutoff, progress)
     is_moving = np.ones(n, dtype=bool)  # by more than the uncertainty of the velocity
     if found.std_v is not None:
-        uncertainty = np.sqrt(np.mean(found.std_v**2, axis=0))
-        is_moving = found.v.std(axis=0) > _MOTION_FACTOR * uncertainty
+        is_moving = found.v.std(axis=0) > _MOTION_FACTOR * np.sqrt(np.mean(found.std_v**2, axis=0))
     v, a = np.where(is_moving, (found.v, found.a), 0.0)
     _check_speeds(machine, v, trust)
-    _warn_standstill(machine, found, v)
+    # static friction makes any force
+    for i in np.flatnonzero(~v.any(axis=0) & found.v.any(axis=0)).tolist():
+        joint, place = machine.active[i], float(found.q[:, i].mean())
+        text = (
+            f"'{joint}' stands still but for noise: its forces are not informative, move it, or "
+            f"lock it ({joint}={place:.4g})"
+        )
+        warnings.warn(text, CraneWarning, stacklevel=2)
     passband = math.inf
     if found.passband is not None:
         passband = float(found.passband[is_moving].min(initial=math.inf))
@@ -148,9 +153,16 @@ def _select_active_joints(machine: Machine, recording: Recording) -> Recording:
         )
         for x in machine.active
     ]
-    v = np.column_stack(rates)
     joint_units = {joint: machine.unit(joint) for joint in machine.active}
-    return Recording(recording.time, machine.active, q, v, tau, joint_units, free=machine.free)
+    return Recording(
+        recording.time,
+        machine.active,
+        q,
+        np.column_stack(rates),
+        tau,
+        joint_units,
+        free=machine.free,
+    )
 
 
 def _check_speeds(machine: Machine, v: Array, trust: bool) -> None:
@@ -166,18 +178,6 @@ def _check_speeds(machine: Machine, v: Array, trust: bool) -> None:
                 f"{unit}: look at the unit of the time",
                 trust,
             )
-
-
-def _warn_standstill(machine: Machine, found: Derivatives, v: Array) -> None:
-    """Warn of joints that have noise, but no motion: static friction makes any force."""
-    for i in np.flatnonzero(~v.any(axis=0) & found.v.any(axis=0)).tolist():
-        joint, place = machine.active[i], float(found.q[:, i].mean())
-        warnings.warn(
-            f"'{joint}' stands still but for noise: its forces are not informative, move it, or "
-            f"lock it ({joint}={place:.4g})",
-            CraneWarning,
-            stacklevel=3,
-        )
 
 
 def recorded_load_forces(machine: Machine, recording: Recording, q_a: Array, trust: bool) -> Array:

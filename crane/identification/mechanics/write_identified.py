@@ -1,9 +1,8 @@
 """Writing of identified machines: machine file and URDF files with identified parameters."""
 
-import dataclasses
 import shutil
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from crane.common.atomic_output import replace_folder
 from crane.common.errors import CraneError, CraneWarning, InputError, OutputError
 from crane.common.samples import Array
 from crane.description.force_elements import Friction
-from crane.description.inertia_feasibility import inertia_problem
+from crane.description.kinematic_tree import inertia_problem
 from crane.description.machine_schema import END_STOP, FORCE, GAS_SPRING, LOOP, ROPE
 from crane.description.parameter_changes import lock_joints
 from crane.description.specification import Chain, MachineSpec
@@ -28,6 +27,7 @@ from crane.formats.parallel_robots import is_parallel_robot
 from crane.identification.mechanics.base_parameters import random_samples
 from crane.identification.mechanics.identification_result import Identification
 from crane.identification.mechanics.identified_description import (
+    FRICTION_PARAMETERS,
     divide_locked_bodies,
     friction_laws,
     joint_combinations,
@@ -38,7 +38,6 @@ from crane.identification.mechanics.model_terms import BODY_PARAMETERS, Friction
 from crane.machine.machine import Machine
 
 _FORCE_TOLERANCE = 1e-9  # of the largest force, for the check of the written machine
-_FRICTION_PARAMETERS = tuple(item.name for item in dataclasses.fields(Friction))
 
 
 def write_identified(identification: Identification, folder: str | Path) -> Path:
@@ -80,9 +79,10 @@ def write_identified(identification: Identification, folder: str | Path) -> Path
         spec = read_machine_spec(machine.path)
         unlocked_machine = load(machine.path) if machine.locked_joints else machine
     bodies = divide_locked_bodies(machine, parameters, unlocked_machine)
-    names = _file_names(spec)
+    chains = spec.chains if spec.payload is None else (*spec.chains, spec.payload.chain)
+    names = _file_names(chains)
     file = f"{machine.path.stem}.yaml"
-    originals = {machine.path, *(chain.urdf for chain in _written_chains(spec))}
+    originals = {machine.path, *(chain.urdf for chain in chains)}
     for name in (file, *names.values()):
         if (target := (Path(folder) / name).resolve()) in originals:
             raise OutputError(
@@ -152,18 +152,13 @@ def _infeasible_body(bodies: Mapping[str, Array]) -> str | None:
     return None
 
 
-def _file_names(spec: MachineSpec) -> dict[str, str]:
+def _file_names(chains: Sequence[Chain]) -> dict[str, str]:
     """File name of each chain; a number distinguishes equal names."""
     taken: dict[str, str] = {}
-    for number, chain in enumerate(_written_chains(spec)):
+    for number, chain in enumerate(chains):
         name = chain.urdf.name
         taken[chain.name] = f"{number}_{name}" if name in taken.values() else name
     return taken
-
-
-def _written_chains(spec: MachineSpec) -> tuple[Chain, ...]:
-    """The chains, with that of the payload of the machine file."""
-    return spec.chains if spec.payload is None else (*spec.chains, spec.payload.chain)
 
 
 def _fixed_links(spec: MachineSpec) -> set[str]:
@@ -304,7 +299,7 @@ def _check_written_machine(
     force_differences = np.abs(written_forces - expected_forces).max(axis=0)
     if force_differences.max() <= _FORCE_TOLERANCE * np.abs(expected_forces).max():
         return
-    kinds = {*_FRICTION_PARAMETERS, "gas_scale", "rotor_inertia", *BODY_PARAMETERS}
+    kinds = {*FRICTION_PARAMETERS, "gas_scale", "rotor_inertia", *BODY_PARAMETERS}
     others = [name for name in model.names if name.rpartition(".")[2] not in kinds]
     what = f"'{others[0]}'" if others else "friction over other velocities than the machine's"
     raise InputError(f"the model has {what}, for which a machine file has no place, leave it out")

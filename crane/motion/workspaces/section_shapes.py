@@ -57,12 +57,15 @@ def patch_curves(
     """Singular curves of a patch: ends of the branch ("branch"), and of the tip ("tip")."""
     if not patch.is_closed.any():
         return []
-    lines = _join_polylines(patch, branch_edges)
-    curves = [curve for line in lines for curve in _split_curve("branch", kinematics, line)]
-    if patch.stroke_pair[0] == patch.stroke_pair[1]:
-        return curves
-    lines = _join_polylines(patch, _tip_singular_edges(kinematics, patch))
-    return curves + [curve for line in lines for curve in _split_curve("tip", kinematics, line)]
+    edges_by_kind = {"branch": branch_edges}
+    if patch.stroke_pair[0] != patch.stroke_pair[1]:
+        edges_by_kind["tip"] = _tip_singular_edges(kinematics, patch)
+    return [
+        curve
+        for kind, edges in edges_by_kind.items()
+        for line in _join_polylines(patch, edges)
+        for curve in _split_curve(kind, kinematics, line)
+    ]
 
 
 def branch_edges(machine: Machine, patch: WorkspacePatch) -> dict[GridEdge, Array]:
@@ -166,8 +169,9 @@ def _split_curve(kind: str, kinematics: WorkspaceKinematics, q: Array) -> list[S
     tips = kinematics.tip_positions(q)
     section_positions = kinematics.section.coordinates(tips)
     distances = np.linalg.norm(np.diff(section_positions, axis=0), axis=1)
-    jump_indices = np.flatnonzero(distances > _MAX_GAP_SHARE * kinematics.extent) + 1
-    rows = np.split(np.arange(len(q)), jump_indices)
+    rows = np.split(
+        np.arange(len(q)), np.flatnonzero(distances > _MAX_GAP_SHARE * kinematics.extent) + 1
+    )
     active = kinematics.machine.closure.active
     return [SingularCurve(kind, q[k][:, active], tips[k], section_positions[k]) for k in rows]
 
@@ -206,8 +210,9 @@ def covered_triangles(
         ring = [(patch.configurations[node], nodes[node]) for node in cell]
         is_reduced = len(kinematics.strokes) > _MAX_CURVE_STROKES
         subdivisions = _REDUCED_SUBDIVISIONS if is_reduced else _MAX_SUBDIVISIONS
-        triangles = _subdivide_cell(kinematics, ring, max_side, subdivisions)
-        out.append(np.array(triangles).reshape(-1, 3, 2))
+        out.append(
+            np.array(_subdivide_cell(kinematics, ring, max_side, subdivisions)).reshape(-1, 3, 2)
+        )
     if branch_edges:
         edge_positions = kinematics.section.coordinates(
             kinematics.tip_positions(np.array(list(branch_edges.values())))

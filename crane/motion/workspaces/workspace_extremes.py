@@ -57,9 +57,12 @@ def workspace_extremes(
             gradient = kinematics.section.section_jacobian(tips, tree)[0, axis]
             return -sign * float(kinematics.section.coordinates(tips)[0, axis]), -sign * gradient
 
-        best_index = int((sign * section_positions[:, axis]).argmin())
         value, configuration = maximize_on_branch(
-            kinematics.machine, q[best_index], kinematics.strokes, limits, objective
+            kinematics.machine,
+            q[int((sign * section_positions[:, axis]).argmin())],
+            kinematics.strokes,
+            limits,
+            objective,
         )
         value, q_a = -sign * value, configuration[kinematics.machine.closure.active]
         coordinates = np.array([value, *curve_positions[:, axis]])

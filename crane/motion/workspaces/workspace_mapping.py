@@ -153,8 +153,9 @@ def _map_patch(
     """Patch over the two strokes with the largest displacements (d,) of the tip."""
     first, second = sorted(strokes[int(i)] for i in np.argsort(displacements)[-2:])
     axes = tuple(np.linspace(lower[i], upper[i], _MAP_VALUES) for i in (first, second))
-    home = machine.home[machine.closure.active]
-    patch = fill_patch(machine, home, (first, second), (axes[0], axes[1]))
+    patch = fill_patch(
+        machine, machine.home[machine.closure.active], (first, second), (axes[0], axes[1])
+    )
     assert patch is not None, "home itself closes"
     return patch
 
@@ -180,20 +181,17 @@ def moving_strokes(
 ) -> list[int]:
     """Indices of driven joints that move the frame or the loops, without the slewing joint."""
     closure = machine.closure
-    configurations = [machine.home]
-    for _ in range(8):
-        configurations.append(
-            last_closed_configuration(machine, machine.home, random.uniform(lower, upper))[0]
-        )
-    tip_motion = np.zeros(len(machine.active))
+    targets = [random.uniform(lower, upper) for _ in range(8)]
+    configurations = [last_closed_configuration(machine, machine.home, x)[0] for x in targets]
     units = closure.units[closure.active] / closure.characteristic_length
-    for q in configurations:
-        gamma = closure.gamma(q)
-        tip_derivatives = np.abs(kinematics.tree_jacobian(q) @ gamma * units).max(axis=0)
-        tip_motion = np.maximum(tip_motion, tip_derivatives)
+    tip_derivatives = [
+        kinematics.tree_jacobian(q) @ closure.gamma(q) * units
+        for q in (machine.home, *configurations)
+    ]
+    tip_motion = np.abs(tip_derivatives).max(axis=(0, 1))
     is_coupled = np.abs(closure.gamma(machine.home)[closure.passive]).max(axis=0, initial=0.0) > 0
     tip_motion[~machine.is_driven] = 0.0
-    if tip_motion.max() <= _MOTION_TOLERANCE:
+    if not tip_motion.max() > _MOTION_TOLERANCE:
         return []
     is_relevant = machine.is_driven & ((tip_motion > _MOTION_TOLERANCE) | is_coupled)
     return [int(i) for i in np.flatnonzero(is_relevant) if i != held_joint]

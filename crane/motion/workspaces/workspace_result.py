@@ -57,8 +57,7 @@ class CoverageRaster:
 
     def cover(self, triangles: Array) -> None:
         """Mark all grid points within triangles (N, 3, 2)."""
-        start = np.array([self.u[0], self.w[0]])
-        grid_positions = (triangles - start) / self.spacing
+        grid_positions = (triangles - np.array([self.u[0], self.w[0]])) / self.spacing
         low = np.maximum(np.ceil(grid_positions.min(axis=1) - 1e-9).astype(int), 0)
         high = np.floor(grid_positions.max(axis=1) + 1e-9).astype(int) + 1
         for corners, (x0, y0), (x1, y1) in zip(grid_positions, low, high, strict=True):
@@ -220,8 +219,9 @@ class Workspace(Result):
             self.condition,
             self.least_singular_value,
         )
-        notes = {"machine": self.machine.load_expression}
-        write_table(path, Table(units, np.column_stack(columns), notes))
+        write_table(
+            path, Table(units, np.column_stack(columns), {"machine": self.machine.load_expression})
+        )
 
     def curves_to_csv(self, path: str | Path) -> None:
         """Write the singular curves: number, kind (0 branch, 1 tip), then as `to_csv`.

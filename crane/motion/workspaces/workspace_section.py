@@ -80,14 +80,14 @@ def find_slewing_joint(machine: Machine, frame: str) -> tuple[int, Array] | None
     gamma = machine.closure.gamma(machine.home)
     supporting_joints = list(model.supports[model.frames[machine.frame(frame)].parentJoint])
     data = model.createData()
-    configuration = machine.coordinates.configuration(machine.home)
-    jacobian = pin.computeJointJacobians(model, data, configuration).reshape(6, -1)
+    jacobian = pin.computeJointJacobians(
+        model, data, machine.coordinates.configuration(machine.home)
+    ).reshape(6, -1)
     for i, name in enumerate(machine.active):
-        column = machine.column(name)
         if not model.existJointName(name):  # a coordinate of a floating base
             continue
         joint = model.getJointId(name)
-        axis = jacobian[3:, column]
+        axis = jacobian[3:, machine.column(name)]
         if (
             machine.is_driven[i]
             and model.parents[joint] == 0
@@ -112,8 +112,9 @@ def workspace_section(
         home_position: (3,) position at home [m].
     """
     up, slewing_joint = up_direction(machine), find_slewing_joint(machine, frame)
-    offsets = tip_positions - tip_positions.mean(axis=0)
-    _, extents, directions = np.linalg.svd(offsets, full_matrices=False)
+    _, extents, directions = np.linalg.svd(
+        tip_positions - tip_positions.mean(axis=0), full_matrices=False
+    )
     flatness_threshold = _FLATNESS_TOLERANCE * max(
         float(extents[0]), 1e-9 * machine.closure.characteristic_length
     )
@@ -124,20 +125,18 @@ def workspace_section(
             normal = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
         normal = normal / np.linalg.norm(normal)
     is_flat = len(tip_positions) < 3 or extents[2] <= flatness_threshold
-    zero = np.zeros(3)
     if slewing_joint is not None:
         index, axis_point = slewing_joint
         axis_point = axis_point - (axis_point @ up) * up  # heights are those of the world
-        is_upright = (
-            abs(normal @ up) < _FLATNESS_TOLERANCE
-            and abs((home_position - axis_point) @ normal) <= 10 * flatness_threshold
-        )
-        if is_flat and is_upright:
+        is_upright = abs(normal @ up) < _FLATNESS_TOLERANCE
+        is_central = abs((home_position - axis_point) @ normal) <= 10 * flatness_threshold
+        is_radial, forward = not (is_flat and is_upright and is_central), np.zeros(3)
+        if not is_radial:
             forward = np.cross(normal, up)
             forward *= np.sign((home_position - axis_point) @ forward) or 1.0
-            return WorkspaceSection(("radius", "height"), forward, up, axis_point, False, index)
-        return WorkspaceSection(("radius", "height"), zero, up, axis_point, True, index)
+        return WorkspaceSection(("radius", "height"), forward, up, axis_point, is_radial, index)
     if not is_flat:
+        zero = np.zeros(3)
         return WorkspaceSection(("radius", "height"), zero, up, zero, True, None)
     if abs(normal @ up) > 1 - 1e-9:
         first_direction = np.eye(3)[(int(np.argmax(np.abs(up))) + 1) % 3]
@@ -147,22 +146,13 @@ def workspace_section(
         second_direction = second_direction / np.linalg.norm(second_direction)
         first_direction = np.cross(normal, second_direction)
         first_direction *= np.sign(first_direction[np.argmax(np.abs(first_direction))])
+    directions = np.array([first_direction, second_direction])
+    names = ["along", "height"]
+    for i, axis in np.argwhere(directions > 1 - 1e-9):
+        names[i] = "xyz"[axis]
     return WorkspaceSection(
-        (_axis_name(first_direction, "along"), _axis_name(second_direction, "height")),
-        first_direction,
-        second_direction,
-        zero,
-        False,
-        None,
+        (names[0], names[1]), first_direction, second_direction, np.zeros(3), False, None
     )
-
-
-def _axis_name(direction: Array, default: str) -> str:
-    """Name x, y or z of a direction along an axis, else a default."""
-    for name, axis in zip("xyz", np.eye(3), strict=True):
-        if direction @ axis > 1 - 1e-9:
-            return name
-    return default
 
 
 class WorkspaceKinematics:
@@ -210,8 +200,9 @@ class WorkspaceKinematics:
     def scaled_tip_jacobian(self, q: Array, tips: Array, gamma: Array) -> Array:
         """Scaled Jacobian d(u, w)/dq_A D_A (N, 2, d) of the strokes [m per scale]."""
         jacobian = np.array([self.kinematics.tree_jacobian(x) for x in q]) @ gamma
-        slopes = self.section.section_jacobian(tips, jacobian)[:, :, self.strokes]
-        return np.asarray(slopes * self.stroke_scales)
+        return np.asarray(
+            self.section.section_jacobian(tips, jacobian)[:, :, self.strokes] * self.stroke_scales
+        )
 
     def tip_determinant(self, stroke_pair: tuple[int, int], q: Array) -> Array:
         """Determinant (N,) [m2] of the scaled Jacobian by two strokes at q (N, nq)."""

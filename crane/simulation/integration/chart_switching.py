@@ -8,7 +8,6 @@ import numpy as np
 from crane.codegen import Tape
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.common.threads import single_threaded_blas
 from crane.control.control_law import ControlLaw, Controller, ControllerInputs
 from crane.control.valve_drive import ValveDrive
 from crane.simulation.integration.charts import (
@@ -78,38 +77,37 @@ class ChartSwitchingIntegrator:
         Raises:
             IntegrationHaltError: The integration halts in all charts.
         """
-        with single_threaded_blas(self._chart.machine.model.nv):
-            i = self.done = 0
-            while i < len(times) or self._integrator.offset < 0:
-                self._segment_start, halt = i, None
-                steps_made = self._integrator.done = 0
-                try:
-                    steps_made = self._integrator.run(
-                        times[i:], state, step, rows[i:], self._progress_from(i, progress)
-                    )
-                except IntegrationHaltError as error:
-                    steps_made, halt = self._integrator.next_instant, error
-                finally:  # also after an interrupt
-                    self.done = i + self._integrator.done
-                    first_recent = i + max(steps_made - _MAX_RECENT_STATES, 0)
-                    recent_states = np.vstack(
-                        [self._recent_states, rows[first_recent : i + steps_made, : len(state)]]
-                    )
-                    self._recent_states = recent_states[-_MAX_RECENT_STATES:]
-                    self._to_user_coordinates(times[i : self.done], rows[i : self.done])
-                i += steps_made
-                if i == len(times) and not self._integrator.offset < 0:
-                    continue
-                if self._switch_chart(times[0] + i * step, state, halt):
-                    continue
-                next_index = self._pass_branch_crossing(times, i, state, step, rows)
-                if next_index is not None:
-                    i = next_index
-                elif halt is not None:
-                    raise halt
-                else:
-                    self._chart_limits = self._chart_limits * _LIMIT_RELAXATION
-                    self._integrator.set_chart_limits(self._chart_limits)
+        i = self.done = 0
+        while i < len(times) or self._integrator.offset < 0:
+            self._segment_start, halt = i, None
+            steps_made = self._integrator.done = 0
+            try:
+                steps_made = self._integrator.run(
+                    times[i:], state, step, rows[i:], self._progress_from(i, progress)
+                )
+            except IntegrationHaltError as error:
+                steps_made, halt = self._integrator.next_instant, error
+            finally:  # also after an interrupt
+                self.done = i + self._integrator.done
+                first_recent = i + max(steps_made - _MAX_RECENT_STATES, 0)
+                recent_states = np.vstack(
+                    [self._recent_states, rows[first_recent : i + steps_made, : len(state)]]
+                )
+                self._recent_states = recent_states[-_MAX_RECENT_STATES:]
+                self._to_user_coordinates(times[i : self.done], rows[i : self.done])
+            i += steps_made
+            if i == len(times) and not self._integrator.offset < 0:
+                continue
+            if self._switch_chart(times[0] + i * step, state, halt):
+                continue
+            next_index = self._pass_branch_crossing(times, i, state, step, rows)
+            if next_index is not None:
+                i = next_index
+            elif halt is not None:
+                raise halt
+            else:
+                self._chart_limits = self._chart_limits * _LIMIT_RELAXATION
+                self._integrator.set_chart_limits(self._chart_limits)
 
     def final_row(self, time: float, state: Array) -> Array:
         """See `StickSlipIntegrator.final_row`."""
@@ -373,9 +371,12 @@ class ChartSwitchingIntegrator:
             return False
         columns = control.references(np.zeros(1)).shape[1]
         sizes = n, n, self._row_layout.parts["controller"], len(control.settings), columns
-        values = (tape.load_vector(i, 0, size) for i, size in enumerate(sizes))
+        q_a, v_a, state, settings, reference = (
+            tape.load_vector(i, 0, size) for i, size in enumerate(sizes)
+        )
+        functions = raise_undetermined, raise_undetermined
         try:
-            control.law(ControllerInputs(*values, raise_undetermined, raise_undetermined))
+            control.law(ControllerInputs(q_a, v_a, state, settings, reference, *functions))
         except InputError:
             return True
         return False

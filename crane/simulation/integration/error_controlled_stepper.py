@@ -27,7 +27,6 @@ from crane.common.samples import Array
 from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
 from crane.dynamics.external_forces import state_count
-from crane.machine.machine import Machine
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.machine_code_stepper import MachineCodeStepper
 from crane.simulation.integration.machine_formulas import reference_samples, wrap_rotations
@@ -117,7 +116,10 @@ class ErrorControlledStepper(MachineCodeStepper):
         super().__init__(chart, control, controller_state_count, method, fold_settings)
         self.tolerance = np.ascontiguousarray(tolerance)
         self._step_state = np.zeros(6)
-        self._break_times = np.append(break_times(chart.machine, control), np.inf)
+        # of the controller, or its reference, and of external forces [s]
+        sources: list[Any] = [x for x in (control, control.reference) if hasattr(x, "breaks")][:1]
+        breaks = [x.breaks() for x in (*chart.machine.external_forces, *sources)]
+        self._break_times = np.unique(np.concatenate([*breaks, [np.inf]]))
 
     def restart(self) -> None:
         """Start the next run with a short step."""
@@ -162,12 +164,15 @@ class ErrorControlledStepper(MachineCodeStepper):
                 segment_end = time_to_break
             pairs = max(1, int(np.ceil((segment_end - segment_start) / pair - _TIME_TOLERANCE)))
             lengths[2:5] = segment_start, (segment_end - segment_start) / pairs, segment_end
+            # references have one-sided limits at both ends
+            grid = np.linspace(now + segment_start, now + segment_end, 2 * pairs + 1)
+            grid[[0, -1]] += _TIME_TOLERANCE * (grid[1] - grid[0]) * np.array([1.0, -1.0])
             rows_made = self._program.call(
                 "run",
                 count,
                 *functions,
                 *self._common_arguments,
-                self._reference_rows(now + segment_start, now + segment_end, pairs),
+                reference_samples(self._chart.machine, self._control, grid),
                 state,
                 out,
                 lengths,
@@ -189,22 +194,14 @@ class ErrorControlledStepper(MachineCodeStepper):
                 break
         return done, offset
 
-    def _reference_rows(self, start_time: float, end_time: float, pairs: int) -> Array:
-        """References (2 pairs + 1, c) between two times [s], with one-sided limits at both."""
-        grid = np.linspace(start_time, end_time, 2 * pairs + 1)
-        grid[[0, -1]] += _TIME_TOLERANCE * (grid[1] - start_time) * np.array([1.0, -1.0])
-        return reference_samples(self._chart.machine, self._control, grid)
-
     def _build(self, program: Program) -> None:
         for suffix, with_joints_at_rest in self._rest_variants:
             machine = self._trace_controlled_machine(Tape())
             outputs = machine.outputs(with_joints_at_rest)
             if isinstance(self._control, ValveDrive):
                 outputs += self._control.channel_values(machine.inputs)
-            margin = machine.accelerations(with_joints_at_rest).transition_margin
-            program.add_formula("observe" + suffix, 5, {"outputs": outputs, "margin": [margin]})
-            machine = self._trace_controlled_machine(Tape())
             rate, margin = machine.state_rate(with_joints_at_rest)
+            program.add_formula("observe" + suffix, 5, {"outputs": outputs, "margin": [margin]})
             closure = self._chart.machine.closure
             event_distances = machine.dynamics_formulas.end_stop_distances(
                 closure.units.tolist(), closure.characteristic_length
@@ -223,7 +220,16 @@ class ErrorControlledStepper(MachineCodeStepper):
                 "external", functions=("callback",), arrays=("callback_inputs", "results")
             ) as r:
                 r.return_value(r.call("callback", r.callback_inputs, r.results))
-        self._add_event_formulas(program, len(event_distances))
+        if count := len(event_distances):  # signs, and the least product of distance and sign
+            start = program.formula_outputs("rate").start_index("event_distances")
+            signs = [copysign(1.0, x) for x in Tape().load_vector(0, start, count)]
+            program.add_formula("event_signs", 1, signs)
+            tape = Tape()
+            smallest: Scalar = 1.0
+            pairs = tape.load_vector(0, start, count), tape.load_vector(1, 0, count)
+            for distance, sign in zip(*pairs, strict=True):
+                smallest = minimum(smallest, distance * sign)
+            program.add_formula("least_distance", 2, [smallest])
         self._add_method(program)
         self._add_interpolation(program)
         functions = ("close",) if self.external_callback is None else ("close", "callback")
@@ -297,21 +303,6 @@ class ErrorControlledStepper(MachineCodeStepper):
         step_ratio = minimum(maximum(step_ratio, MIN_STEP_RATIO), max_step_ratio)
         return {"state": after, "error": [error], "change": [step_ratio], "move": [largest_move]}
 
-    def _add_event_formulas(self, program: Program, count: int) -> None:
-        """event_signs(rate), and least_distance(rate, signs), of event distance times sign."""
-        start = program.formula_outputs("rate").start_index("event_distances")
-        if not count:
-            return
-        program.add_formula(
-            "event_signs", 1, [copysign(1.0, x) for x in Tape().load_vector(0, start, count)]
-        )
-        tape = Tape()
-        distances = tape.load_vector(0, start, count)
-        smallest: Scalar = 1.0
-        for distance, sign in zip(distances, tape.load_vector(1, 0, count), strict=True):
-            smallest = minimum(smallest, distance * sign)
-        program.add_formula("least_distance", 2, [smallest])
-
     @abstractmethod
     def _add_method(self, program: Program) -> None:
         """Add the formulas of a method, among them `finish` and `dense`.
@@ -322,16 +313,6 @@ class ErrorControlledStepper(MachineCodeStepper):
     @abstractmethod
     def _write_step(self, program: Program, step: StepLoop) -> tuple[StepWriter, StepWriter]:
         """Writers of a step up to `finish`, and of `dense` after a step."""
-
-
-def break_times(machine: Machine, control: ControlLaw) -> Array:
-    """Break times (k,) [s] of a controller, or its reference, and of external forces, in order."""
-    sources: list[Any] = [control, getattr(control, "reference", None)]
-    sources = [*machine.external_forces, *[x for x in sources if hasattr(x, "breaks")][:1]]
-    return np.array(
-        sorted({time for source in sources for time in np.asarray(source.breaks()).tolist()}),
-        dtype=np.float64,
-    )
 
 
 class DormandPrinceStepper(ErrorControlledStepper):
@@ -410,7 +391,6 @@ class DormandPrinceStepper(ErrorControlledStepper):
         program.add_formula("dense", 4, parts)
 
     def _write_step(self, program: Program, step: StepLoop) -> tuple[StepWriter, StepWriter]:
-        """See `ErrorControlledStepper`."""
         from scipy.integrate import DOP853  # slow to import
 
         r, size = step.routine, self.state_layout.size

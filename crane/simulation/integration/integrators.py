@@ -60,7 +60,7 @@ class StickSlipIntegrator(ABC):
     ):
         self.python_stepper = PythonStepper(chart, control, controller_state_count)
         self.done = self.next_instant = 0
-        self.offset = self._next_time = 0.0
+        self.offset = self._first = self._step = 0.0
         self._stick_slip, self._compiled_method = chart.stick_slip, compiled_method
         self._dynamics, self._transition_count, self._count_start_time = chart.dynamics, 0, -np.inf
 
@@ -88,19 +88,17 @@ class StickSlipIntegrator(ABC):
         Raises:
             IntegrationHaltError: A step fails, or the loops do not close.
         """
-        first = times[0] if len(times) else self._next_time
+        first = times[0] if len(times) else self._first + self._step * self.next_instant
+        self._first, self._step = first, step
         self.done = self.next_instant = 0
         self._prepare_modes(first + self.offset, state)
-        try:
-            while self.done < len(times) or self.offset < 0:
-                if not self._advance(first, times, state, step, rows, progress):
-                    break
-                if not self.offset < -_TIME_TOLERANCE * step:  # within rounding errors
-                    self.offset = 0.0
-                if progress is not None:
-                    progress(self.done)
-        finally:
-            self._next_time = first + step * self.next_instant
+        while self.done < len(times) or self.offset < 0:
+            if not self._advance(first, times, state, step, rows, progress):
+                break
+            if not self.offset < -_TIME_TOLERANCE * step:  # within rounding errors
+                self.offset = 0.0
+            if progress is not None:
+                progress(self.done)
         return self.next_instant
 
     @abstractmethod
@@ -154,7 +152,6 @@ class StickSlipIntegrator(ABC):
         raise NotImplementedError
 
     def _outputs_and_margin(self, time: float, state: Array) -> tuple[Array, float]:
-        """Outputs and margin at a state."""
         if self._compiled_method is not None:
             return self._compiled_method.observe(time, state)
         return self.python_stepper.observe(time, state)[1], self.python_stepper.transition_margin
@@ -269,7 +266,6 @@ class FixedStepIntegrator(StickSlipIntegrator):
         rows: Array,
         progress: StepProgress,
     ) -> bool:
-        """See `StickSlipIntegrator._advance`."""
         if self.offset < 0:
             time = first + step * self.next_instant + self.offset
             after, margin = self._make_step(time, state, -self.offset)
@@ -307,7 +303,6 @@ class FixedStepIntegrator(StickSlipIntegrator):
         return True
 
     def _make_step(self, time: float, state: Array, length: float) -> tuple[Array, float]:
-        """See `StickSlipIntegrator._make_step`."""
         if self._compiled_stepper is not None:
             after, row = state.copy(), np.empty((1, self._row_size))
             if self._compiled_stepper.run(np.array([time]), after, length, row):
@@ -406,14 +401,20 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
         rows: Array,
         progress: StepProgress,
     ) -> bool:
-        """See `StickSlipIntegrator._advance`."""
         now = first + step * self.done
         chunk = rows[self.done : min(self.done + _INSTANTS_PER_REPORT, len(times))]
         if self._sampled_drive is not None:
             since = round(now / step) % self._period_in_steps
             chunk = chunk[: 0 if self.offset < 0 else self._period_in_steps - since]
-            if not since and not self.offset < 0:
-                self._update_command(self._sampled_drive, now, state)
+            at = self.python_stepper.state_layout.view(state)
+            try:
+                if not since and not self.offset < 0:
+                    v_a = self._chart.user_velocities(at.q, at.v_a)
+                    self._sampled_drive.update(now, at.q, v_a, at.controller)
+            except ClosureError as error:
+                raise IntegrationHaltError(
+                    now, self.python_stepper.user_coordinates(state), f": {error}"
+                ) from None
         count, self.offset = self._stepper.run(now, state, self.offset, step, chunk)
         self.done = self.next_instant = self.done + count
         time = first + step * self.done + self.offset
@@ -426,13 +427,3 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
                 raise self.python_stepper.halt_error(time, state)
             return False
         return True
-
-    def _update_command(self, drive: ValveDrive, time: float, state: Array) -> None:
-        """Sample the valve command."""
-        at = self.python_stepper.state_layout.view(state)
-        try:
-            drive.update(time, at.q, self._chart.user_velocities(at.q, at.v_a), at.controller)
-        except ClosureError as error:
-            raise IntegrationHaltError(
-                time, self.python_stepper.user_coordinates(state), f": {error}"
-            ) from None

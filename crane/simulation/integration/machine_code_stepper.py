@@ -8,7 +8,6 @@ from crane.codegen import (
     Program,
     Routine,
     RoutineValue,
-    Scalar,
     Tape,
     max_abs,
     maximum,
@@ -109,7 +108,6 @@ class MachineCodeStepper:
         self._program = machine_program(machine, control, key, self._build)
 
     def _build(self, program: Program) -> None:
-        """Add formulas and routines."""
         raise NotImplementedError
 
     def _trace_controlled_machine(self, tape: Tape) -> MachineFormulas:
@@ -198,14 +196,12 @@ class RungeKuttaStepper(MachineCodeStepper):
 
     def _build(self, program: Program) -> None:
         for suffix, with_joints_at_rest in self._rest_variants:
-            for name in ("observe", "rate"):
-                machine = self._trace_controlled_machine(Tape())
-                rate, margin = machine.state_rate(with_joints_at_rest)
-                parts: dict[str, list[Scalar]] = {"rate": rate}
-                if name == "observe":
-                    parts["outputs"] = machine.outputs(with_joints_at_rest)
-                    parts["margin"] = [margin]
-                program.add_formula(name + suffix, 5, parts)
+            machine = self._trace_controlled_machine(Tape())
+            rate, margin = machine.state_rate(with_joints_at_rest)
+            outputs = machine.outputs(with_joints_at_rest)
+            parts = {"rate": rate, "outputs": outputs, "margin": [margin]}
+            program.add_formula("observe" + suffix, 5, parts)
+            program.add_formula("rate" + suffix, 5, {"rate": rate})
         self._add_sum_formulas(program)
         names = ("geometry", "numbers", "control", "refs", "state", "out", "h", "bounds")
         with program.add_routine(

@@ -218,15 +218,21 @@ class PythonStepper:
             rate, _ = self._state_rate(time + share * step, state + share * step * rate)
             rate_sum = rate_sum + weight * rate
         after = state + step / 6 * rate_sum
-        machine, q = self._dynamics.machine, self.state_layout.view(after).q
+        self.close_loops(time + step, after)
+        return after
+
+    def close_loops(self, time: float, state: Array) -> None:
+        """Close the loops of a state.
+
+        Raises:
+            IntegrationHaltError: They do not close.
+        """
+        machine, q = self._dynamics.machine, self.state_layout.view(state).q
         try:
             closed = machine.closure.solve(q[machine.closure.active], initial_guess=q)
         except ClosureError as error:
-            raise IntegrationHaltError(
-                time + step, self.user_coordinates(after), f": {error}"
-            ) from None
+            raise IntegrationHaltError(time, self.user_coordinates(state), f": {error}") from None
         q[:] = machine.coordinates.wrap_rotations(closed)
-        return after
 
     def halt_error(self, time: float, state: Array) -> IntegrationHaltError:
         """The halt of a machine that cannot continue with any step size."""
@@ -264,7 +270,6 @@ class PythonStepper:
         ), tau
 
     def _set_circuit_friction(self, time: float, state: LayoutView, v_a: Array) -> None:
-        """Set the circuit friction of the dynamics."""
         control = self._control
         if self._dynamics.forces.circuit_friction_columns and isinstance(control, ValveDrive):
             inputs = control.inputs_at(

@@ -268,7 +268,6 @@ class RadauStepper(ErrorControlledStepper):
         program.add_formula("dense", 1, [x for row in coefficients for x in row])
 
     def _write_step(self, program: Program, step: StepLoop) -> tuple[StepWriter, StepWriter]:
-        """See `ErrorControlledStepper`."""
         sizes = self.state_layout.size, self._mobility, self._controller_state_count
         writer = _RadauStepCode(program, step, *sizes)
         return writer.write_attempt, writer.write_interpolation
@@ -433,7 +432,6 @@ def _stage_outputs(
 
 
 def _sum_of_squares(values: list[Scalar], scales: list[Scalar]) -> Scalar:
-    """Sum of the squares of scaled values."""
     total: Scalar = 0.0
     for x, scale in zip(values, scales, strict=True):
         total = total + (x * scale) * (x * scale)
@@ -441,5 +439,4 @@ def _sum_of_squares(values: list[Scalar], scales: list[Scalar]) -> Scalar:
 
 
 def _combine_rows(weights: Array, rows: list[list[Scalar]]) -> list[list[Scalar]]:
-    """Linear combinations of rows by rows of weights."""
     return [[dot(row, column) for column in zip(*rows, strict=True)] for row in weights.tolist()]

@@ -205,7 +205,15 @@ class RosenbrockStepper(ErrorControlledStepper):
             coordinate_directions = [
                 scale_vector(step_gamma, row) for row in dynamics.rate_jacobian
             ]
-        matrix = self._system_matrix(jacobian, by_coordinates, mass, step_gamma)
+        # 1 - h gamma J of stiff controller states and velocities, the latter times M_A
+        matrix = [scale_vector(-1.0 * step_gamma, row) for row in jacobian]
+        for i in range(k):
+            matrix[i][i] = matrix[i][i] + 1.0
+        for row, mass_row in zip(matrix[k:], mass, strict=True):
+            row[k:] = add_vectors(row[k:], mass_row)
+        for row, derivatives in zip(matrix, by_coordinates, strict=True):
+            for j, derivative in enumerate(derivatives):
+                row[k + j] = row[k + j] - step_gamma * derivative
         constraints = dynamics.stick_slip_rows if with_joints_at_rest else []
         constraint_rows = [scale_vector(held, row) for held, row in constraints]
         _append_constraints(matrix, k, constraint_rows, [held - 1.0 for held, _ in constraints])
@@ -224,21 +232,6 @@ class RosenbrockStepper(ErrorControlledStepper):
         )
         for i in range(STAGES):
             self._add_stage_solver(program, i, suffix, tables)
-
-    def _system_matrix(
-        self, jacobian: Matrix, by_coordinates: Matrix, mass: Matrix, step_gamma: Scalar
-    ) -> Matrix:
-        """1 - h gamma J of stiff controller states and velocities, the latter times M_A."""
-        k = self._stiff_state_count
-        matrix = [scale_vector(-1.0 * step_gamma, row) for row in jacobian]
-        for i in range(k):
-            matrix[i][i] = matrix[i][i] + 1.0
-        for row, mass_row in zip(matrix[k:], mass, strict=True):
-            row[k:] = add_vectors(row[k:], mass_row)
-        for row, derivatives in zip(matrix, by_coordinates, strict=True):
-            for j, derivative in enumerate(derivatives):
-                row[k + j] = row[k + j] - step_gamma * derivative
-        return matrix
 
     def _add_stage_solver(
         self, program: Program, stage: int, suffix: str, tables: dict[str, Matrix]
@@ -276,7 +269,6 @@ class RosenbrockStepper(ErrorControlledStepper):
         program.add_formula(f"solve{stage}{suffix}", 4, outputs)
 
     def _write_step(self, program: Program, step: StepLoop) -> tuple[StepWriter, StepWriter]:
-        """See `ErrorControlledStepper`."""
         r, size = step.routine, self.state_layout.size
         u, stage = r.local_array("u", STAGES * size), r.local_array("stage", size)
         stage_rate = r.local_array("slope", program.formula_outputs("rate"))

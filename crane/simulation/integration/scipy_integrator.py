@@ -118,7 +118,7 @@ class ScipyIntegrator(StickSlipIntegrator):
                 progress(self.next_instant)
             if event_state is not None:
                 state[:] = event_state
-                self._close_loops(until, state)
+                self.python_stepper.close_loops(until, state)
                 self._find_modes(until, state)
                 self.next_instant = self.done
                 self.offset = until - instants[self.next_instant]
@@ -164,23 +164,9 @@ class ScipyIntegrator(StickSlipIntegrator):
             if time > end_time:
                 break
             sample = dense_output(time)
-            self._close_loops(time, sample)
+            self.python_stepper.close_loops(time, sample)
             state[:] = sample
             self.next_instant, self.offset = k, 0.0
             if k < len(rows):
                 rows[k] = [*sample, *self.python_stepper.observe(time, sample)[1]]
                 self.done = k + 1
-
-    def _close_loops(self, time: float, state: Array) -> None:
-        """Close the loops of a state.
-
-        Raises:
-            IntegrationHaltError: They do not close.
-        """
-        q, closure = self.python_stepper.state_layout.view(state).q, self._closure
-        try:
-            q[:] = closure.solve(q[closure.active], initial_guess=q)
-        except ClosureError as error:
-            raise IntegrationHaltError(
-                time, self.python_stepper.user_coordinates(state), f": {error}"
-            ) from None

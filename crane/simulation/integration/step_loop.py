@@ -79,9 +79,15 @@ class StepLoop:
         self._output_interval, self._time, self._reference_spacing, self._end_time = (
             routine.new_variable(routine.h[i]) for i in (0, 2, 3, 4)
         )
-        self._recorded_count, self._output_time = map(routine.new_variable, (0, 0.0))
+        self._recorded_count, self._output_time = (
+            routine.new_variable(0),
+            routine.new_variable(0.0),
+        )
         # references at the start of the step
-        self._reference_index, self._reference_time = map(routine.new_variable, (0, self._time))
+        self._reference_index, self._reference_time = (
+            routine.new_variable(0),
+            routine.new_variable(self._time),
+        )
         self._event_distance_count = formula_outputs("rate").parts["event_distances"]
         self._has_events = self._has_stick_slip or bool(self._event_distance_count)
 
@@ -97,9 +103,8 @@ class StepLoop:
         self._attempt_step, self._interpolate = make_step(self._program, self)
         self.call("rate", self._time, r.state, self.start_rate)
         # event location: time to the event, and margins before and behind it
-        self._time_to_event, self._margin_before, self._margin_behind, self._trial_count = map(
-            r.new_variable, (0.0, 1.0, 0.0, 0)
-        )
+        self._time_to_event, self._trial_count = r.new_variable(0.0), r.new_variable(0)
+        self._margin_before, self._margin_behind = r.new_variable(1.0), r.new_variable(0.0)
         self._event_signs = r.local_array("event_signs", max(1, self._event_distance_count))
         self._signed_distance = r.local_array("least_distance", 1)
         if self._event_distance_count:
@@ -190,7 +195,8 @@ class StepLoop:
         """Detect events and record outputs after an accepted step whose loops are closed."""
         r = self.routine
         self.call("rate", self._time + self._step_size, self.step_result, self.end_rate)
-        is_beyond_event, event, least_margin = map(r.new_variable, (0, 0, 1.0))
+        is_beyond_event, event = r.new_variable(0), r.new_variable(0)
+        least_margin = r.new_variable(1.0)
         self._detect_event(is_beyond_event, event, least_margin)
         self._record_outputs(is_beyond_event, event)
         with r.if_then(is_beyond_event < 1):
@@ -219,7 +225,7 @@ class StepLoop:
     def _record_outputs(self, is_beyond_event: RoutineValue, event: RoutineValue) -> None:
         """Write the rows of the output instants within the step."""
         r, output_time, length = self.routine, self._output_time, self._step_size
-        count, first_time = map(r.new_variable, (self._recorded_count, output_time))
+        count, first_time = r.new_variable(self._recorded_count), r.new_variable(output_time)
         is_inside = output_time < (self._time + length) * _END_SHARE
         with r.if_then((is_beyond_event < 1) & is_inside):
             self._interpolate(self._time, length)
@@ -298,7 +304,8 @@ class StepLoop:
         """Write the call of a formula at a time relative to `run`, with state and arrays."""
         r = self.routine
         if self._columns:
-            index, start = map(r.new_variable, (self._reference_index, self._reference_time))
+            index = r.new_variable(self._reference_index)
+            start = r.new_variable(self._reference_time)
             self._advance_references(index, start, time)
             r.store(self._relative_time, 0, (time - start) / self._reference_spacing)
             r.call(

@@ -1,6 +1,6 @@
 """Drive of a machine that is linearized: forces, or a circuit with valves."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -101,8 +101,7 @@ class LinearizedDrive:
             for name in self.state_units
         ]
         spools = self._valve_drive.circuit.hydraulics.spools.values()
-        mask: Any = np.array([*initial_states, *(spool.joint in moving for spool in spools)])
-        return mask
+        return np.asarray([*initial_states, *(spool.joint in moving for spool in spools)])
 
     def load_bearing_mask(self, forces: Array) -> Any:
         """(k,) whether states are pressures of the chambers that carry forces (n,)."""
@@ -212,7 +211,14 @@ class LinearizedDrive:
         tau, rates = control.law(inputs)
         output_units = [*control.channel_values(inputs), *(tau[i] for i in self._active_indices)]
         if friction := control.circuit_friction(inputs):
-            tau = subtract_vectors(tau, self._friction_forces(machine, friction, v_a))
+            # F_K sign(v); 0 for joints at rest
+            forces = JointForces(machine)
+            friction_forces: list[Scalar] = [0.0] * n
+            for column, force in zip(forces.circuit_friction_columns, friction, strict=True):
+                i, law = machine.active.index(machine.joints[column]), forces.table[column]
+                sign = friction_sign(law.tolist(), v_a[i], column in forces.sticking, False)
+                friction_forces[i] = force * sign
+            tau = subtract_vectors(tau, friction_forces)
         values = [*tau, *rates[:k], *output_units]
         variables = [
             x for x in (*q_a, *v_a, *states, *initial_inputs) if isinstance(x, SymbolicExpression)
@@ -233,20 +239,6 @@ class LinearizedDrive:
         if key not in compiled_closure.programs:
             compiled_closure.programs[key] = compiled_closure.cached_program(key, build)
         return compiled_closure.programs[key]
-
-    @staticmethod
-    def _friction_forces(
-        machine: Machine, circuit_friction: Sequence[Scalar], v_a: Sequence[Scalar]
-    ) -> list[Scalar]:
-        """Circuit friction (n,), F_K sign(v); 0 for joints at rest."""
-        out: list[Scalar] = [0.0] * len(v_a)
-        forces = JointForces(machine)
-        for column, force in zip(forces.circuit_friction_columns, circuit_friction, strict=True):
-            i = machine.active.index(machine.joints[column])
-            out[i] = force * friction_sign(
-                forces.table[column].tolist(), v_a[i], column in forces.sticking, False
-            )
-        return out
 
     def evaluate(
         self, q_a: Array, v_a: Array, states: Array, inputs: Array

@@ -87,7 +87,6 @@ class LinearModel(Result):
     gamma: Array
 
     def _one_line(self) -> str:
-        """Its sizes, and the frequencies of oscillatory modes."""
         rings = [mode.frequency for mode in self.modes if mode.is_oscillatory]
         ends = dict.fromkeys(f"{frequency:.3g}" for frequency in rings[:1] + rings[-1:])
         words = f", rings at {' to '.join(ends)} Hz" if rings else ""

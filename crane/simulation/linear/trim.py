@@ -40,41 +40,27 @@ def find_trim(
         + dynamics.friction(q_a, v_a)
         - external_forces
     )
-    if machine.free:
-        _check_free_joints(dynamics, q_a, v_a, forces, external_forces)
-    if drive.state_units:
-        for shared in (True, False) if not v_a.any() else (True,):
-            trim = _trim_valves(_TrimEquations(dynamics, drive, q_a, v_a, external_forces, shared))
-            if trim is not None:
-                return trim
-        raise SimulationError(
-            "the machine cannot be trimmed there: no pressures and signals keep these velocities"
-        )
-    return drive.initial_states, forces[machine.is_driven]
-
-
-def _check_free_joints(
-    dynamics: Dynamics, q_a: Array, v_a: Array, forces: Array, external_forces: Array
-) -> None:
-    """Check that free joints keep their velocities while the drives exert their forces (n,).
-
-    Raises:
-        SimulationError: One does not.
-    """
-    machine = dynamics.machine
-    drive_forces = np.where(machine.is_driven, forces, 0.0)
-    units = machine.closure.units[machine.closure.active] / machine.closure.characteristic_time**2
-    accelerations = (
-        np.abs(dynamics.forward(q_a, v_a, drive_forces + external_forces, friction=True)) / units
+    if machine.free:  # they keep their velocities while the drives exert their forces
+        closure, drive_forces = machine.closure, np.where(machine.is_driven, forces, 0.0)
+        units = closure.units[closure.active] / closure.characteristic_time**2
+        a_a = dynamics.forward(q_a, v_a, drive_forces + external_forces, friction=True)
+        if np.abs(a_a / units).max() > _FREE_JOINT_TOLERANCE:
+            worst = int(np.argmax(np.abs(forces - drive_forces)))
+            joint = machine.active[worst]
+            raise SimulationError(
+                f"free joint '{joint}' does not stay there, {forces[worst]:.3g} "
+                f"{FORCE_UNITS[machine.unit(joint)]} would have to hold it: linearize where it "
+                "hangs still"
+            )
+    if not drive.state_units:
+        return drive.initial_states, forces[machine.is_driven]
+    for shared in (True, False) if not v_a.any() else (True,):
+        trim = _trim_valves(_TrimEquations(dynamics, drive, q_a, v_a, external_forces, shared))
+        if trim is not None:
+            return trim
+    raise SimulationError(
+        "the machine cannot be trimmed there: no pressures and signals keep these velocities"
     )
-    if accelerations.max() > _FREE_JOINT_TOLERANCE:
-        worst = int(np.argmax(np.abs(forces - drive_forces)))
-        joint = machine.active[worst]
-        unit = FORCE_UNITS[machine.unit(joint)]
-        raise SimulationError(
-            f"free joint '{joint}' does not stay there, {forces[worst]:.3g} {unit} would have to "
-            "hold it: linearize where it hangs still"
-        )
 
 
 class _TrimEquations:

@@ -112,21 +112,14 @@ class AdjointIntegrator:
                 if len(output_weights) > 1:
                     output_weights[-1] = 0.0  # it belongs to the next segment
                 adjoint = self._integrate_segment(nodes, adjoint, output_weights, MAX_REFINEMENTS)
-        return self._gradient_constants(adjoint)
-
-    def _gradient_constants(self, start: Array) -> SimulationConstants:
-        """The gradient by parts of the constants."""
         out = SimulationConstants(
-            *(np.zeros((len(start), part.shape[-1])) for part in self._nominal_constants)
+            *(np.zeros((sum_count, part.shape[-1])) for part in self._nominal_constants)
         )
-        every = np.split(
-            self._gradient,
-            np.cumsum([len(which) for which in self._variable_indices])[:-1],
-            axis=1,
-        )
+        ends = np.cumsum([len(which) for which in self._variable_indices])[:-1]
+        every = np.split(self._gradient, ends, axis=1)
         for part, which, found in zip(out[:4], self._variable_indices, every, strict=True):
             part[:, which] = found
-        return out._replace(initial_state=start)
+        return out._replace(initial_state=adjoint)
 
     def _integrate_segment(
         self, nodes: MotionNodes, adjoint: Array, output_weights: Array | None, depth: int
@@ -238,7 +231,7 @@ class AdjointIntegrator:
     def _gradients_at_nodes(
         self, nodes: MotionNodes, node_indices: Indices, weights: Array
     ) -> Array:
-        """See `ReverseDerivatives.against`, at some of the nodes."""
+        """See `ReverseDerivatives.gradients`, at some of the nodes."""
         numbers = self._motion.constants_at(self._nominal_constants, nodes)
         numbers = numbers._replace(references=numbers.references[node_indices])
         return self._reverse_derivatives.gradients(
@@ -289,7 +282,7 @@ class AdjointIntegrator:
         return rough
 
     def _apply_jump(self, jump: TransitionJump, adjoint: Array) -> Array:
-        """Lambda before joints start or stop, from that behind; see `SimulatedMotion.leap`."""
+        """Lambda before joints start or stop, from that behind; see `sensitivity_jump`."""
         track, nodes = self._motion, self._motion.nodes_at_transition(jump.transition)
         by_state, leap = track.sensitivity_jump(
             self._forward_derivatives, self._nominal_constants, jump

@@ -8,10 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.codegen import LayoutView
 from crane.common.errors import CraneWarning, InputError, suggest_names
 from crane.common.one_line_repr import OneLineRepr
-from crane.common.progress import progress_reporter
 from crane.common.samples import Array
 from crane.control.control_law import Controller
 from crane.control.valve_commands import ValveCommand
@@ -21,7 +19,6 @@ from crane.recordings.recording import Recording
 from crane.simulation.recorded_run import read_simulation
 from crane.simulation.sensitivity.adjoint_integration import AdjointIntegrator
 from crane.simulation.sensitivity.motion_sensitivities import SensitivityProblem
-from crane.simulation.sensitivity.simulated_motion import SimulatedMotion
 from crane.simulation.sensitivity.simulation_constants import SimulationConstants
 from crane.simulation.simulation_run import Progress
 from crane.simulation.simulation_setup import Force
@@ -53,7 +50,6 @@ class Gradient(OneLineRepr):
     derivatives: Array
 
     def _one_line(self) -> str:
-        """Outputs and number of parameters."""
         return f"Gradient of {', '.join(self.outputs)} by {len(self.parameters)} numbers"
 
     def derivative(self, parameter: str) -> Array:
@@ -131,20 +127,12 @@ def gradient(
         InputError: As `sensitivities`, or weights have a wrong shape.
         SimulationError: As `sensitivities`.
     """
-    progress = progress_reporter(progress)
-    problem = SensitivityProblem.from_arguments(
-        machine, controller, initial, duration, step, outputs, method, tolerance
-    )
-    directions = problem.directions
     parameters = None if parameters is None else list(dict.fromkeys(parameters))
-    for name in parameters or ():
-        directions.parameter_value(name)
-    track = SimulatedMotion(problem.simulation, progress)
-    directions_by_name = (
-        directions.all_derivatives(track.time)
-        if parameters is None
-        else directions.derivatives(parameters, track.time)
-    )
+    motion, recording, names, directions = SensitivityProblem.from_arguments(
+        machine, controller, initial, duration, step, outputs, parameters or (), method, tolerance,
+        progress,
+    )  # fmt: skip
+    directions_by_name = directions.derivatives(parameters, motion.time)
     for name in [x for x, direction in directions_by_name.items() if direction.references.any()]:
         if parameters is not None:
             raise InputError(
@@ -157,11 +145,17 @@ def gradient(
     changes = _largest_changes(
         directions_by_name, {name: directions.typical_change(name) for name in directions_by_name}
     )
-    integrator = AdjointIntegrator(
-        track, problem.outputs, directions.nominal_constants(track.time), changes
-    )
-    recording = problem.record_motion(track)
-    observed = _output_values(track.chart.machine, recording, track.parts, problem.outputs)
+    nominal_constants = directions.nominal_constants(motion.time)
+    integrator = AdjointIntegrator(motion, names, nominal_constants, changes)
+    simulated, columns, values = motion.chart.machine, recording.columns(), []
+    for name in names:
+        joint = name.removesuffix(VELOCITY_SUFFIX)
+        if name not in columns and joint in simulated.joints:  # the velocity of a passive joint
+            rows = simulated.closure.gamma(motion.parts.q)[:, simulated.joints.index(joint)]
+            values.append(np.einsum("ni,ni->n", rows, motion.parts.v_a))
+        else:
+            values.append(read_simulation(simulated, recording, [name])[:, 0])
+    observed = np.column_stack(values)
     total, weights = _functional_and_weights(functional, recording.time, observed)
     gradients = integrator.integrate_backward(weights.reshape(-1, *observed.shape))
     # no parameter changes the references of the controller
@@ -174,11 +168,11 @@ def gradient(
         ),
         np.zeros(()),
     )
-    for note in track.notes:
+    for note in motion.notes:
         warnings.warn(note, CraneWarning, stacklevel=2)
     return Gradient(
         recording,
-        problem.outputs,
+        names,
         observed,
         tuple(directions_by_name),
         np.array([directions.parameter_value(name) for name in directions_by_name]),
@@ -224,23 +218,3 @@ def _functional_and_weights(
     if not (np.isfinite(weights).all() and np.isfinite(total).all()):
         raise InputError("weights of outputs are not finite, look at the function")
     return total, weights
-
-
-def _output_values(
-    machine: Machine, recording: Recording, parts: LayoutView, outputs: Sequence[str]
-) -> Array:
-    """Values (N + 1, k) of the outputs, which may be velocities of passive joints."""
-    columns, found = recording.columns(), []
-    for name in outputs:
-        joint = name.removesuffix(VELOCITY_SUFFIX)
-        if name not in columns and joint in machine.joints:
-            found.append(
-                np.einsum(
-                    "ni,ni->n",
-                    machine.closure.gamma(parts.q)[:, machine.joints.index(joint)],
-                    parts.v_a,
-                )
-            )
-        else:
-            found.append(read_simulation(machine, recording, [name])[:, 0])
-    return np.column_stack(found)

@@ -32,13 +32,13 @@ from crane.recordings.recording import Recording
 from crane.recordings.timeseries import Table
 from crane.simulation.recorded_run import record_run
 from crane.simulation.sensitivity.rate_formulas import observed_frames
-from crane.simulation.sensitivity.simulated_motion import SimulatedMotion, SimulationProblem
+from crane.simulation.sensitivity.simulated_motion import SimulatedMotion
 from crane.simulation.sensitivity.simulation_constants import (
     START_PREFIX,
     ParameterDirections,
     SimulationConstants,
 )
-from crane.simulation.sensitivity.variational_integration import integrate_sensitivities
+from crane.simulation.sensitivity.variational_integration import VariationalIntegrator
 from crane.simulation.simulation_run import Progress
 from crane.simulation.simulation_setup import (
     Force,
@@ -49,15 +49,17 @@ from crane.simulation.simulation_setup import (
 
 
 class SensitivityProblem(NamedTuple):
-    """A simulation with its outputs and parameters.
+    """A simulated motion with its outputs and parameters.
 
     Attributes:
-        simulation: The simulation.
+        motion: The motion.
+        recording: Its recording.
         outputs: Names of the outputs.
         directions: Constants and their derivatives by parameters.
     """
 
-    simulation: SimulationProblem
+    motion: SimulatedMotion
+    recording: Recording
     outputs: tuple[str, ...]
     directions: ParameterDirections
 
@@ -70,37 +72,37 @@ class SensitivityProblem(NamedTuple):
         duration: float | None,
         step: float,
         outputs: Sequence[str] | None,
+        parameters: Sequence[str],
         method: str | None,
         tolerance: float | None,
+        progress: Progress | None,
     ) -> "SensitivityProblem":
         """The problem from the arguments of `sensitivities`; see there."""
+        progress = progress_reporter(progress)
         if not isinstance(machine, Machine):
             machine = load(machine)
         control = resolve_controller(controller, machine)
         count = count_steps(control, duration, step)
         start = initial_motion(machine, initial, control)
-        if (isinstance(control, ValveDrive) and control.period) or not isinstance(
-            control, ControlLaw
-        ):
+        is_sampled = isinstance(control, ValveDrive) and control.period
+        if is_sampled or not isinstance(control, ControlLaw):
             raise InputError(
                 "a controller in Python has no formulas, write it as a crane.control.ControlLaw"
             )
         dynamics = Dynamics(machine)
         if outputs is None:
             joints = machine.hydraulics.joints if machine.hydraulics is not None else ()
-            outputs = [
-                *machine.active,
-                *[f"pressure_{joint}_{side}" for joint in joints for side in "ab"],
-            ]
-        names = tuple(outputs)
-        links = [link for link, _ in observed_frames(machine, names)]
-        motion = SimulationProblem(dynamics, control, start, count, step, method, tolerance)
-        return cls(motion, names, ParameterDirections(dynamics, control, start, links))
-
-    def record_motion(self, motion: SimulatedMotion) -> Recording:
-        """The recording of the motion."""
-        machine, control = self.simulation.dynamics.machine, self.simulation.control
-        return record_run(machine, control, motion.time[::2], motion.parts, "")
+            pressures = [f"pressure_{joint}_{side}" for joint in joints for side in "ab"]
+            outputs = [*machine.active, *pressures]
+        links = [link for link, _ in observed_frames(machine, outputs)]
+        directions = ParameterDirections(dynamics, control, start, links)
+        for name in parameters:
+            directions.parameter_value(name)  # an unknown one is refused before the simulation
+        motion = SimulatedMotion(
+            dynamics, control, start, count, step, method, tolerance, progress
+        )
+        recording = record_run(machine, control, motion.time[::2], motion.parts, "")
+        return cls(motion, recording, tuple(outputs), directions)
 
 
 ZERO_TOLERANCE = 1e-9  # of an output, in the unit that it is read in
@@ -125,7 +127,6 @@ class Sensitivities(Result):
     derivatives: Array
 
     def _one_line(self) -> str:
-        """Outputs and parameters."""
         return f"Sensitivities of {', '.join(self.outputs)} by {', '.join(self.parameters)}"
 
     def derivative(self, output: str, parameter: str) -> Array:
@@ -137,19 +138,15 @@ class Sensitivities(Result):
         for name, names in ((output, self.outputs), (parameter, self.parameters)):
             if name not in names:
                 raise InputError(f"'{name}' is not among them, {suggest_names(names, name)}")
-        found: Array = self.derivatives[
-            :, self.outputs.index(output), self.parameters.index(parameter)
-        ]
-        return found
+        index = self.outputs.index(output), self.parameters.index(parameter)
+        return np.asarray(self.derivatives[:, index[0], index[1]])
 
     @property
     def typical_changes(self) -> Array:
         """(p,) small changes: 1 % of parameters; 0.001 [SI] of zeros and initial values."""
         is_parameter = [not name.startswith(START_PREFIX) for name in self.parameters]
-        steps: Array = np.where(
-            is_parameter & (self.values != 0), 0.01 * np.abs(self.values), 1e-3
-        )
-        return steps
+        is_zero = ~np.array(is_parameter) | (self.values == 0)
+        return np.where(is_zero, 1e-3, 0.01 * np.abs(self.values))
 
     def unit(self, output: str) -> str:
         """SI unit of an output."""
@@ -242,30 +239,24 @@ def sensitivities(
         InputError: Unknown names, a machine that floats, or one without formulas.
         SimulationError: The motion comes to a dead centre; else as `simulate`.
     """
-    progress = progress_reporter(progress)
     if not parameters:
         raise InputError("no number is named, give `by` such as ['payload.mass']")
-    problem = SensitivityProblem.from_arguments(
-        machine, controller, initial, duration, step, outputs, method, tolerance
-    )
-    directions = problem.directions
+    motion, recording, names, directions = SensitivityProblem.from_arguments(
+        machine, controller, initial, duration, step, outputs, parameters, method, tolerance,
+        progress,
+    )  # fmt: skip
     values = np.array([directions.parameter_value(name) for name in parameters])
     sizes = np.array([directions.typical_change(name) for name in parameters])
-
-    def setup(times: Array) -> tuple[SimulationConstants, SimulationConstants]:
-        every = directions.derivatives(list(dict.fromkeys(parameters)), times)
-        parts = zip(*(every[name] for name in parameters), strict=True)
-        return directions.nominal_constants(times), SimulationConstants(*map(np.array, parts))
-
-    motion, derivatives = integrate_sensitivities(
-        problem.simulation, problem.outputs, setup, sizes, progress=progress
+    every = directions.derivatives(list(dict.fromkeys(parameters)), motion.time)
+    parts = zip(*(every[name] for name in parameters), strict=True)
+    integrator = VariationalIntegrator(
+        motion,
+        names,
+        directions.nominal_constants(motion.time),
+        SimulationConstants(*map(np.array, parts)),
+        sizes,
     )
+    derivatives = integrator.integrate()
     for note in motion.notes:
         warnings.warn(note, CraneWarning, stacklevel=2)
-    return Sensitivities(
-        problem.record_motion(motion),
-        problem.outputs,
-        tuple(parameters),
-        values,
-        derivatives,
-    )
+    return Sensitivities(recording, names, tuple(parameters), values, derivatives)

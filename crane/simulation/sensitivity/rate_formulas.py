@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.closure.kinematics_formulas import FormulaConstants, Vector, folding_pattern
+from crane.closure.kinematics_formulas import FormulaConstants, folding_pattern
 from crane.codegen import FormulaTooLongError, Program, Scalar, SymbolicExpression, Tape
 from crane.codegen.differentiation import directional_derivative
 from crane.codegen.symbolic import (
@@ -259,44 +259,23 @@ class RateProgram:
             raise InputError(
                 f"'{name}' is no output of '{user_machine.name}': take joints, forces, channels"
             )
-        place = links.index(link)
-        return _frame_output(
-            name,
-            machine,
-            self._frames[place][1],
-            tape.load_vector(3, FRAME_SIZE * place, FRAME_SIZE),
-        )
-
-
-def _frame_output(
-    name: str, machine: MachineFormulas, body: int, frame_constants: Vector
-) -> tuple[Scalar, Scalar]:
-    """Position of the tip, or inclination of the x axis of a link and its rate."""
-    dynamics_formulas = machine.dynamics_formulas
-    kinematics = dynamics_formulas.kinematics
-    if not name.startswith(INCLINATION_PREFIX):
-        place = add_vectors(
-            kinematics.origin[body], matvec(kinematics.rotation[body], frame_constants[:3])
-        )
-        back = transpose(kinematics.rotation[0])
-        return matvec(back, subtract_vectors(place, kinematics.origin[0]))[
-            "xyz".index(name[-1])
-        ], 1.0
-    height = dot(
-        matvec(kinematics.rotation[body], frame_constants[3:]),
-        [row[2] for row in kinematics.rotation[0]],
-    )
-    flat = apply_function("sqrt", 1.0 - height * height)
-    if not name.endswith(VELOCITY_SUFFIX):
-        return height, 1.0 / flat
-    ways = dict(
-        zip(
-            map(operation_index, dynamics_formulas.q),
-            dynamics_formulas.coordinate_derivatives,
-            strict=True,
-        )
-    )
-    return directional_derivative([height], ways)[0] / flat, 1.0
+        # the position of the tip, or the inclination of the x axis of a link and its rate
+        place, kinematics = links.index(link), dynamics.kinematics
+        frame_constants = tape.load_vector(3, FRAME_SIZE * place, FRAME_SIZE)
+        body = self._frames[place][1]
+        origin, rotation = kinematics.origin[body], kinematics.rotation[body]
+        if not name.startswith(INCLINATION_PREFIX):
+            position = add_vectors(origin, matvec(rotation, frame_constants[:3]))
+            relative = subtract_vectors(position, kinematics.origin[0])
+            return matvec(transpose(kinematics.rotation[0]), relative)["xyz".index(name[-1])], 1.0
+        axis = matvec(rotation, frame_constants[3:])
+        height = dot(axis, [row[2] for row in kinematics.rotation[0]])
+        flat = apply_function("sqrt", 1.0 - height * height)
+        if not name.endswith(VELOCITY_SUFFIX):
+            return height, 1.0 / flat
+        coordinates = map(operation_index, dynamics.q)
+        rates = dict(zip(coordinates, dynamics.coordinate_derivatives, strict=True))
+        return directional_derivative([height], rates)[0] / flat, 1.0
 
 
 def observed_frame(machine: Machine, name: str) -> str:

@@ -25,28 +25,6 @@ _MAX_CHECKED_SAMPLES = 500  # configurations that are checked for dead centres
 _EVENT_DIFFERENCE_STEP = 1e-6  # share of a step: interval of the rate of references at an event
 
 
-class SimulationProblem(NamedTuple):
-    """Definition of a simulation.
-
-    Attributes:
-        dynamics: Dynamics of the machine.
-        control: Its controller.
-        initial: Initial q_A and v_A.
-        step_count: Number of output intervals.
-        step: Output interval [s].
-        method: See `simulate`.
-        tolerance: See `simulate`.
-    """
-
-    dynamics: Dynamics
-    control: ControlLaw
-    initial: tuple[Array, Array]
-    step_count: int
-    step: float
-    method: str | None = None
-    tolerance: float | None = None
-
-
 class MotionNodes(NamedTuple):
     """Nodes of a segment of n steps: their ends and their middles.
 
@@ -124,7 +102,13 @@ class SimulatedMotion:
     """A simulated motion with states at the ends and middles of its steps.
 
     Args:
-        motion: The simulation.
+        dynamics: Dynamics of the machine.
+        control: Its controller.
+        initial: Initial q_A and v_A.
+        step_count: Number of output intervals.
+        step: Output interval [s].
+        method: See `simulate`.
+        tolerance: See `simulate`.
         progress: See `simulate`.
 
     Attributes:
@@ -146,21 +130,20 @@ class SimulatedMotion:
         SimulationError: The motion comes to a dead centre; else as `simulate`.
     """
 
-    def __init__(self, motion: SimulationProblem, progress: Callable[[float], None] | None):
-        dynamics, control, count, step = (
-            motion.dynamics,
-            motion.control,
-            motion.step_count,
-            motion.step,
-        )
-        machine, self.chart, self.control = (
-            dynamics.machine,
-            Chart.from_dynamics(dynamics),
-            control,
-        )
-        if not (dynamics.backend == "compiled" and machine.has_traceable_forces) or not isinstance(
-            control, ControlLaw
-        ):
+    def __init__(
+        self,
+        dynamics: Dynamics,
+        control: ControlLaw,
+        initial: tuple[Array, Array],
+        step_count: int,
+        step: float,
+        method: str | None = None,
+        tolerance: float | None = None,
+        progress: Callable[[float], None] | None = None,
+    ):
+        machine, self.chart = dynamics.machine, Chart.from_dynamics(dynamics)
+        self.control, self._step, self.has_joints_at_rest = control, step, False
+        if dynamics.backend != "compiled" or not machine.has_traceable_forces:
             raise InputError(
                 f"'{machine.name}' with its controller has no formulas to differentiate: lock "
                 "joints, or write the controller as a Law, and loads as ExternalForce"
@@ -173,17 +156,12 @@ class SimulatedMotion:
                 "are of those without lateral stiffness"
             )
         self.chart.stick_slip.transitions = []
-        made = (dynamics, control, motion.initial, 2 * count, 0.5 * step, motion.method)
-        run = integrate(*made, progress, motion.tolerance, self.chart)
+        made = (dynamics, control, initial, 2 * step_count, 0.5 * step, method)
+        run = integrate(*made, progress, tolerance, self.chart)
         if run.stop is not None:
             raise run.stop
         time, parts, self.notes = run.time, run.rows, run.notes
-        self.time, self.controller_state_count, self._step, self.has_joints_at_rest = (
-            time,
-            parts.controller.shape[1],
-            step,
-            False,
-        )
+        self.time, self.controller_state_count = time, parts.controller.shape[1]
         stride = max(1, len(time) // _MAX_CHECKED_SAMPLES)
         for at, configuration in zip(time[::stride], parts.q[::stride], strict=True):
             if self.chart.largest_gamma_entry(configuration) > self.chart.chart_limits[0]:
@@ -201,7 +179,7 @@ class SimulatedMotion:
         self.parts = layout.view(self.rows[::2])
         self._states = self.rows[:, : layout.start_index("tau")]
         make = integrator_factory(
-            dynamics, control, self.controller_state_count, motion.method, motion.tolerance
+            dynamics, control, self.controller_state_count, method, tolerance
         )
         self._integrator = make(self.chart)
         self.transitions: list[StickSlipTransition] = self.chart.stick_slip.transitions

@@ -1,6 +1,6 @@
 """Constants of a simulation, and their derivatives by named parameters."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -77,10 +77,8 @@ def simulation_constants_of(
     # the scale of residuals does not affect the motion
     geometry[-1] = dynamics.machine.closure.compiled_closure.geometry.constants[-1]
     q = machine.closure.solve(initial[0], initial_guess=machine.home)
-    controller_state = np.zeros(0)
-    if hasattr(control, "start_closed"):
-        # compiling does not pay for a single configuration
-        controller_state = control.start_closed(Dynamics(machine, backend="pinocchio"), q)
+    # compiling does not pay for a single configuration
+    controller_state = control.start_closed(Dynamics(machine, backend="pinocchio"), q)
     if isinstance(control, ValveDrive):
         controller_state = controller_state[: control.circuit.stiff_state_count]
     # a variant may have circuit friction at other joints, and more constants
@@ -142,24 +140,19 @@ class ParameterDirections:
         """Constants, for the times (2 N + 1,) of the references [s]."""
         return self._constants_of(self._dynamics.machine, self._initial_motion, times)
 
-    def derivatives(self, names: Sequence[str], times: Array) -> dict[str, SimulationConstants]:
+    def derivatives(
+        self, names: Sequence[str] | None, times: Array
+    ) -> dict[str, SimulationConstants]:
         """Derivatives by parameters; see `nominal_constants`.
+
+        Args:
+            names: Names of the parameters; None for all of the machine that have an effect and can
+                be varied.
+            times: See `nominal_constants`.
 
         Raises:
             InputError: A name is unknown, or a parameter cannot be varied.
         """
-        return dict(self._iterate_derivatives(names, times, skip_invalid=False))
-
-    def all_derivatives(self, times: Array) -> dict[str, SimulationConstants]:
-        """Derivatives by all parameters of the machine that have an effect and can be varied."""
-        every = self._iterate_derivatives(
-            self._constant_derivatives.parameter_names, times, skip_invalid=True
-        )
-        return {name: found for name, found in every if any(part.any() for part in found)}
-
-    def _iterate_derivatives(
-        self, names: Sequence[str], times: Array, skip_invalid: bool
-    ) -> Iterator[tuple[str, SimulationConstants]]:
         base = self.nominal_constants(times)
         ends = np.cumsum([part.size for part in base])[:-1]
 
@@ -168,19 +161,19 @@ class ParameterDirections:
                 [x.ravel() for x in self._constants_of(machine, self._initial_motion, times)]
             )
 
-        nominal = None
-        for name in names:
+        out: dict[str, SimulationConstants] = {}
+        nominal, ignored_errors = None, InputError if names is None else ()
+        for name in self._constant_derivatives.parameter_names if names is None else names:
             if name.startswith(START_PREFIX):
-                yield name, self._start_derivative(name, times)
+                out[name] = self._start_derivative(name, times)
                 continue
-            nominal = (
-                self._constant_derivatives.nominal_constants(flat) if nominal is None else nominal
-            )
+            if nominal is None:
+                nominal = self._constant_derivatives.nominal_constants(flat)
             try:
                 derivative = self._constant_derivatives.derivative(name, flat, nominal)
-            except InputError:
-                if not skip_invalid:
-                    raise
+            except ignored_errors:
+                continue
+            if names is None and not derivative.any():
                 continue
             parts = zip(np.split(derivative, ends), base, strict=True)
             found = SimulationConstants(*(part.reshape(like.shape) for part, like in parts))
@@ -188,7 +181,8 @@ class ParameterDirections:
                 found = SimulationConstants(*map(np.copy, found))._replace(
                     references=np.broadcast_to(0.0, found.references.shape)
                 )
-            yield name, found
+            out[name] = found
+        return out
 
     def parameter_value(self, name: str) -> float:
         """Value of a parameter, or of an initial coordinate or velocity."""
@@ -226,15 +220,13 @@ class ParameterDirections:
             * closure.units[closure.active][i]
             / (closure.characteristic_time if part else 1.0)
         )
-        start = np.zeros(0)
+        base = self.nominal_constants(times)  # no other constant depends on the initial motion
+        start = np.zeros_like(base.initial_state)
         for side, weight in _CENTRAL_DIFFERENCE_WEIGHTS:
             moved = self._initial_motion[0].copy(), self._initial_motion[1].copy()
             moved[part][i] += side * difference_step
-            more = (
-                weight / difference_step * self._constants_of(machine, moved, times).initial_state
-            )
-            start = start + more if start.size else more
-        base = self.nominal_constants(times)  # no other constant depends on the initial motion
+            state = self._constants_of(machine, moved, times).initial_state
+            start += weight / difference_step * state
         return SimulationConstants(*(np.broadcast_to(0.0, x.shape) for x in base))._replace(
             initial_state=start
         )

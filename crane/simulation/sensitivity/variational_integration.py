@@ -18,7 +18,7 @@ The transposed map takes weights lambda of S(t + h) to those of S(t) and of the 
     Psi^T lambda = sum_j B_j^T mu_j,    mu_j = h sum_i a_ij nu_i.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +30,6 @@ from crane.simulation.sensitivity.simulated_motion import (
     MotionNodes,
     ResimulatedSegment,
     SimulatedMotion,
-    SimulationProblem,
     TransitionJump,
 )
 from crane.simulation.sensitivity.simulation_constants import SimulationConstants
@@ -70,18 +69,24 @@ def step_pair_maps(values: Array, lengths: Array, sizes: Array) -> tuple[Array, 
     Args:
         values: A and B (4 n + 1, m, m + p) at the nodes.
         lengths: (2 n,) of the steps, those of a pair equal [s].
-        sizes: See `step_maps`.
+        sizes: (m,) scales of the states for the solution of the equations.
 
     Returns:
         Maps of the first step, and of both steps, extrapolated.
     """
-    m, count = values.shape[1], len(lengths)
-    all_step_maps = np.concatenate(step_maps(*_stage_values(values, lengths), sizes), axis=2)
-    first, second, coarse = (
-        all_step_maps[:count:2],
-        all_step_maps[1:count:2],
-        all_step_maps[count:],
+    count, (stage_values, all_lengths) = len(lengths), _stage_values(values, lengths)
+    by_state, by_number = np.split(stage_values, [values.shape[1]], axis=-1)
+    step_count, stages, m, _ = by_state.shape
+    right = np.empty_like(stage_values)
+    right[..., :m] = np.eye(m)
+    right[..., m:] = (
+        np.einsum("ij,n,njmp->nimp", STAGE_WEIGHTS, all_lengths, by_number) / sizes[:, None]
     )
+    sides = right.reshape(step_count, stages * m, stage_values.shape[-1])
+    matrix = _stage_matrix(by_state, all_lengths, sizes)
+    maps = np.linalg.solve(matrix, sides)[:, -m:] * sizes[:, None]
+    maps[..., :m] /= sizes
+    first, second, coarse = maps[:count:2], maps[1:count:2], maps[count:]
     refined = second[..., :m] @ first
     refined[..., m:] += second[..., m:]
     return first, refined + (refined - coarse) / 15.0
@@ -94,8 +99,13 @@ def transposed_pair_maps(
 
     See `step_pair_maps`, with A (4 n + 1, m, m).
     """
-    count = len(lengths)
-    back, stages = transposed_step_maps(*_stage_values(by_state, lengths), sizes)
+    count, (stage_values, all_lengths) = len(lengths), _stage_values(by_state, lengths)
+    step_count, stage_count, m, _ = stage_values.shape
+    right = np.broadcast_to(np.eye(stage_count * m)[:, -m:], (step_count, stage_count * m, m))
+    matrix = _stage_matrix(stage_values, all_lengths, sizes)
+    solution = np.linalg.solve(np.swapaxes(matrix, 1, 2), right)
+    nu = solution.reshape(step_count, stage_count, m, m) / sizes[:, None] * sizes
+    back, stages = nu.sum(axis=1), np.einsum("ij,n,nimp->njmp", STAGE_WEIGHTS, all_lengths, nu)
     first, second = (TransposedMap(back[i:count:2], stages[i:count:2]) for i in range(2))
     refined_stages = np.concatenate(
         [
@@ -124,38 +134,6 @@ def _values_by_step(values: Array) -> Array:
     return np.stack([values[i : len(values) - 2 + i : 2] for i in range(3)], axis=1)
 
 
-def step_maps(values: Array, lengths: Array, sizes: Array) -> tuple[Array, Array]:
-    """Phi (N, m, m) and Psi (N, m, p) of steps.
-
-    Args:
-        values: A and B (N, 3, m, m + p) at their stages.
-        lengths: (N,) [s].
-        sizes: (m,) scales of the states for the solution of the equations.
-    """
-    count, stages, m, width = values.shape
-    by_state, by_number, p = values[..., :m], values[..., m:], width - m
-    right = np.empty((count, stages, m, m + p))
-    right[..., :m] = np.eye(m)
-    right[..., m:] = (
-        np.einsum("ij,n,njmp->nimp", STAGE_WEIGHTS, lengths, by_number) / sizes[:, None]
-    )
-    right = right.reshape(count, stages * m, m + p)
-    solution = (
-        np.linalg.solve(_stage_matrix(by_state, lengths, sizes), right)[:, -m:] * sizes[:, None]
-    )
-    solution[..., :m] /= sizes
-    return solution[..., :m].astype(np.float64), solution[..., m:].astype(np.float64)
-
-
-def transposed_step_maps(by_state: Array, lengths: Array, sizes: Array) -> tuple[Array, Array]:
-    """Phi^T (N, m, m) of steps, and matrices (N, 3, m, m) that give mu_j of their stages."""
-    count, stages, m, _ = by_state.shape
-    right = np.broadcast_to(np.eye(stages * m)[:, -m:], (count, stages * m, m))
-    solution = np.linalg.solve(np.swapaxes(_stage_matrix(by_state, lengths, sizes), 1, 2), right)
-    nu = solution.astype(np.float64).reshape(count, stages, m, m) / sizes[:, None] * sizes
-    return nu.sum(axis=1), np.einsum("ij,n,nimp->njmp", STAGE_WEIGHTS, lengths, nu)
-
-
 def _stage_matrix(by_state: Array, lengths: Array, sizes: Array) -> Array:
     """1 - h a (x) A (N, 3 m, 3 m), scaled by the sizes of the states."""
     by_state = by_state / sizes[:, None] * sizes
@@ -171,44 +149,22 @@ STEP_ACCURACY = 1e-8  # relative error of a step
 MIN_RELATIVE_CHANGE = 1e-6  # least relative change of states by a whole parameter that counts
 
 
-def integrate_sensitivities(
-    motion: SimulationProblem,
-    outputs: Sequence[str],
-    make_constants: Callable[[Array], tuple[SimulationConstants, SimulationConstants]],
-    typical_changes: Array,
-    accuracy: float = STEP_ACCURACY,
-    progress: Callable[[float], None] | None = None,
-) -> tuple[SimulatedMotion, Array]:
-    """Simulate a machine, with derivatives of its outputs along directions.
-
-    Args:
-        motion: The simulation.
-        outputs: Names of the outputs, see `sensitivities`.
-        make_constants: Function of the times (2 N + 1,) of the references; returns constants of
-            the simulation, and p directions of them, each part with a leading axis.
-        typical_changes: (p,) sizes of large changes along the directions.
-        accuracy: Relative error of a step.
-        progress: See `simulate`.
-
-    Returns:
-        The motion, and derivatives (N + 1, k, p) of k outputs in p directions at its instants.
-
-    Raises:
-        InputError: The machine has no formulas or a floating base, or an output is unknown.
-        SimulationError: The motion comes to a dead centre; else as `simulate`.
-    """
-    track = SimulatedMotion(motion, progress)
-    integrator = _VariationalIntegrator(
-        track, outputs, *make_constants(track.time), typical_changes, accuracy
-    )
-    return track, integrator.integrate()
-
-
-class _VariationalIntegrator:
-    """Integrator of the variational equations along a recorded motion, segment by segment.
+class VariationalIntegrator:
+    """Integrator of the variational equations along a simulated motion, segment by segment.
 
     Pairs of steps over which A or B are not smooth, as where a valve opens or a compensator
-    closes, are divided and simulated again. For the arguments see `integrate_sensitivities`.
+    closes, are divided and simulated again.
+
+    Args:
+        motion: The motion.
+        outputs: Names (k,) of the outputs, see `sensitivities`.
+        nominal_constants: Constants of the simulation, for the times of the motion.
+        directions: p directions of them, each part with a leading axis.
+        typical_changes: (p,) sizes of large changes along the directions.
+        accuracy: Relative error of a step.
+
+    Raises:
+        InputError: An output is unknown, or the formulas are too long.
     """
 
     def __init__(
@@ -218,7 +174,7 @@ class _VariationalIntegrator:
         nominal_constants: SimulationConstants,
         directions: SimulationConstants,
         typical_changes: Array,
-        accuracy: float,
+        accuracy: float = STEP_ACCURACY,
     ):
         self._motion, self._accuracy = motion, accuracy
         self._nominal_constants, self._directions = nominal_constants, directions
@@ -263,7 +219,7 @@ class _VariationalIntegrator:
         return output_derivatives
 
     def _directional_derivatives(self, nodes: MotionNodes) -> tuple[Array, Array]:
-        """A and B, derivatives of outputs and margin; see `ForwardDerivatives.along`."""
+        """A and B, derivatives of outputs and margin; see `ForwardDerivatives`."""
         reference_changes = nodes.interpolate(self._directions.references)
         return self._forward_derivatives.directional_derivatives(
             self._motion.constants_at(self._nominal_constants, nodes),
@@ -318,7 +274,7 @@ class _VariationalIntegrator:
         )
 
     def _apply_jump(self, jump: TransitionJump, sensitivity: Array) -> Array:
-        """S behind an instant at which joints start or stop; see `SimulatedMotion.leap`."""
+        """S behind an instant at which joints start or stop; see `sensitivity_jump`."""
         track, m, nodes = (
             self._motion,
             self._forward_derivatives.state_size,

@@ -92,8 +92,7 @@ class DesignProblem:
     """Objectives and requirements of a job, as functions of the parameters."""
 
     def __init__(self, job: DesignJob):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", CraneWarning)
+        with warnings.catch_warnings(action="ignore", category=CraneWarning):
             machine = load(job.machine, job.changes, job.locked_joints)
         self.job, self._variants = job, MachineVariants(machine)
         self.objectives = [MeasureExpression(text) for text in job.objectives]
@@ -113,8 +112,8 @@ class DesignProblem:
         if self._last_outcome[0] != values.tobytes():
             job = self.job
             try:
-                with warnings.catch_warnings(), np.errstate(all="ignore"):
-                    warnings.simplefilter("ignore")  # also those of user measures
+                # also warnings of user measures
+                with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
                     evaluation = VariantEvaluation(
                         self._variants,
                         job.parameter_names,

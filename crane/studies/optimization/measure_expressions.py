@@ -217,9 +217,9 @@ class MeasureExpression:
                 self._check_node(right)
             case ast.Call(func=ast.Name(), args=args, keywords=[]):
                 for x in args:
-                    if isinstance(x, ast.Starred):
-                        raise create_error("a star")
                     self._check_node(x)
+            case ast.Starred():
+                raise create_error("a star")
             case _:
                 raise create_error(f"'{ast.unparse(node)}'")
 

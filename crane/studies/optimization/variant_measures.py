@@ -219,22 +219,25 @@ class VariantEvaluation:
                 position,
                 *(x for x in self._load_positions if (with_derivatives, x) not in self._loads),
             ]
-            slews = sorted({x[2] for x in all_positions if len(x) == 3})
-            for slew in [None, *slews]:
-                positions = [x for x in all_positions if (x[2] if len(x) == 3 else None) == slew]
-                if positions:
-                    self._compute_loads(positions, slew, with_derivatives)
+            by_slew: dict[tuple[float, ...], list[tuple[float, ...]]] = {}
+            for x in all_positions:
+                by_slew.setdefault(x[2:], []).append(x)
+            for slews, positions in by_slew.items():
+                self._compute_loads(positions, slews, with_derivatives)
         return self._loads[with_derivatives, position]
 
     def _compute_loads(
-        self, positions: Sequence[tuple[float, ...]], slew: float | None, with_derivatives: bool
+        self,
+        positions: Sequence[tuple[float, ...]],
+        slews: tuple[float, ...],
+        with_derivatives: bool,
     ) -> None:
         radii, heights = (sorted({x[i] for x in positions}) for i in (0, 1))
         zero = constant(0.0, len(self._parameter_names))
         try:
             chart = capacity(
                 self.machine, self._options.frame, rule=self._options.rule, radii=radii,
-                heights=heights, slews=None if slew is None else [np.deg2rad(slew)],
+                heights=heights, slews=np.deg2rad(slews).tolist() or None,
             )  # fmt: skip
         except InputError as error:
             if "reaches none" not in str(error):

@@ -25,12 +25,6 @@ _WARNING_BOX_TAG = (
 )
 
 
-def format_coordinate(machine: Machine, joint: str, value: float) -> str:
-    """Return a joint coordinate [m], [rad] as text in its display unit."""
-    unit, scale = DISPLAY_UNITS[machine.unit(joint)]
-    return f"{round(scale * value, 2) + 0.0:.2f} {unit}"
-
-
 def readout_html(
     machine: Machine, readout: Readout, payload_mass: float, recorded_forces: Array | None = None
 ) -> str:
@@ -42,45 +36,34 @@ def readout_html(
         payload_mass: Mass at the tip [kg].
         recorded_forces: (n,) forces of a recording at this instant [N], [N m].
     """
-    headings = [
-        "joint",
-        "holding force" if not payload_mass else "holding force with payload",
-    ]
-    headings += ["recorded"] if recorded_forces is not None else []
+    columns = {
+        "holding force" if not payload_mass else "holding force with payload": readout.gravity
+    }
+    if recorded_forces is not None:
+        columns["recorded"] = recorded_forces
     rows = []
-    for i, joint in enumerate(machine.active):
-        unit = FORCE_UNITS[machine.unit(joint)]
-        forces = [readout.gravity[i], *([] if recorded_forces is None else [recorded_forces[i]])]
-        rows.append(
-            [
-                joint,
-                *("free" if (joint in machine.free) else format_quantity(x, unit) for x in forces),
-            ]
-        )
-    parts = [_html_table(headings, rows)]
+    for joint, *forces in zip(machine.active, *columns.values(), strict=True):
+        unit, is_free = FORCE_UNITS[machine.unit(joint)], joint in machine.free
+        rows.append([joint, *("free" if is_free else format_quantity(x, unit) for x in forces)])
+    parts = [_html_table(["joint", *columns], rows)]
     if readout.tip is not None:
-        x, y, z = (f"{round(1e3 * value, 1) + 0.0:.1f}" for value in readout.tip)
-        parts.append(_html_table(["tip x [mm]", "y [mm]", "z [mm]"], [[x, y, z]]))
-    if passive := [joint for joint in machine.joints if joint not in machine.active]:
-        rows = [
-            [x, format_coordinate(machine, x, readout.configuration[machine.column(x)])]
-            for x in passive
-        ]
+        position = [f"{round(1e3 * value, 1) + 0.0:.1f}" for value in readout.tip]
+        parts.append(_html_table(["tip x [mm]", "y [mm]", "z [mm]"], [position]))
+    rows = []
+    for joint in machine.joints:
+        if joint not in machine.active:
+            unit, scale = DISPLAY_UNITS[machine.unit(joint)]
+            value = scale * readout.configuration[machine.column(joint)]
+            rows.append([joint, f"{round(value, 2) + 0.0:.2f} {unit}"])
+    if rows:
         parts.append(_html_table(["passive joint", "coordinate"], rows))
     if readout.gain_joints:
         passive_joint, active_joint = readout.gain_joints
         unit = f"{machine.unit(passive_joint)}/{machine.unit(active_joint)}"
+        gain, condition_number = f"{readout.largest_gain:.3g}", f"{readout.condition_number:.3g}"
         rows = [
-            [
-                "largest gamma",
-                f"{readout.largest_gain:.3g} {unit}",
-                f"{passive_joint} per {active_joint}",
-            ],
-            [
-                "condition number of J_P",
-                f"{readout.condition_number:.3g}",
-                f"loop {readout.weakest_loop}",
-            ],
+            ["largest gamma", f"{gain} {unit}", f"{passive_joint} per {active_joint}"],
+            ["condition number of J_P", condition_number, f"loop {readout.weakest_loop}"],
             ["loops closed to", f"{readout.residual:.0e} m", ""],
         ]
         parts.append(_html_table([], rows))
@@ -120,6 +103,9 @@ class LivePage:
         session: Session that is shown.
         playback: Recording that can be played.
         requests: Queue of requests: key and value of a widget.
+
+    Attributes:
+        is_playing: Whether the recording plays.
     """
 
     def __init__(
@@ -131,7 +117,7 @@ class LivePage:
     ):
         self._server, self._session, self._playback = server, session, playback
         self._requests = requests
-        self._playing, self._last_update = False, time.perf_counter()
+        self.is_playing, self._last_update = False, time.perf_counter()
         self._recorded_forces: Array | None = None
         machine, gui = session.machine, server.gui
         self._scene = LiveScene(server, session)
@@ -158,7 +144,8 @@ class LivePage:
             with gui.add_folder("Payload"):
                 self._add_slider(_LOAD_KEY, "mass [kg]", 0.0, session.max_payload, 0.0)
         if playback is not None:
-            self._scene.add_path(self._tip_path(playback))
+            stride = max(len(playback.configurations) // 2000, 1)
+            self._scene.add_path(session.tip_positions(playback.configurations[::stride]))
             with gui.add_folder("Recording"):
                 self._add_slider(
                     _TIME_KEY, "time [s]", playback.start, playback.end, playback.start
@@ -178,11 +165,6 @@ class LivePage:
                 client.camera.position = position  # moves the target along
                 client.camera.look_at = look_at
 
-    @property
-    def is_playing(self) -> bool:
-        """Whether the recording plays."""
-        return self._playing
-
     def process_requests(self, pending_requests: list[tuple[str, float]]) -> None:
         """Process requests; of several requests of one widget only the last."""
         for key, value in dict(pending_requests).items():
@@ -198,9 +180,8 @@ class LivePage:
         now = time.perf_counter()
         playback_time = self._sliders[_TIME_KEY].value + now - self._last_update
         self._last_update = now
-        if playback_time >= self._playback.end:
-            playback_time, self._playing = self._playback.end, False
-        self._update_widgets(self._seek(playback_time))
+        self.is_playing = playback_time < self._playback.end
+        self._update_widgets(self._seek(min(playback_time, self._playback.end)))
 
     def _process_request(self, key: str, value: float) -> Readout:
         session = self._session
@@ -208,13 +189,19 @@ class LivePage:
             slider = self._sliders[key]
             value = float(np.clip(value, slider.min, slider.max))
         if key == _LOAD_KEY:
+            readout = session.set_payload(value)
             self._scene.show_payload()
-            return session.set_payload(value)
+            return readout
         if key == _TIME_KEY:
             return self._seek(value)
         if key == _PLAY_KEY:
-            return self._toggle_playback()
-        self._playing, self._recorded_forces = False, None
+            assert self._playback is not None
+            self.is_playing = not self.is_playing
+            self._last_update = time.perf_counter()
+            slider_time = self._sliders[_TIME_KEY].value
+            is_at_end = slider_time >= self._playback.end
+            return self._seek(self._playback.start if is_at_end else slider_time)
+        self.is_playing, self._recorded_forces = False, None
         if key == _HOME_KEY:
             return session.go_home()
         joint = key.removeprefix("joint ")
@@ -222,15 +209,6 @@ class LivePage:
         _, scale = DISPLAY_UNITS[session.machine.unit(joint)]
         value = float(np.clip(value / scale, session.lower[index], session.upper[index]))
         return session.move(joint, value)
-
-    def _toggle_playback(self) -> Readout:
-        assert self._playback is not None
-        self._playing = not self._playing
-        self._last_update = time.perf_counter()
-        slider_time = self._sliders[_TIME_KEY].value
-        return self._seek(
-            self._playback.start if slider_time >= self._playback.end else slider_time
-        )
 
     def _seek(self, playback_time: float) -> Readout:
         """Move to the configuration at a time of the recording [s]."""
@@ -248,7 +226,7 @@ class LivePage:
                 _, scale = DISPLAY_UNITS[machine.unit(joint)]
                 _set_slider(self._sliders[f"joint {joint}"], scale * value)
             if self._playback is not None:
-                self._play_button.label = "Pause" if self._playing else "Play"
+                self._play_button.label = "Pause" if self.is_playing else "Play"
             self._warning_html.content = warning_html(readout.refusal)
             self._readout_html.content = readout_html(
                 machine, readout, self._session.payload_mass, self._recorded_forces
@@ -259,23 +237,16 @@ class LivePage:
         upper = max(upper, lower + 1e-9)
         step = round_up_to_nice((upper - lower) / _SLIDER_STEPS)
         # ends with few digits, within the range
-        rounding_step = step / 10
-        lower, upper = (
-            round(x, 9)
-            for x in (
-                np.ceil(lower / rounding_step) * rounding_step,
-                np.floor(upper / rounding_step) * rounding_step,
-            )
-        )
+        lower = round(np.ceil(lower / (step / 10)) * (step / 10), 9)
+        upper = round(np.floor(upper / (step / 10)) * (step / 10), 9)
         value = min(max(value, lower), upper)
-        slider = self._server.gui.add_slider(label, lower, upper, step, value)
-        self._sliders[key] = slider
+        self._sliders[key] = self._server.gui.add_slider(label, lower, upper, step, value)
 
         async def note(event: Any) -> None:
             if event.client_id is not None:  # not one of our own
                 self._requests.put((key, float(event.target.value)))
 
-        slider.on_update(note)
+        self._sliders[key].on_update(note)
 
     def _add_button(self, key: str, label: str) -> Any:
         button = self._server.gui.add_button(label)
@@ -286,15 +257,9 @@ class LivePage:
         button.on_click(note)
         return button
 
-    def _tip_path(self, playback: Playback) -> Array:
-        """Return the path of the tip (k, 3) [m], thinned."""
-        return self._session.tip_positions(
-            playback.configurations[:: max(len(playback.configurations) // 2000, 1)]
-        )
-
 
 def _set_slider(slider: Any, value: float) -> None:
     """Set a slider to the nearest value in its range."""
-    clipped_value = float(np.clip(value, slider.min, slider.max))
-    if abs(slider.value - clipped_value) > 1e-6 * (slider.max - slider.min):
-        slider.value = clipped_value
+    nearest_value = float(np.clip(value, slider.min, slider.max))
+    if abs(slider.value - nearest_value) > 1e-6 * (slider.max - slider.min):
+        slider.value = nearest_value

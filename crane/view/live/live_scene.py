@@ -43,7 +43,6 @@ class LiveScene:
         ]
         for index, visual in enumerate(visuals):
             _add_shape(server.scene, f"/machine/{visual.link}/{index}", visual)
-        self._tip: Any = None
         if session.machine.tip is not None:
             self._links.append(session.machine.tip)
             self._frames.append(server.scene.add_frame("/tip", show_axes=False))
@@ -71,9 +70,12 @@ class LiveScene:
     def add_path(self, points: Array) -> None:
         """Draw a line through points (N, 3) [m]."""
         if len(points) > 1:
-            segments = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
             self._server.scene.add_line_segments(
-                "/path", segments, _PAYLOAD_COLOUR, thickness=2.0, thickness_units="screen"
+                "/path",
+                np.stack([points[:-1], points[1:]], axis=1).astype(np.float32),
+                _PAYLOAD_COLOUR,
+                thickness=2.0,
+                thickness_units="screen",
             )
 
     def _set_view(self, lower: Array, upper: Array, ground_height: float) -> None:

@@ -70,10 +70,9 @@ class AccessGuard:
             name = urlsplit(f"//{host}").hostname or ""
             if name in ("localhost", self.host.lower()):
                 return True
-            number = ipaddress.ip_address(name)
+            return ipaddress.ip_address(name).is_loopback or not self.is_local_only
         except ValueError:
             return False
-        return number.is_loopback or not self.is_local_only
 
     @contextmanager
     def guard_servers(self) -> Iterator[None]:
@@ -114,11 +113,8 @@ def restrict_widget_updates(server: Any) -> None:
 
     async def checked(client: Any, message: Any) -> None:
         widgets, name = gui._gui_input_handle_from_uuid, message.uuid
-        if (
-            isinstance(name, str)
-            and name in widgets
-            and _is_valid_update(widgets[name], message.updates)
-        ):
+        is_known = isinstance(name, str) and name in widgets
+        if is_known and _is_valid_update(widgets[name], message.updates):
             await update(client, message)
 
     interface.unregister_handler(GuiUpdateMessage, update)
@@ -231,10 +227,9 @@ def _take_requests(requests: RequestQueue, is_playing: bool) -> list[tuple[str, 
 @contextmanager
 def _stop_on_signals(requests: RequestQueue) -> Iterator[None]:
     """Put None into the queue on SIGINT and SIGTERM; `SimpleQueue.put` is reentrant."""
-    signal_numbers = (signal.SIGINT, signal.SIGTERM)
     previous_handlers = {
-        signal_number: signal.signal(signal_number, lambda *_: requests.put(None))
-        for signal_number in signal_numbers
+        number: signal.signal(number, lambda *_: requests.put(None))
+        for number in (signal.SIGINT, signal.SIGTERM)
     }
     try:
         yield

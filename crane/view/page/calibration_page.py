@@ -102,11 +102,11 @@ def _parameter_table(calibration: Calibration) -> str:
         del columns["in the file"]
     cautions = "".join(f"<p><b>{escape(caution)}</b></p>" for caution in calibration.cautions)
     return (
-        f"{cautions}<p>Confidence intervals of 95 %, computed without bounds; correlated residuals "
-        "reduce the number of independent samples. Grey rows are parameters on a bound and "
-        "parameters that the recordings do not determine: they are no result. Intervals hold for "
-        "a correct model. A parameter that compensates an effect which is missing in the machine "
-        "file may be far off with a narrow interval.</p>"
+        f"{cautions}<p>Confidence intervals of 95 %, computed without bounds; correlated "
+        "residuals reduce the number of independent samples. Grey rows are parameters on a bound "
+        "and parameters that the recordings do not determine: they are no result. Intervals hold "
+        "for a correct model. A parameter that compensates an effect which is missing in the "
+        "machine file may be far off with a narrow interval.</p>"
     ) + html_table(
         list(columns),
         zip(*columns.values(), strict=True),

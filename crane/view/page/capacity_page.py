@@ -22,7 +22,7 @@ from crane.view.plots.rating_figures import (
     home_outlines,
     load_contours,
 )
-from crane.view.sketches.mechanism_projection import MachineOutline, machine_outline
+from crane.view.sketches.mechanism_projection import machine_outline
 
 _MAX_CELLS = 1500  # per slew angle, at most
 _OUTLINE_RESOLUTION = 4000.0  # of the extent, to which outlines are rounded
@@ -68,7 +68,21 @@ def capacity_page_data(chart: Capacity) -> dict[str, Any]:
         drive.joint: drive.chamber_pressures
         for drive in drive_force_limits(machine, chart.raising_joints)
     }
+    max_count = int((~np.isnan(chart.loads)).sum(axis=(1, 2)).max())
+    stride = max(int(np.ceil(np.sqrt(max_count / _MAX_CELLS))), 1)
     shapes: dict[str, int] = {}
+    cells, contours = [], []
+    for k in range(len(chart.slews)):
+        cells.append(_cell_rows(chart, k, stride, pressures, unit, shapes))
+        lines_by_load = load_contours(chart, k)
+        name, scale = display_unit("kg", max((load for load, _ in lines_by_load), default=0.0))
+        contours.append(
+            [
+                [f"{scale * load:g} {name}", [_round_points(line, unit) for line in lines]]
+                for load, lines in lines_by_load
+                if lines
+            ]
+        )
     return {
         "facts": capacity_facts(chart),
         "names": chart.section.coordinate_names,
@@ -76,13 +90,16 @@ def capacity_page_data(chart: Capacity) -> dict[str, Any]:
         "low": lower.tolist(),
         "high": upper.tolist(),
         "unit": unit,
-        "step": [_cell_stride(chart) * _smallest_spacing(x) for x in (chart.radii, chart.heights)],
+        "step": [
+            stride * float(np.diff(x).min()) if len(x) > 1 else 0.0
+            for x in (chart.radii, chart.heights)
+        ],
         "causes": [str(cause) for cause in chart.limiting_factors],
         "tints": factor_colours(chart),
         "drives": [
             {
                 "joint": joint,
-                "unit": _reading_unit(machine.unit(joint))[0],
+                "unit": display_unit(machine.unit(joint), 0.0)[0],
                 "limits": [_rounded_or_none(1e-5 * x) for x in limits.get(joint, ())],
             }
             for joint in machine.active
@@ -91,32 +108,35 @@ def capacity_page_data(chart: Capacity) -> dict[str, Any]:
             _round_points(home_outline.stationary_hull, unit)
             for home_outline in home_outlines(chart)
         ],
-        "cells": [_cell_rows(chart, k, pressures, unit, shapes) for k in range(len(chart.slews))],
-        "contours": [_contour_rows(chart, k, unit) for k in range(len(chart.slews))],
+        "cells": cells,
+        "contours": contours,
         "shapes": [json.loads(shape) for shape in shapes],
     }
 
 
 def _cell_rows(
-    chart: Capacity, k: int, pressures: dict[str, Array], unit: float, shapes: dict[str, int]
+    chart: Capacity,
+    k: int,
+    stride: int,
+    pressures: dict[str, Array],
+    unit: float,
+    shapes: dict[str, int],
 ) -> list[list[Any]]:
     """Return one row per position at a slew angle.
 
-    Radius, height, load, limiting factor, loads by factor, strokes, pressures by joint, outline
-    index.
+    Radius, height, load, limiting factor, loads by factor, strokes to 0.1 mm or deg, pressures by
+    joint, outline index.
     """
     machine, active = chart.machine, chart.machine.closure.active
-    stride = _cell_stride(chart)
     b, a = np.nonzero(~np.isnan(chart.loads[k])[::stride, ::stride])
     b, a = b * stride, a * stride
-    scales = np.array([_reading_unit(machine.unit(joint))[1] for joint in machine.active])
+    scales = np.array([display_unit(machine.unit(joint), 0.0)[1] for joint in machine.active])
     q = machine.closure.solve(np.ascontiguousarray(chart.q_a[k, b, a]))
     out = []
     for configuration, i, j in zip(q, b, a, strict=True):
-        configuration_outline = machine_outline(machine, chart.frame, chart.section, configuration)
-        shape_index = shapes.setdefault(
-            json.dumps(_outline_shape(configuration_outline, unit)), len(shapes)
-        )
+        outline = machine_outline(machine, chart.frame, chart.section, configuration)
+        parts = (outline.bodies, outline.cylinders)
+        shape = json.dumps([[_round_points(x, unit) for x in part] for part in parts])
         out.append(
             [
                 _rounded_or_none(chart.radii[j]),
@@ -124,58 +144,22 @@ def _cell_rows(
                 _rounded_or_none(chart.loads[k, i, j], _LOAD_DIGITS),
                 int(chart.limiting_factor_index[k, i, j]),
                 [_rounded_or_none(x, _LOAD_DIGITS) for x in chart.values_by_factor[k, i, j]],
-                [_round_to_tenths(x) for x in scales * configuration[active]],
+                [round(float(x), 1) + 0.0 for x in scales * configuration[active]],  # no -0.0
                 [
                     [_rounded_or_none(1e-5 * x) for x in pressures[joint][k, i, j]]
                     if joint in pressures
                     else []
                     for joint in machine.active
                 ],
-                shape_index,
+                shapes.setdefault(shape, len(shapes)),
             ]
         )
     return out
 
 
-def _cell_stride(chart: Capacity) -> int:
-    """Return the stride of the positions that are shown along both axes."""
-    max_count = int((~np.isnan(chart.loads)).sum(axis=(1, 2)).max())
-    return max(int(np.ceil(np.sqrt(max_count / _MAX_CELLS))), 1)
-
-
-def _contour_rows(chart: Capacity, k: int, unit: float) -> list[list[Any]]:
-    """Return label and lines of each contour."""
-    contour_lines = load_contours(chart, k)
-    name, scale = display_unit("kg", max((level for level, _ in contour_lines), default=0.0))
-    return [
-        [f"{scale * level:g} {name}", [_round_points(line, unit) for line in lines]]
-        for level, lines in contour_lines
-        if lines
-    ]
-
-
-def _outline_shape(outline: MachineOutline, unit: float) -> list[Any]:
-    return [[_round_points(body, unit) for body in outline.bodies],
-            [_round_points(cylinder, unit) for cylinder in outline.cylinders]]  # fmt: skip
-
-
 def _round_points(points: Array, unit: float) -> list[int]:
     """Return rounded coordinates x, y, x, y ... in multiples of `unit`."""
     return [int(x) for x in np.rint(points / unit).ravel()]
-
-
-def _reading_unit(unit: str) -> tuple[str, float]:
-    """Return display unit and scale: degrees or millimetres."""
-    return display_unit(unit, 0.0)
-
-
-def _smallest_spacing(values: Array) -> float:
-    return float(np.diff(values).min()) if len(values) > 1 else 0.0
-
-
-def _round_to_tenths(value: float) -> float:
-    """Round strokes and angles to 0.1 mm or deg."""
-    return round(float(value), 1) + 0.0  # no -0.0
 
 
 def _rounded_or_none(value: float, digits: int = _SIGNIFICANT_DIGITS) -> float | None:

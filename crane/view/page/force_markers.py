@@ -46,15 +46,16 @@ def actuator_markers(
             if (machine.unit(joint) == "m")
             else []
         )
-        share = (
-            np.where(np.abs(shown_force) > zero_threshold, shown_force, 0.0) / full_arrow[joint]
-        )
         markers.append(
             {
                 "joint": index,
                 "at": pin_frames[0]["placement"][12:15] if pin_frames else [0.0, 0.0, 0.0],
                 "name": joint,
-                "share": pack_base64(share, "f4"),
+                "share": pack_base64(
+                    np.where(np.abs(shown_force) > zero_threshold, shown_force, 0.0)
+                    / full_arrow[joint],
+                    "f4",
+                ),
             }
         )
     return markers

@@ -110,24 +110,17 @@ def _summary_facts(result: Identification, recording: str, validation: str) -> s
 
 def _fit_section(result: Identification) -> str:
     machine, rows = result.described_machine, []
+    fits = [fit for fit in (result.training, result.validation) if fit is not None]
     headings = ["drive*", "RMS error", "relative", "squared"]
     if result.validation is not None:
         headings += ["validation: RMS error", "relative", "squared"]
     for i, joint in enumerate(result.training.joints):
         row = [escape(joint)]
-        for fit in (result.training, result.validation):
-            if fit is None:
-                continue
-            cells = ["-", "-", "-"]
-            if fit.is_moving[:, i].any():
-                cells = [
-                    f"{fit.rmse[i]:.4g} {FORCE_UNITS[machine.unit(joint)]}",
-                    f"{100 * fit.relative_error[i]:.3g} %",
-                    f"{fit.percentage_error[i]:.3g} %",
-                ]
-                if joint in machine.free:
-                    cells[1:] = "free", ""
-            row += cells
+        for fit in fits:
+            error = f"{fit.rmse[i]:.4g} {FORCE_UNITS[machine.unit(joint)]}"
+            shares = [f"{100 * fit.relative_error[i]:.3g} %", f"{fit.percentage_error[i]:.3g} %"]
+            cells = [error, *(["free", ""] if joint in machine.free else shares)]
+            row += cells if fit.is_moving[:, i].any() else ["-", "-", "-"]
         rows.append(row)
     return (
         "<p>Without standstill: root mean square of measured minus modelled force, its "
@@ -180,16 +173,26 @@ def _base_parameter_section(result: Identification) -> str:
             ]
         )
         classes.append("" if is_essential else "weak")
-    headings = [
-        "parameter*", "value", "from", "to", "rel. std", "description", "marks*", "together with*",
-    ]  # fmt: skip
     return (
         f"{warning_text}<p>{len(essential_indices)} of {len(result.names)} are essential: without "
         "the others (grey), the forces are not explained significantly worse. Intervals have a "
         "confidence of 95 %. Parameters are not determined if their standard deviation exceeds "
         "the values of such machines. A base parameter combines the parameter in its name with "
         "others that have the same effect.</p>"
-    ) + html_table(headings, rows, classes)
+    ) + html_table(
+        [
+            "parameter*",
+            "value",
+            "from",
+            "to",
+            "rel. std",
+            "description",
+            "marks*",
+            "together with*",
+        ],
+        rows,
+        classes,
+    )
 
 
 def _format_share(numerator: float, denominator: float) -> str:
@@ -257,8 +260,11 @@ def _correlation_section(result: Identification) -> str:
 
 def _unobservable_section(result: Identification) -> str:
     base = result.base
-    effects = zip(base.names, base.grouping.any(axis=0), strict=True)
-    unexcited = [x for x, is_seen in effects if not is_seen and x not in base.unobservable]
+    unexcited = [
+        x
+        for x, column in zip(base.names, base.grouping.T, strict=True)
+        if not column.any() and x not in base.unobservable
+    ]
     parts = [
         f"<p>{explanation}: {', '.join(f'<code>{escape(name)}</code>' for name in names)}.</p>"
         for names, explanation in (

@@ -45,6 +45,14 @@ _GROUP_BY_UNIT = {
     "m3": "Volumes", "": "Signals",
 }  # fmt: skip
 _PREFIXES = ("pressure_", "voltage_", "spool_", "flow_", "friction_")
+_GROUP_BY_PREFIX = {"friction_": "Friction", "spool_": "Spools"}
+# Groups of coordinate, velocity and force by the unit of a joint and whether it is passive.
+_JOINT_GROUPS = {
+    ("rad", False): (ANGLES, "Angular velocities", TORQUES),
+    ("m", False): (STROKES, "Stroke velocities", FORCES),
+    ("rad", True): ("Passive angles", "Passive velocities", "Other"),
+    ("m", True): ("Passive strokes", "Passive velocities", "Other"),
+}
 _ERROR_PREFIX = "error_"  # of a joint to its reference
 
 
@@ -127,15 +135,6 @@ class ThinningGrid:
         }
 
 
-def _column_series(column: PageColumn, grid: ThinningGrid, scale: float) -> dict[str, Any]:
-    series_data: dict[str, Any] = {"series": grid.thin_out(scale * column.values)}
-    if column.reference is not None:
-        series_data["reference"] = grid.thin_out(scale * column.reference)
-    if column.limits is not None:
-        series_data["limits"] = [scale * x if np.isfinite(x) else None for x in column.limits]
-    return series_data
-
-
 def plot_groups(
     machine: Machine,
     recording: Recording,
@@ -153,17 +152,15 @@ def plot_groups(
     columns_by_group: dict[tuple[str, str], list[PageColumn]] = {}
     for column in page_columns(machine, recording):
         columns_by_group.setdefault((column.group, column.unit), []).append(column)
-    second_columns = (
-        {}
-        if second_recording is None
-        else {x.name: x for x in page_columns(machine, second_recording[0])}
-    )
+    second_columns: dict[tuple[str, str], PageColumn] = {}
+    if second_recording is not None:
+        second_columns = {(x.name, x.unit): x for x in page_columns(machine, second_recording[0])}
     order = [*OPEN_GROUPS, *CLOSED_GROUPS]
     group_data = []
     for title, unit in sorted(columns_by_group, key=lambda key: order.index(key[0])):
         group_columns = columns_by_group[title, unit]
-        peak = max(_peak_magnitude(column.values) for column in group_columns)
-        shown_unit, scale = display_unit(unit, peak)
+        peaks = [_peak_magnitude(column.values) for column in group_columns]
+        shown_unit, scale = display_unit(unit, max(peaks))
         line_data = []
         for index, (column, hue, shade) in enumerate(_with_colours(machine, group_columns)):
             release_pages()
@@ -173,25 +170,30 @@ def plot_groups(
                 "hue": hue,
                 "shade": shade,
                 "shown": index < INITIALLY_SHOWN,
-                **_column_series(column, grid, scale),
+                "series": grid.thin_out(scale * column.values),
             }
-            second_column = second_columns.get(column.name)
-            if (
-                second_recording is not None
-                and second_column is not None
-                and second_column.unit == unit
-            ):
+            if column.reference is not None:
+                line["reference"] = grid.thin_out(scale * column.reference)
+            if column.limits is not None:
+                line["limits"] = [scale * x if np.isfinite(x) else None for x in column.limits]
+            second_column = second_columns.get((column.name, unit))
+            if second_recording is not None and second_column is not None:
                 line["other"] = second_recording[1].thin_out(scale * second_column.values)
             line_data.append(line)
-        is_moving = len(recording.time) == 1 or any(
-            _varies(column.values) for column in group_columns
-        )
+        # whether a column varies by more than rounding errors
         release_pages()
         group_data.append(
             {
                 "title": title,
                 "unit": shown_unit,
-                "open": is_moving and title in OPEN_GROUPS,
+                "open": (
+                    len(recording.time) == 1
+                    or any(
+                        float(np.ptp(column.values)) > 1e-9 * max(1.0, peak)
+                        for column, peak in zip(group_columns, peaks, strict=True)
+                    )
+                )
+                and title in OPEN_GROUPS,
                 "lines": line_data,
             }
         )
@@ -203,7 +205,7 @@ def page_columns(machine: Machine, recording: Recording) -> Iterator[PageColumn]
 
     Errors (reference minus coordinate) and the sum of kinetic and potential energy are added.
     """
-    channels = recording.channels
+    channels, units = recording.channels, recording.channel_units
     used_references = set()
 
     def reference(name: str) -> Array | None:
@@ -211,64 +213,47 @@ def page_columns(machine: Machine, recording: Recording) -> Iterator[PageColumn]
         return channels.get(REFERENCE_PREFIX + name)
 
     for i, joint in enumerate(recording.joints):
-        unit = recording.units[joint]
-        is_angle, is_passive = unit == "rad", joint not in machine.active
+        unit, column = recording.units[joint], machine.column(joint)
+        is_passive = joint not in machine.active
         lower, upper = (
-            float(limits[machine.column(joint)])
-            for limits in (machine.coordinates.lower, machine.coordinates.upper)
+            float(x[column]) for x in (machine.coordinates.lower, machine.coordinates.upper)
         )
-        group_titles = (
-            [ANGLES, "Angular velocities", TORQUES]
-            if is_angle
-            else [STROKES, "Stroke velocities", FORCES]
-        )
-        if is_passive:
-            group_titles = [
-                "Passive angles" if is_angle else "Passive strokes",
-                "Passive velocities",
-                "Other",
-            ]
-        yield PageColumn(
-            joint,
-            group_titles[0],
-            joint,
-            unit,
-            recording.q[:, i],
-            reference(joint),
-            (lower, upper),
-        )
-        reference_velocity = reference(f"velocity_{joint}")
+        groups = _JOINT_GROUPS[unit, is_passive]
+        values, velocity = recording.q[:, i], recording.v[:, i]
+        yield PageColumn(joint, groups[0], joint, unit, values, reference(joint), (lower, upper))
         yield PageColumn(
             joint + VELOCITY_SUFFIX,
-            group_titles[1],
+            groups[1],
             joint,
             VELOCITY_UNITS[unit],
-            recording.v[:, i],
-            reference_velocity,
+            velocity,
+            reference(f"velocity_{joint}"),
         )
         if REFERENCE_PREFIX + joint in channels:
             yield PageColumn(_ERROR_PREFIX + joint, ERRORS, joint, unit, recording.error(joint))
-        if joint in recording.free:
-            continue
-        yield PageColumn(
-            f"{joint}_force", group_titles[2], joint, FORCE_UNITS[unit], recording.tau[:, i]
-        )
+        if joint not in recording.free:
+            yield PageColumn(
+                f"{joint}_force", groups[2], joint, FORCE_UNITS[unit], recording.tau[:, i]
+            )
     for name, values in channels.items():
         if name.startswith(REFERENCE_PREFIX):
             continue
-        unit = recording.channel_units[name]
+        unit = units[name]
         if not unit and name in machine.joints:
             unit = machine.unit(name)
         group, label = _group_and_label(machine, name, unit)
         yield PageColumn(name, group, label, unit, values, reference(name))
-        if name == "potential" and unit == recording.channel_units.get("kinetic") == "J":
-            energy_name = "kinetic + potential"
+        if name == "potential" and unit == units.get("kinetic") == "J":
             yield PageColumn(
-                energy_name, group, energy_name, unit, _sum_blockwise(channels["kinetic"], values)
+                "kinetic + potential",
+                group,
+                "kinetic + potential",
+                unit,
+                _sum_blockwise(channels["kinetic"], values),
             )
     for name, values in channels.items():
         if name.startswith(REFERENCE_PREFIX) and name not in used_references:
-            yield PageColumn(name, "Other", name, recording.channel_units[name], values)
+            yield PageColumn(name, "Other", name, units[name], values)
 
 
 def _sum_blockwise(first: Array, second: Array) -> Array:
@@ -277,7 +262,7 @@ def _sum_blockwise(first: Array, second: Array) -> Array:
 
 def _group_and_label(machine: Machine, name: str, unit: str) -> tuple[str, str]:
     if name in machine.joints:
-        return ("Passive strokes" if machine.unit(name) == "m" else "Passive angles"), name
+        return _JOINT_GROUPS[machine.unit(name), True][0], name
     joint = name.removesuffix(VELOCITY_SUFFIX)
     if joint in machine.joints:
         return "Passive velocities", joint
@@ -285,21 +270,13 @@ def _group_and_label(machine: Machine, name: str, unit: str) -> tuple[str, str]:
         return "Tip", name[-1]
     prefix = next((x for x in _PREFIXES if name.startswith(x)), "")
     label = name.removeprefix(prefix)
-    if prefix == "friction_":
-        return "Friction", label
-    if prefix == "spool_":
-        return "Spools", label
-    return _GROUP_BY_UNIT.get(unit, "Other"), label if unit in _GROUP_BY_UNIT else name
+    group = _GROUP_BY_PREFIX.get(prefix) or _GROUP_BY_UNIT.get(unit)
+    return (group, label) if group else ("Other", name)
 
 
 def _peak_magnitude(values: Array) -> float:
     release_pages()
     return float(np.abs(values).max())
-
-
-def _varies(values: Array) -> bool:
-    """Return whether a column varies by more than rounding errors."""
-    return float(np.ptp(values)) > 1e-9 * max(1.0, _peak_magnitude(values))
 
 
 def _with_colours(

@@ -97,24 +97,19 @@ def column_major_pose(pose: pin.SE3) -> list[float]:
 
 def payload_frame_data(machine: Machine) -> dict[str, Any] | None:
     """Return the centre of mass of the payload as a frame; None without payload."""
-    model = machine.model
-    payload_chains = [chain for chain in machine.chains if chain.name == "payload"]
-    if not payload_chains:
-        has_payload_frame = any(
-            f.name == "payload" and f.type == pin.FrameType.BODY for f in model.frames
-        )
-        return frame_data(machine, "payload") if has_payload_frame else None
+    model, tree = machine.model, machine.tree
+    payload_chain = next((chain for chain in machine.chains if chain.name == "payload"), None)
+    if payload_chain is None:
+        return frame_data(machine, "payload") if "payload" in tree.links else None
     total, moment, joint = 0.0, np.zeros(3), 0
-    child_joints, pending_links = (
-        machine.tree.joints_by_parent(),
-        [machine.tree.joints[payload_chains[0].attachment_name].child],
-    )
+    child_joints = tree.joints_by_parent()
+    pending_links = [tree.joints[payload_chain.attachment_name].child]
     while pending_links:
         link = pending_links.pop()
         pending_links += [joint.child for joint in child_joints.get(link, ())]
         frame = model.frames[machine.frame(link)]
         joint = frame.parentJoint
-        if (inertial := machine.tree.links[link].inertial) is not None:
+        if (inertial := tree.links[link].inertial) is not None:
             total += inertial.mass
             moment += inertial.mass * frame.placement.act(np.array(inertial.com))
     if not total:
@@ -145,10 +140,12 @@ def nearest_frame_rows(time: Array, fps: float) -> np.ndarray:
         time: (N,) increasing times [s].
         fps: Frames per second.
     """
-    nearest_rows = np.searchsorted(
-        (time[1:] + time[:-1]) / 2, np.arange(time[0], time[-1], 1 / fps)
+    return np.unique(
+        np.append(
+            np.searchsorted((time[1:] + time[:-1]) / 2, np.arange(time[0], time[-1], 1 / fps)),
+            len(time) - 1,
+        )
     )
-    return np.unique(np.append(nearest_rows, len(time) - 1))
 
 
 def motion_data(time: Array, q: Array) -> dict[str, Any]:
@@ -191,22 +188,17 @@ def recorded_configurations(machine: Machine, recording: Recording, rows: np.nda
     """
     check_joints(machine, recording)
     columns = {joint: recording.q[rows, i] for i, joint in enumerate(recording.joints)}
-    q = np.empty((len(rows), len(machine.joints)))
-    if all(
-        joint in columns or _is_recorded(machine, recording, joint) for joint in machine.joints
-    ):
-        for joint in machine.joints:
-            column = columns[joint] if joint in columns else recording.channels[joint][rows]
-            q[:, machine.column(joint)] = column
+    for joint, unit in recording.channel_units.items():
+        # a passive joint, in its unit or without unit
+        if joint in machine.joints and unit in ("", machine.unit(joint)):
+            columns.setdefault(joint, recording.channels[joint][rows])
+    if len(columns) == len(machine.joints):
+        q = np.empty((len(rows), len(machine.joints)))
+        for joint, values in columns.items():
+            q[:, machine.column(joint)] = values
     else:
         q = machine.closure.solve(np.column_stack([columns[joint] for joint in machine.active]))
     for joint in machine.joints:
         if not np.isfinite(q[:, machine.column(joint)]).all():
             raise InputError(f"joint '{joint}' is not finite, check the recording")
     return q
-
-
-def _is_recorded(machine: Machine, recording: Recording, joint: str) -> bool:
-    """Return whether a passive joint is recorded, in its unit or without unit."""
-    unit = recording.channel_units.get(joint)
-    return unit is not None and unit in ("", machine.unit(joint))

@@ -195,11 +195,10 @@ def _render_page(page_data: dict[str, Any], scene: Scene) -> str:
     import umsgpack  # type: ignore[import-untyped]
 
     assets = files("crane.view.page") / "assets"
-    viewer = files(meshcat) / "viewer" / "dist" / "main.min.js"
     return Template((assets / "page.html").read_text(encoding="utf-8")).substitute(
         title=escape(result_title(page_data["machine"], page_data["task"])),
         style=(assets / "page.css").read_text(encoding="utf-8"),
-        viewer=viewer.read_text(encoding="utf-8"),
+        viewer=(files(meshcat) / "viewer" / "dist" / "main.min.js").read_text(encoding="utf-8"),
         data=_script_json(page_data),
         commands=_script_json(
             [base64.b64encode(umsgpack.packb(c)).decode() for c in scene.commands]
@@ -273,12 +272,12 @@ def summarize_run(machine: Machine, recording: Recording | None) -> dict[str, An
             text += f", {_format_quantity(returned_work, 'J')} returned"
         facts.append(("work of the actuators", text))
     channels = recording.channels
-    for name, label in (("dissipated", "friction losses"), ("pump_work", "work of the pump")):
+    for name, text in (("dissipated", "friction losses"), ("pump_work", "work of the pump")):
         if count < 2 or recording.channel_units.get(name) != "J":
             continue
         change = float(channels[name][-1] - channels[name][0])
         if _format_number(change) != "0":
-            facts.append((label, _format_quantity(change, "J")))
+            facts.append((text, _format_quantity(change, "J")))
     if count > 1 and summary.balance_text:
         facts.append(("energy balance", summary.balance_text.replace("-", "\u2212")))
     if summary.tip_rms_error is not None and summary.tip_peak_error is not None:

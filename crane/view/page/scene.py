@@ -95,26 +95,14 @@ def draw_surroundings(viewer: Any, lower: Array, upper: Array, ground_height: fl
         (1, 2, 5, 10), key=lambda step: abs(np.log(12 * step * power_of_ten / size))
     )
     count = int(np.ceil(size / spacing))
-    ticks, half_length = np.arange(-count, count + 1) * spacing, count * spacing
-    line_ends = np.array([[(tick, -half_length), (tick, half_length)] for tick in ticks]).reshape(
-        -1, 2
-    )
+    end = count * spacing
+    ticks = np.arange(-count, count + 1) * spacing
+    line_ends = np.array([[(x, -end), (x, end)] for x in ticks]).reshape(-1, 2)
     centre = np.round((lower + upper)[:2] / 2 / spacing) * spacing
-    grid_points = np.concatenate([line_ends, line_ends[:, ::-1]]) + centre
-    viewer.set_object(
-        g.LineSegments(
-            _points_geometry(
-                np.column_stack([grid_points, np.full(len(grid_points), ground_height)])
-            ),
-            g.LineBasicMaterial(color=_GRID_COLOUR),
-        )
-    )
-
-
-def _points_geometry(points: Array) -> Any:
-    import meshcat.geometry as g
-
-    return g.PointsGeometry(np.ascontiguousarray(points.T, dtype=np.float32))
+    points = np.full((2 * len(line_ends), 3), ground_height)
+    points[:, :2] = np.concatenate([line_ends, line_ends[:, ::-1]]) + centre
+    geometry = g.PointsGeometry(np.ascontiguousarray(points.T, dtype=np.float32))
+    viewer.set_object(g.LineSegments(geometry, g.LineBasicMaterial(color=_GRID_COLOUR)))
 
 
 _SAMPLED_FRAMES = 300  # frames that determine the size of the scene
@@ -170,19 +158,26 @@ def build_scene(
     sample_rows = (
         np.zeros(1, dtype=int) if recording is None else frame_rows(recording.time, frame_share)
     )
-    time = np.zeros(1) if recording is None else recording.time[sample_rows]
     configurations = (
         machine.home[None]
         if recording is None
         else recorded_configurations(machine, recording, sample_rows)
     )
     visuals = read_visuals(machine)
-    links = tuple(dict.fromkeys(visual.link for visual in visuals))
     sampled_rows = np.unique(np.linspace(0, len(configurations) - 1, _SAMPLED_FRAMES).astype(int))
-    poses = link_poses(machine, configurations[sampled_rows], links)
-    element_links = {link for item in machine.force_elements for link in item.between or ()}
+    poses = link_poses(
+        machine,
+        configurations[sampled_rows],
+        tuple(dict.fromkeys(visual.link for visual in visuals)),
+    )
     lower, upper = _scene_bounds(
-        visuals, poses, link_poses(machine, configurations[sampled_rows], element_links)
+        visuals,
+        poses,
+        link_poses(
+            machine,
+            configurations[sampled_rows],
+            {link for item in machine.force_elements for link in item.between or ()},
+        ),
     )
     floor_height = ground_height(machine, visuals)
     lower[2], upper[2] = min(lower[2], floor_height), max(upper[2], floor_height)
@@ -196,7 +191,7 @@ def build_scene(
     return Scene(
         commands=recorder.commands,
         frame_rows=sample_rows,
-        time=time,
+        time=np.zeros(1) if recording is None else recording.time[sample_rows],
         configurations=configurations,
         lower=lower,
         upper=upper,
@@ -267,13 +262,13 @@ def _scene_bounds(
         points.append(world_corners.reshape(-1, 3))
     all_points = np.concatenate(points)
     lower, upper = all_points.min(axis=0), all_points.max(axis=0)
-    size = float((upper - lower).max())
-    return lower, np.maximum(upper, lower + (_MIN_SIDE_SHARE * size or _MIN_SIZE))
+    return lower, np.maximum(
+        upper, lower + (_MIN_SIDE_SHARE * float((upper - lower).max()) or _MIN_SIZE)
+    )
 
 
-_MAX_ROD_STROKE_RATIO = (
-    3.0  # largest distances on one body, the longest stroke that is drawn as a rod
-)
+# Longest stroke that is drawn as a rod, in largest distances on one body.
+_MAX_ROD_STROKE_RATIO = 3.0
 
 
 def read_visuals(machine: Machine) -> list[Visual]:
@@ -286,7 +281,9 @@ def read_visuals(machine: Machine) -> list[Visual]:
     visuals: list[Visual] = []
     missing_meshes: list[str] = []
     problems: list[str] = []
-    box = BoxShape((0.15 * _largest_joint_distance(machine),) * 3)
+    model = machine.model
+    distance = max(float(np.linalg.norm(x.translation)) for x in model.jointPlacements)
+    box = BoxShape((0.15 * (distance or 1.0),) * 3)
     with open_robots(machine) as sources:
         for xml in sources:
             drawn_visuals = read_shapes(xml, replacement=box)
@@ -294,53 +291,41 @@ def read_visuals(machine: Machine) -> list[Visual]:
             missing_meshes += drawn_visuals.missing_meshes
             problems += drawn_visuals.problems
     if missing_meshes:
-        _warn(
+        warnings.warn(
             f"{machine.name}: {len(missing_meshes)} mesh files are not there and are drawn as "
-            f"boxes ({missing_meshes[0]}), install the package that has them"
+            f"boxes ({missing_meshes[0]}), install the package that has them",
+            CraneWarning,
+            stacklevel=2,
         )
     if problems:
         more_text = f" ({len(problems)} such, crane check lists them)" if len(problems) > 1 else ""
-        _warn(f"{problems[0]}{more_text}")
-    frames = machine.model.frames
-    shown_joints = {frames[machine.frame(visual.link)].parentJoint for visual in visuals}
-    long = {joint for joint, end, _ in _body_points(machine) if joint and end.any()}
-    masses = machine.model.inertias
-    visuals += skeleton_visuals(
-        machine,
-        None
-        if all(visual.shape is box for visual in visuals)
-        else {joint for joint in long - shown_joints if masses[joint].mass},
-    )
+        warnings.warn(f"{problems[0]}{more_text}", CraneWarning, stacklevel=2)
+    shown_joints = {model.frames[machine.frame(x.link)].parentJoint for x in visuals}
+    bodies: set[int] | None = None
+    if not all(visual.shape is box for visual in visuals):
+        long = {joint for joint, end, _ in _body_points(machine) if joint and end.any()}
+        bodies = {joint for joint in long - shown_joints if model.inertias[joint].mass}
+    visuals += skeleton_visuals(machine, bodies)
     return visuals + sliding_body_visuals(machine, shown_joints)
-
-
-def _warn(text: str) -> None:
-    warnings.warn(text, CraneWarning, stacklevel=3)
-
-
-def _largest_joint_distance(machine: Machine) -> float:
-    """Return the largest distance between two joints on one body [m]; 1 if all are 0."""
-    return (
-        max(
-            float(np.linalg.norm(placement.translation))
-            for placement in machine.model.jointPlacements
-        )
-        or 1.0
-    )
 
 
 def _body_points(machine: Machine) -> list[tuple[int, Array, str]]:
     """Return parent joint, position (3,) [m] and name of all frames and joints on bodies."""
     model = machine.model
-    points = [
+    frames = [
         (frame.parentJoint, frame.placement.translation, frame.name)
-        for frame in (frame for frame in model.frames if frame.type == pin.FrameType.BODY)
+        for frame in model.frames
+        if frame.type == pin.FrameType.BODY
     ]
-    for joint in range(1, model.njoints):
-        points.append(
-            (model.parents[joint], model.jointPlacements[joint].translation, model.names[joint])
-        )
-    return points
+    return (
+        frames
+        + [
+            (parent, x.translation, name)
+            for parent, x, name in zip(
+                model.parents, model.jointPlacements, model.names, strict=True
+            )
+        ][1:]
+    )
 
 
 def largest_body_extent(machine: Machine) -> float:
@@ -374,14 +359,20 @@ def sliding_body_visuals(machine: Machine, drawn_joints: Collection[int]) -> lis
         axis = np.ravel(model.joints[joint].createData().S)[:3]
         stroke = float(limits.upper[column] - limits.lower[column])
         is_rod = bool(model.parents[joint]) and stroke < _MAX_ROD_STROKE_RATIO * size
-        shape = (
-            CylinderShape(0.2 * width, stroke) if is_rod else BoxShape((1.5 * width, width, width))
-        )
         rotation = pin.Quaternion.FromTwoVectors(pin.ZAxis if is_rod else pin.XAxis, axis)
         link_placement = model.frames[machine.frame(links[joint])].placement.inverse() * pin.SE3(
             rotation, -0.5 * stroke * axis if is_rod else np.zeros(3)
         )
-        visuals.append(Visual(links[joint], shape, link_placement.homogeneous, DEFAULT_COLOUR))
+        visuals.append(
+            Visual(
+                links[joint],
+                CylinderShape(0.2 * width, stroke)
+                if is_rod
+                else BoxShape((1.5 * width, width, width)),
+                link_placement.homogeneous,
+                DEFAULT_COLOUR,
+            )
+        )
     return visuals
 
 
@@ -394,27 +385,29 @@ def skeleton_visuals(machine: Machine, bodies: Collection[int] | None = None) ->
         machine: The machine.
         bodies: Joints of the bodies to draw; by default all, and the ground.
     """
-    model, links, radius = (
-        machine.model,
-        _first_links(machine),
-        0.03 * largest_body_extent(machine),
-    )
+    model, links = machine.model, _first_links(machine)
+    radius = 0.03 * largest_body_extent(machine)
     element_links = {link for item in machine.force_elements for link in item.between or ()}
     visuals = []
     for body, point, name in _body_points(machine):
         if bodies is not None and body not in bodies:
             continue
         link_placement = model.frames[machine.frame(links[body])].placement.inverse()
-        ball_placement = link_placement.homogeneous
-        ball_placement[:3, 3] = link_placement.act(point)
-        visuals.append(
-            Visual(links[body], SphereShape(1.5 * radius), ball_placement, DEFAULT_COLOUR)
-        )
+        shapes: list[tuple[Any, pin.SE3]] = [
+            (SphereShape(1.5 * radius), pin.SE3(np.eye(3), point))
+        ]
         length = float(np.linalg.norm(point))
         if length and (body or name not in element_links):
-            rotation = pin.Quaternion.FromTwoVectors(pin.ZAxis, point)
-            bar_placement = (link_placement * pin.SE3(rotation, point / 2)).homogeneous
+            shapes.append(
+                (
+                    CylinderShape(radius, length),
+                    pin.SE3(pin.Quaternion.FromTwoVectors(pin.ZAxis, point), point / 2),
+                )
+            )
+        for shape, placement in shapes:
             visuals.append(
-                Visual(links[body], CylinderShape(radius, length), bar_placement, DEFAULT_COLOUR)
+                Visual(
+                    links[body], shape, (link_placement * placement).homogeneous, DEFAULT_COLOUR
+                )
             )
     return visuals

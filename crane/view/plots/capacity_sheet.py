@@ -91,12 +91,10 @@ def _draw_charts(figure: Figure, chart: Capacity, bottom: float, top: float) -> 
     columns, best_width = -(-panel_count // lines), panel_width(lines)
     for k in range(panel_count):
         row, column = divmod(k, columns)
-        left = _PAGE_MARGIN + 0.5 + column * (best_width + 0.55)
-        panel_bottom = top - 0.2 - row * (top - bottom) / lines - best_width * aspect
         axes = figure.add_axes(
             (
-                left / _PAGE_WIDTH,
-                panel_bottom / _PAGE_HEIGHT,
+                (_PAGE_MARGIN + 0.5 + column * (best_width + 0.55)) / _PAGE_WIDTH,
+                (top - 0.2 - row * (top - bottom) / lines - best_width * aspect) / _PAGE_HEIGHT,
                 best_width / _PAGE_WIDTH,
                 best_width * aspect / _PAGE_HEIGHT,
             )
@@ -144,11 +142,21 @@ def _draw_table(figure: Figure, chart: Capacity, table: LoadTable, bottom: float
     right_edges = (
         first_column + width * (1 + np.arange(len(rows[0]))) - 0.08
     )  # right ends of columns
-    top = bottom + _LINE_HEIGHT * (len(rows) + (2 if any(names) else 1))
     for i, (height, row) in enumerate(zip(table.heights, rows, strict=True)):
         y = bottom + _LINE_HEIGHT * (len(rows) - 1 - i)
         if i % 2 == 0:
-            _draw_row_band(figure, y - 0.045, first_column + width * len(row))
+            figure.add_artist(
+                Rectangle(
+                    (_PAGE_MARGIN / _PAGE_WIDTH, (y - 0.045) / _PAGE_HEIGHT),
+                    (first_column + width * len(row) - _PAGE_MARGIN) / _PAGE_WIDTH,
+                    _LINE_HEIGHT / _PAGE_HEIGHT,
+                    facecolor=FAINT_COLOUR,
+                    alpha=0.45,
+                    transform=figure.transFigure,
+                    linewidth=0,
+                    zorder=-1,
+                )
+            )
         _write_text(
             figure,
             _PAGE_MARGIN + 0.5,
@@ -187,20 +195,4 @@ def _draw_table(figure: Figure, chart: Capacity, table: LoadTable, bottom: float
             fontweight="bold",
         )
     _write_text(figure, right_edges[-1], y, "at [m]", size=size, ha="right", fontweight="bold")
-    return top
-
-
-def _draw_row_band(figure: Figure, y: float, right: float) -> None:
-    """Draw a tinted band behind a row."""
-    figure.add_artist(
-        Rectangle(
-            (_PAGE_MARGIN / _PAGE_WIDTH, y / _PAGE_HEIGHT),
-            (right - _PAGE_MARGIN) / _PAGE_WIDTH,
-            _LINE_HEIGHT / _PAGE_HEIGHT,
-            facecolor=FAINT_COLOUR,
-            alpha=0.45,
-            transform=figure.transFigure,
-            linewidth=0,
-            zorder=-1,
-        )
-    )
+    return y + _LINE_HEIGHT

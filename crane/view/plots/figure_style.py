@@ -120,8 +120,11 @@ def envelope(time: Array, values: Array) -> tuple[Array, Array]:
     size = -(-2 * count // _MAX_POINTS)
     blocks = np.pad(values, (0, -count % size), mode="edge").reshape(-1, size)
     starts = np.arange(0, count, size)
-    extrema = [starts + blocks.argmin(axis=1), starts + blocks.argmax(axis=1)]
-    indices = np.unique(np.concatenate([[0, count - 1], *extrema]))
+    indices = np.unique(
+        np.concatenate(
+            [[0, count - 1], starts + blocks.argmin(axis=1), starts + blocks.argmax(axis=1)]
+        )
+    )
     return time[indices], values[indices]
 
 

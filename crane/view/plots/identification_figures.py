@@ -11,8 +11,8 @@ from crane.common.samples import Array
 from crane.common.units import display_unit
 from crane.identification.excitation.periodic_excitation import Excitation
 from crane.identification.excitation.signal_excitation import SignalExcitation
+from crane.identification.hydraulics.cylinder_equations import EquationSides
 from crane.identification.hydraulics.cylinder_friction import CylinderFriction
-from crane.identification.hydraulics.orifice_equations import EquationSides
 from crane.identification.hydraulics.valve_curve import ValveCurve
 from crane.identification.mechanics.force_comparison import ForceComparison
 from crane.identification.mechanics.identification_result import Identification
@@ -254,7 +254,6 @@ def excitation_figure(excitation: Excitation) -> Figure:
     """Return the figure of a trajectory; limits are dashed, lead times shaded."""
     machine, reference, bounds = excitation.machine, excitation.trajectory, excitation.limits
     time, q, v, _, tau = (x[:: -(-len(x) // _MAX_POINTS)] for x in excitation.motion())
-    leads = (0, reference.lead), (reference.duration - reference.lead, reference.duration)
     figure, grid = _create_grid(2.4, len(machine.active))
     for i, joint in enumerate(machine.active):
         unit, scale = DISPLAY_UNITS[machine.unit(joint)]
@@ -270,8 +269,13 @@ def excitation_figure(excitation: Excitation) -> Figure:
             lines = [(factor * values[:, i], RECORDED_COLOUR)]
             limits = [factor * (centre - limit), factor * (centre + limit)]
             _draw_lines(axes, time, lines, limits, f"{name} [{label}]")
-            for lead in leads:
-                axes.axvspan(*lead, color=FAINT_COLOUR, alpha=0.5)
+            axes.axvspan(0, reference.lead, color=FAINT_COLOUR, alpha=0.5)
+            axes.axvspan(
+                reference.duration - reference.lead,
+                reference.duration,
+                color=FAINT_COLOUR,
+                alpha=0.5,
+            )
         grid[0, i].set_title(escape_label(joint))
     return figure
 

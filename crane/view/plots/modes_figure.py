@@ -1,5 +1,6 @@
 """Figures of linear models and sensitivities."""
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -70,7 +71,7 @@ def parameter_modes_figure(models: Sequence[tuple[dict[str, float], LinearModel]
     figure = Figure(figsize=(6.4, 5.6), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
     for color, (family_values, family) in zip(
-        _cycle_colours(len(families)), families.items(), strict=True
+        itertools.cycle(_CURVE_COLOURS), families.items(), strict=False
     ):
         label_text = ", ".join(
             f"{name} {value:g}" for name, value in zip(names[1:], family_values, strict=True)
@@ -95,10 +96,6 @@ def parameter_modes_figure(models: Sequence[tuple[dict[str, float], LinearModel]
         figure.legend(loc="outside lower center", ncols=min(len(families), 5))
     add_heading(figure, escape_label(result_title(machine.name, "oscillatory modes")))
     return figure
-
-
-def _cycle_colours(count: int) -> list[str]:
-    return [_CURVE_COLOURS[i % len(_CURVE_COLOURS)] for i in range(count)]
 
 
 def _track_modes(family: Sequence[tuple[float, LinearModel]]) -> list[tuple[Array, Array, Array]]:
@@ -197,7 +194,7 @@ def _draw_response(
     axes: Axes, model: LinearModel, frequencies: Array, response: Array, input_index: int
 ) -> None:
     position_outputs = _position_outputs(model)
-    for color, i in zip(_cycle_colours(len(position_outputs)), position_outputs, strict=True):
+    for color, i in zip(itertools.cycle(_CURVE_COLOURS), position_outputs, strict=False):
         joint = model.outputs[i]
         unit, factor = DISPLAY_UNITS[model.machine.unit(joint)]
         if response[:, i].max() > _MIN_RESPONSE_SHARE * response[:, position_outputs].max():

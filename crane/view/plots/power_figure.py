@@ -1,5 +1,6 @@
 """Figures of power balances: power over time of one run, energies of several runs."""
 
+import itertools
 from collections.abc import Mapping
 
 import numpy as np
@@ -152,7 +153,7 @@ def power_comparison_figure(comparison: PowerComparison) -> Figure:
     time_axes, bar_axes = figure.subplots(2, 1, height_ratios=(2.4, bars_height))
     peaks = [float(np.abs(balance.shaft_power).max()) for balance in comparison.balances.values()]
     power_unit, power_scale = display_unit("W", max(peaks))
-    for run, color in zip(runs, _run_colours(len(runs)), strict=True):
+    for i, (run, color) in enumerate(zip(runs, itertools.cycle(_RUN_COLOURS), strict=False)):
         time, power = comparison.shaft_power_over_time(run)
         label = (
             f"{run}: {format_number(scale * totals[run])} {unit} in {format_number(time[-1])} s"
@@ -160,11 +161,6 @@ def power_comparison_figure(comparison: PowerComparison) -> Figure:
         time_axes.plot(
             time, power_scale * power, color=color, linewidth=1.1, label=escape_label(label)
         )
-    time_axes.set(xlabel="time [s]", ylabel=f"power of the shafts [{power_unit}]")
-    time_axes.margins(x=0.0)
-    time_axes.set_ylim(bottom=min(0.0, time_axes.get_ylim()[0]))
-    figure.legend(loc="outside upper left", ncols=2)
-    for i, (run, color) in enumerate(zip(runs, _run_colours(len(runs)), strict=True)):
         values = [scale * energies[run][kind] for kind in classes]
         bars = bar_axes.barh(
             [group_height * k + _BAR_HEIGHT * i for k in range(len(classes))],
@@ -173,10 +169,12 @@ def power_comparison_figure(comparison: PowerComparison) -> Figure:
             color=color,
         )
         bar_axes.bar_label(bars, [format_number(x) for x in values], padding=2, fontsize=6.5)
-    bar_axes.set_yticks(
-        [group_height * k + (0.5 * _BAR_HEIGHT * (len(runs) - 1)) for k in range(len(classes))],
-        classes,
-    )
+    time_axes.set(xlabel="time [s]", ylabel=f"power of the shafts [{power_unit}]")
+    time_axes.margins(x=0.0)
+    time_axes.set_ylim(bottom=min(0.0, time_axes.get_ylim()[0]))
+    figure.legend(loc="outside upper left", ncols=2)
+    group_centre = 0.5 * _BAR_HEIGHT * (len(runs) - 1)
+    bar_axes.set_yticks([group_height * k + group_centre for k in range(len(classes))], classes)
     bar_axes.tick_params(axis="y", length=0)
     bar_axes.grid(visible=False, axis="y")
     bar_axes.invert_yaxis()
@@ -184,7 +182,3 @@ def power_comparison_figure(comparison: PowerComparison) -> Figure:
     bar_axes.margins(x=0.08, y=0.02)
     bar_axes.set_xlabel(f"energy [{unit}]")
     return figure
-
-
-def _run_colours(count: int) -> list[str]:
-    return [_RUN_COLOURS[i % len(_RUN_COLOURS)] for i in range(count)]

@@ -63,13 +63,13 @@ def capacity_figure(chart: Capacity) -> Figure:
     height = float(np.clip(8.6 / columns * content_height / content_width, 3.0, 6.5))
     width = float(np.clip(columns * height * content_width / content_height + 1.0, 5.0, 10.0))
     figure = Figure(figsize=(width, lines * height + 1.3), layout="constrained")
-    for k, axes in enumerate(figure.subplots(lines, columns, squeeze=False).ravel()):
-        if k < panel_count:
-            draw_capacity_panel(axes, chart, k)
-            if k % columns:
-                axes.set_ylabel("")
-        else:
-            axes.set_axis_off()
+    panels = figure.subplots(lines, columns, squeeze=False).ravel()
+    for k, axes in enumerate(panels[:panel_count]):
+        draw_capacity_panel(axes, chart, k)
+        if k % columns:
+            axes.set_ylabel("")
+    for axes in panels[panel_count:]:
+        axes.set_axis_off()
     figure.set_layout_engine("constrained", h_pad=_ROOM)  # or headings touch
     add_heading(figure, escape_label(capacity_heading(chart)))
     figure.legend(

@@ -168,10 +168,12 @@ def _joint_panels(recording: Recording, column: int) -> list[_TimePanel]:
 
 
 def _draw_panel(axes: Axes, time: Array, panel: _TimePanel, unit: str, scale: float) -> None:
-    marker = "o" if len(time) == 1 else None
     for label, values in panel.drawn_lines():
         axes.plot(
-            *envelope(time, scale * values), marker=marker, label=label, **LINE_STYLES[label]
+            *envelope(time, scale * values),
+            marker="o" if len(time) == 1 else None,
+            label=label,
+            **LINE_STYLES[label],
         )
     axes.set_ylabel(f"{panel.quantity} [{unit}]")
     axes.margins(x=0.0, y=0.08)
@@ -230,8 +232,12 @@ def _draw_path(
     coordinates = list(plane or range(3))
     points = paths[0][:, coordinates]
     if plane is None:
-        shadow = *points.T[:2], np.full(len(points), lower[2])
-        axes.plot(*shadow, color="#a8a8a8", linewidth=1.0, label="shadow")
+        axes.plot(
+            *(*points.T[:2], np.full(len(points), lower[2])),
+            color="#a8a8a8",
+            linewidth=1.0,
+            label="shadow",
+        )
     axes.plot(*points.T, color=RECORDED_COLOUR, label="recording")
     for reference in paths[1:]:
         axes.plot(*reference[:, coordinates].T, label="reference", **DASHED_STYLE)
@@ -292,12 +298,13 @@ def _add_caption(figure: Figure, heading_text: str) -> None:
     if legend_lines := [
         lines[label] for label in LINE_STYLES if label in lines and label != "recording"
     ]:
-        fits_beside = (
-            _LETTER_WIDTH * len(heading_text) + _LEGEND_ENTRY_WIDTH * (1 + len(legend_lines))
-            < figure.get_figwidth()
-        )
         figure.legend(
             handles=[lines["recording"], *legend_lines],
-            loc="outside upper right" if fits_beside else "outside lower center",
+            loc="outside upper right"
+            if (
+                _LETTER_WIDTH * len(heading_text) + _LEGEND_ENTRY_WIDTH * (1 + len(legend_lines))
+                < figure.get_figwidth()
+            )
+            else "outside lower center",
             ncols=1 + len(legend_lines),
         )

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch, Polygon, Rectangle
 from matplotlib.path import Path as Outline
@@ -144,30 +143,24 @@ class _SankeyDiagram:
     def _create_group(self, owner: str, names: list[str]) -> _SankeyGroup:
         balance, ribbons, returned_energy, small_energy = self._balance, [], 0.0, 0.0
         for name in names:
-            power, kind = balance.powers[name], part_kind(name)
+            power, kind, part_owner_name = balance.powers[name], part_kind(name), part_owner(name)
             energy, returned = balance.integrate_energy(power), 0.0
             if kind == LOAD:
                 returned = balance.integrate_energy(np.maximum(-power, 0.0))
             elif energy < 0:
                 returned = -energy
             energy, returned_energy = energy + returned, returned_energy + returned
-            part_owner_name = part_owner(name)
-            is_own = owner == part_owner_name or len(self._shaft_energies) == 1
-            label = (
-                part_owner_name
-                if kind == "element"
-                else kind
-                if is_own and kind != "stored"
-                else ""
-            )
+            label = f"{part_owner_name} {kind}"
+            if kind == "element":
+                label = part_owner_name
+            elif kind != "stored" and (owner == part_owner_name or len(self._shaft_energies) == 1):
+                label = kind
             if energy < _MIN_RIBBON_SHARE * self._total_energy:
                 small_energy += energy
             elif energy > 0:
                 ribbons.append(
                     _SankeyRibbon(
-                        escape_label(label or f"{part_owner_name} {kind}"),
-                        energy,
-                        CLASS_COLOURS[part_class(balance, name)],
+                        escape_label(label), energy, CLASS_COLOURS[part_class(balance, name)]
                     )
                 )
         if small_energy > _MIN_OTHERS_SHARE * self._total_energy:
@@ -341,10 +334,10 @@ class _SankeyDiagram:
         self, x: float, y: float, text: str, ha: str = "left", va: str = "bottom",
         weight: str = "normal", is_vertical: bool = False,
     ) -> None:  # fmt: skip
-        halo = [withStroke(linewidth=2.0, foreground="white", alpha=0.8)]
         self._axes.text(
-            x, y, text, ha=ha, va=va, fontsize=8, fontweight=weight, path_effects=halo,
+            x, y, text, ha=ha, va=va, fontsize=8, fontweight=weight,
             rotation=90 if is_vertical else 0, zorder=3,
+            path_effects=[withStroke(linewidth=2.0, foreground="white", alpha=0.8)],
         )  # fmt: skip
 
     def _draw_bar(self, x: float, top: float, size: float, color: str) -> None:
@@ -356,28 +349,21 @@ class _SankeyDiagram:
         self, start: tuple[float, float], end: tuple[float, float], size: float, color: str
     ) -> None:
         """Draw a ribbon between two top edges."""
-        self._axes.add_patch(_ribbon_patch(start, end, size, color))
-
-    _axes: Axes
-    _scale: float
-
-
-def _ribbon_patch(
-    start: tuple[float, float], end: tuple[float, float], size: float, color: str
-) -> PathPatch:
-    (x, y), (end_x, end_y) = start, end
-    middle_x = 0.5 * (x + end_x)
-    points = [
-        (x, y),
-        (middle_x, y),
-        (middle_x, end_y),
-        (end_x, end_y),
-        (end_x, end_y - size),
-        (middle_x, end_y - size),
-        (middle_x, y - size),
-        (x, y - size),
-        (x, y),
-    ]
-    curve = [Outline.CURVE4] * 3
-    codes = [Outline.MOVETO, *curve, Outline.LINETO, *curve, Outline.CLOSEPOLY]
-    return PathPatch(Outline(points, codes), facecolor=color, alpha=0.45, linewidth=0)
+        (x, y), (end_x, end_y) = start, end
+        middle_x = 0.5 * (x + end_x)
+        points = [
+            (x, y),
+            (middle_x, y),
+            (middle_x, end_y),
+            (end_x, end_y),
+            (end_x, end_y - size),
+            (middle_x, end_y - size),
+            (middle_x, y - size),
+            (x, y - size),
+            (x, y),
+        ]
+        curve = [Outline.CURVE4] * 3
+        codes = [Outline.MOVETO, *curve, Outline.LINETO, *curve, Outline.CLOSEPOLY]
+        self._axes.add_patch(
+            PathPatch(Outline(points, codes), facecolor=color, alpha=0.45, linewidth=0)
+        )

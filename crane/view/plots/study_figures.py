@@ -152,9 +152,12 @@ def _draw_map(figure: Figure, axes: Axes, study: Study, name: str) -> None:
         x, y, np.ma.masked_array(values, is_infeasible), cmap="viridis", shading="nearest"
     )
     if is_infeasible.any():
-        infeasible_mask = np.ma.masked_array(np.zeros_like(values), ~is_infeasible)
         axes.pcolormesh(
-            x, y, infeasible_mask, cmap=ListedColormap([_INFEASIBLE_COLOUR]), shading="nearest"
+            x,
+            y,
+            np.ma.masked_array(np.zeros_like(values), ~is_infeasible),
+            cmap=ListedColormap([_INFEASIBLE_COLOUR]),
+            shading="nearest",
         )
         axes.plot([], [], "s", ms=8, color=_INFEASIBLE_COLOUR, label="not possible")
     if min(values.shape) > 1 and _is_varying(values):
@@ -211,11 +214,13 @@ def _draw_scatter(study: Study, shown_measures: list[str]) -> Figure:
 def design_figure(result: Design) -> Figure:
     """Return solutions over their ranges, and of several objectives the first two."""
     is_multi_objective = len(result.objectives) > 1
-    height = max(2.2, 0.9 + 0.34 * len(result.parameter_names))
     figure = Figure(
         figsize=(
             10.0 if is_multi_objective else 7.0,
-            max(height, 3.6 if is_multi_objective else 2.2),
+            max(
+                max(2.2, 0.9 + 0.34 * len(result.parameter_names)),
+                3.6 if is_multi_objective else 2.2,
+            ),
         )
     )
     axes = figure.subplots(1, 2 if is_multi_objective else 1, squeeze=False)[0]
@@ -249,7 +254,7 @@ def design_figure(result: Design) -> Figure:
         axes[0].plot(
             *np.array([x.objectives[:2] for x in result.solutions]).T,
             "o",
-            linestyle=DASHED_STYLE,
+            linestyle=DASHED_STYLE["linestyle"],
             color=RECORDED_COLOUR,
             markersize=5,
             linewidth=1.0,

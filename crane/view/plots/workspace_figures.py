@@ -68,8 +68,9 @@ def workspace_figure(reachable_space: Workspace) -> Figure:
     _draw_section(figure.add_subplot(grid[:, 0]), reachable_space, skeleton, points)
     right = [figure.add_subplot(grid[k, 1]) for k in range(1 + has_condition_panel)]
     if has_condition_panel:
-        condition_label = "condition number of the drive"
-        _draw_stroke_map(right[0], reachable_space, stroke_map.condition, condition_label)
+        _draw_stroke_map(
+            right[0], reachable_space, stroke_map.condition, "condition number of the drive"
+        )
         right[0].sharex(right[1])
         right[0].tick_params(labelbottom=False)
         right[0].set_xlabel("")
@@ -86,14 +87,9 @@ def workspace_figure(reachable_space: Workspace) -> Figure:
 
 def _draw_section(axes: Axes, reachable_space: Workspace, skeleton: Array, points: Array) -> None:
     if reachable_space.area:
-        raster = reachable_space.raster
-        covered = raster.fill_cracks(2 if reachable_space.is_complete else 6)
-        axes.contourf(raster.u, raster.w, covered, [0.5, 1.5], colors=[_REGION_COLOUR], zorder=1)
+        _draw_region(axes, reachable_space, 1.1)
         lines = _grid_images(reachable_space)
         axes.add_collection(LineCollection(lines, colors=_GRID_COLOUR, linewidths=0.6, zorder=2))
-        axes.contour(
-            raster.u, raster.w, covered, [0.5], colors=[RECORDED_COLOUR], linewidths=1.1, zorder=3
-        )
     else:
         stroke = reachable_space.machine.active.index(reachable_space.strokes[0])
         path = reachable_space.section_positions[np.argsort(reachable_space.q_a[:, stroke])]
@@ -135,8 +131,9 @@ def _grid_images(reachable_space: Workspace) -> list[Array]:
     extent = float(np.ptp(reachable_space.section_positions, axis=0).max())
     lines: list[Array] = []
     for rows in (positions, positions.swapaxes(0, 1)):
-        row_indices = np.linspace(0, len(rows) - 1, _GRID_LINE_COUNT + 1).round().astype(int)
-        for row in rows[np.unique(row_indices)]:
+        for row in rows[
+            np.unique(np.linspace(0, len(rows) - 1, _GRID_LINE_COUNT + 1).round().astype(int))
+        ]:
             steps = np.linalg.norm(np.diff(row, axis=0), axis=1)
             gap_indices = np.flatnonzero(~(steps < _MAX_GAP_SHARE * extent)) + 1
             lines += [
@@ -152,8 +149,9 @@ def _section_positions(reachable_space: Workspace, configurations: Iterable[Arra
     positions = []
     for q in configurations:
         pin.forwardKinematics(machine.model, data, machine.coordinates.configuration(q))
-        placement = pin.updateFramePlacement(machine.model, data, frame)
-        positions.append(np.array(placement.translation))
+        positions.append(
+            np.array(pin.updateFramePlacement(machine.model, data, frame).translation)
+        )
     return reachable_space.section.coordinates(np.array(positions))
 
 
@@ -167,8 +165,11 @@ def skeleton_lines(reachable_space: Workspace) -> Array:
         for joint, parent in enumerate(model.parents)
         if parent > 0
     ]
-    loops = machine.closure.equations.loops
-    names = [name for loop in loops for name in (loop.predecessor, loop.successor)]
+    names = [
+        name
+        for loop in machine.closure.equations.loops
+        for name in (loop.predecessor, loop.successor)
+    ]
     for name in [*names, reachable_space.frame]:
         frame = machine.frame(name)
         parent = model.frames[frame].parentJoint
@@ -193,10 +194,26 @@ def _draw_stroke_map(axes: Axes, reachable_space: Workspace, values: Array, labe
         axes.plot(x, values[:, 0], color=RECORDED_COLOUR)
         for curve in stroke_map.curves:
             axes.axvline(curve.q_a[0, strokes[0]] * factors[0], **_CURVE_STYLES[curve.kind])
-        home_value = np.interp(home[0], x, values[:, 0])
-        axes.plot(home[0], home_value, "o", ms=6, color=INK_COLOUR, mfc="white", mew=1.3)
-        top = min(float(np.nanmax(values)), _MAX_SHOWN_CONDITION * float(np.nanmin(values)) + 1)
-        axes.set(xlim=(x[0], x[-1]), ylabel=label, ylim=(0, 1.1 * top))
+        axes.plot(
+            home[0],
+            np.interp(home[0], x, values[:, 0]),
+            "o",
+            ms=6,
+            color=INK_COLOUR,
+            mfc="white",
+            mew=1.3,
+        )
+        axes.set(
+            xlim=(x[0], x[-1]),
+            ylabel=label,
+            ylim=(
+                0,
+                1.1
+                * min(
+                    float(np.nanmax(values)), _MAX_SHOWN_CONDITION * float(np.nanmin(values)) + 1
+                ),
+            ),
+        )
         return
     y = patch.axes[1] * factors[1]
     axes.grid(False)
@@ -214,9 +231,11 @@ def _draw_stroke_map(axes: Axes, reachable_space: Workspace, values: Array, labe
         axes.plot(*(curve.q_a[:, strokes] * factors).T, **_CURVE_STYLES[curve.kind])
     axes.plot(*home, "o", ms=6, color=INK_COLOUR, mfc="white", mew=1.3)
     axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), ylabel=labels[1])
-    is_truncated = is_condition and largest > _MAX_SHOWN_CONDITION
     colour_bar = add_side_colour_bar(
-        axes, mesh, label, extend="max" if is_truncated else "neither"
+        axes,
+        mesh,
+        label,
+        extend="max" if (is_condition and largest > _MAX_SHOWN_CONDITION) else "neither",
     )
     if is_condition:
         ticks = [
@@ -256,6 +275,7 @@ def _add_caption(figure: Figure, reachable_space: Workspace) -> None:
 
 
 _SOIL_COLOUR, _LINE_COLOUR = "#8a6d4b", "#666666"
+_VERTICAL_WORDS = ("depth", "height")
 _LINE_GAP_SHARE = 0.055  # between dimension lines, of the drawing's larger extent
 
 
@@ -275,7 +295,10 @@ def working_range_figure(result: WorkingRange) -> Figure:
     gap = _LINE_GAP_SHARE * float((upper - lower).max())
     figure = Figure(figsize=(9.6, 6.8), layout="constrained")
     axes = figure.subplots()
-    _draw_reach(axes, reach, skeleton)
+    _draw_region(axes, reach, 1.2)
+    for line in skeleton:
+        axes.plot(*line.T, color=INK_COLOUR, linewidth=1.6, solid_capstyle="round", zorder=5)
+    axes.plot(*skeleton.reshape(-1, 2).T, "o", ms=2.6, color=INK_COLOUR, zorder=5)
     letters = dict(zip(string.ascii_uppercase, result.dimensions, strict=False))
     right = _draw_vertical_lines(axes, letters, result.ground_height, max(upper[0], 0.0), gap)
     axes.plot(
@@ -283,7 +306,11 @@ def working_range_figure(result: WorkingRange) -> Figure:
         zorder=4,
     )  # fmt: skip
     bottom, top = _draw_horizontal_lines(axes, letters, lower[1], upper[1], gap)
-    _draw_level_bottom(axes, result)
+    for dimension in result.dimensions:
+        if "level bottom" in dimension.name:
+            u, w = dimension.section_position
+            style: Any = {"color": DASHED_STYLE["color"], "linewidth": 1.8, "zorder": 6}
+            axes.plot([u, u + result.level_length], [w, w], **style)
     names = reach.section.coordinate_names
     axes.set(xlim=(lower[0] - gap, right), ylim=(bottom, top), aspect="equal",
              xlabel=f"{names[0]} [m]", ylabel=f"{names[1]} [m]")  # fmt: skip
@@ -296,73 +323,51 @@ def working_range_figure(result: WorkingRange) -> Figure:
     return figure
 
 
-def _draw_reach(axes: Axes, reach: Workspace, skeleton: Array) -> None:
+def _draw_region(axes: Axes, reach: Workspace, line_width: float) -> None:
+    """Draw the region of the section that is reached, with its border."""
     raster = reach.raster
     covered = raster.fill_cracks(2 if reach.is_complete else 6)
     axes.contourf(raster.u, raster.w, covered, [0.5, 1.5], colors=[_REGION_COLOUR], zorder=1)
-    axes.contour(
-        raster.u, raster.w, covered, [0.5], colors=[RECORDED_COLOUR], linewidths=1.2, zorder=3
-    )
-    for line in skeleton:
-        axes.plot(*line.T, color=INK_COLOUR, linewidth=1.6, solid_capstyle="round", zorder=5)
-    axes.plot(*skeleton.reshape(-1, 2).T, "o", ms=2.6, color=INK_COLOUR, zorder=5)
-
-
-def _is_vertical(dimension: Dimension) -> bool:
-    return any(word in dimension.name for word in ("depth", "height"))
+    style: Any = {"colors": [RECORDED_COLOUR], "linewidths": line_width, "zorder": 3}
+    axes.contour(raster.u, raster.w, covered, [0.5], **style)
 
 
 def _draw_vertical_lines(
     axes: Axes, letters: Mapping[str, Dimension], ground: float, right: float, gap: float
 ) -> float:
-    """Draw lines on the right of the reach, and return the right end of the drawing."""
-    columns = _dimension_columns({a: x for a, x in letters.items() if _is_vertical(x)}, ground)
-    for k, column in enumerate(columns):
-        u = right + gap * (k + 1)
-        for letter, dimension in column:
+    """Draw lines on the right of the reach, and return the right end of the drawing.
+
+    Dimensions above and below ground share a line, the shortest first.
+    """
+    counts = {False: 0, True: 0}
+    for letter, dimension in sorted(letters.items(), key=lambda item: item[1].value):
+        if any(word in dimension.name for word in _VERTICAL_WORDS):
             position = dimension.section_position
+            is_above = bool(position[1] > ground)
+            counts[is_above] += 1
+            u = right + gap * counts[is_above]
             _draw_dimension_line(axes, letter, (u, ground), (u, position[1]), position)
-    return right + gap * (len(columns) + 0.7)
+    return right + gap * (max(counts.values()) + 0.7)
 
 
 def _draw_horizontal_lines(
     axes: Axes, letters: Mapping[str, Dimension], bottom: float, top: float, gap: float
 ) -> tuple[float, float]:
     """Draw lines below and above the reach, and return the vertical limits of the drawing."""
-    horizontal = {a: x for a, x in letters.items() if not _is_vertical(x)}
-    heights = [bottom, top]
-    for is_above, edge, direction in ((False, bottom, -1.0), (True, top, 1.0)):
-        items = [(a, x) for a, x in horizontal.items() if ("slewing" in x.name) == is_above]
-        for k, (letter, dimension) in enumerate(sorted(items, key=lambda item: item[1].value)):
-            w, position = edge + direction * gap * (k + 1), dimension.section_position
+    heights = {False: bottom, True: top}
+    has_lines = False
+    for letter, dimension in sorted(letters.items(), key=lambda item: item[1].value):
+        if not any(word in dimension.name for word in _VERTICAL_WORDS):
+            is_above, position = "slewing" in dimension.name, dimension.section_position
+            has_lines = True
+            heights[is_above] += gap if is_above else -gap
+            w = heights[is_above]
             _draw_dimension_line(axes, letter, (0.0, w), (position[0], w), position)
-            heights.append(w)
-    limits = min(heights) - gap, max(heights) + gap
-    if horizontal:
+    limits = heights[False] - gap, heights[True] + gap
+    if has_lines:
         style: Any = {"color": _LINE_COLOUR, "linewidth": 0.8, "linestyle": (0, (8, 2, 1, 2))}
         axes.plot([0, 0], limits, zorder=2, **style)
     return limits
-
-
-def _dimension_columns(
-    vertical: dict[str, Dimension], ground_height: float
-) -> list[list[tuple[str, Dimension]]]:
-    """Return pairs of dimensions above and below ground that share a line, shortest first."""
-    sides = [
-        sorted(
-            (
-                item
-                for item in vertical.items()
-                if (item[1].section_position[1] > ground_height) == is_above
-            ),
-            key=lambda item: item[1].value,
-        )
-        for is_above in (False, True)
-    ]
-    return [
-        [side[k] for side in sides if k < len(side)]
-        for k in range(max(len(side) for side in sides))
-    ]
 
 
 def _draw_dimension_line(
@@ -390,19 +395,3 @@ def _draw_dimension_line(
         letter, middle, ha="center", va="center", fontsize=9, fontweight="bold", zorder=7,
         bbox={"boxstyle": "circle,pad=0.15", "facecolor": "white", "edgecolor": "none"},
     )  # fmt: skip
-
-
-def _draw_level_bottom(axes: Axes, result: WorkingRange) -> None:
-    for dimension in result.dimensions:
-        if "level bottom" in dimension.name:
-            line_ends = [
-                dimension.section_position[0],
-                dimension.section_position[0] + result.level_length,
-            ]
-            axes.plot(
-                line_ends,
-                [dimension.section_position[1]] * 2,
-                color=DASHED_STYLE["color"],
-                linewidth=1.8,
-                zorder=6,
-            )

@@ -62,8 +62,11 @@ def place_labels(canvas: SketchCanvas, labels: Sequence[SketchLabel]) -> None:
             path_effects=[withStroke(linewidth=2.0, foreground="white")],
         )
         texts.append(text)
-        half_size = np.array(text.get_window_extent(renderer).size) / 2 * 72 / figure.dpi * point
-        candidates, gaps = _candidates(label, half_size, point)
+        candidates, gaps = _candidates(
+            label,
+            np.array(text.get_window_extent(renderer).size) / 2 * 72 / figure.dpi * point,
+            point,
+        )
         boxes.append(candidates)
         costs.append(_placement_costs(canvas, label, candidates, gaps))
     chosen = _choose_candidates(boxes, costs, point)
@@ -72,19 +75,28 @@ def place_labels(canvas: SketchCanvas, labels: Sequence[SketchLabel]) -> None:
         nearest = np.clip(label.position, lower, upper)
         distance = float(np.linalg.norm(nearest - label.position)) / point
         if distance > label.radius + _LEADER_LINE_GAP:
-            start = label.position + (nearest - label.position) * label.radius / distance
-            axes.plot(*np.array([start, nearest]).T, color=GREY, linewidth=0.6, zorder=8)
+            axes.plot(
+                *np.array(
+                    [
+                        label.position + (nearest - label.position) * label.radius / distance,
+                        nearest,
+                    ]
+                ).T,
+                color=GREY,
+                linewidth=0.6,
+                zorder=8,
+            )
 
 
 def _candidates(label: SketchLabel, half_size: Array, point_size: float) -> tuple[Array, Array]:
     """Return boxes (k, 2, 2) as lower and upper corners [m], and their gaps (k,) [points]."""
     directions = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
     # a box whose nearest point lies in that direction: corners for slanted ones, sides for others
-    corner_directions = np.clip(1.6 * directions, -1, 1)
     gaps = np.repeat(_RING_GAPS, len(_ANGLES))
-    distances = (label.radius + gaps)[:, None] * point_size
-    centres = label.position + np.tile(directions, (len(_RING_GAPS), 1)) * distances
-    centres = centres + np.tile(corner_directions, (len(_RING_GAPS), 1)) * half_size
+    centres = label.position + np.tile(directions, (len(_RING_GAPS), 1)) * (
+        (label.radius + gaps)[:, None] * point_size
+    )
+    centres = centres + np.tile(np.clip(1.6 * directions, -1, 1), (len(_RING_GAPS), 1)) * half_size
     return np.stack([centres - half_size, centres + half_size], axis=1), gaps
 
 
@@ -117,16 +129,22 @@ def _choose_candidates(
     for sweep in range(_MAX_SWEEPS):
         previous = dict(chosen)
         for i in sorted(range(len(boxes)), key=lambda i: -float(costs[i].min())):
-            cost = costs[i]
-            for j, best_index in chosen.items():
-                if j != i:
-                    lower, upper = boxes[j][best_index]
-                    gap = np.maximum(boxes[i][:, 0] - upper, lower - boxes[i][:, 1]).max(axis=1)
-                    cost = cost + np.where(gap < 4 * point_size, 1000.0, 0)
+            others = [boxes[j][best_index] for j, best_index in chosen.items() if j != i]
+            cost = _costs_with_labels(others, boxes[i], costs[i], point_size)
             chosen[i] = int(cost.argmin())
         if sweep and chosen == previous:
             break
     return [candidates[chosen[i]] for i, candidates in enumerate(boxes)]
+
+
+def _costs_with_labels(
+    other_boxes: Sequence[Array], boxes: Array, cost: Array, point_size: float
+) -> Array:
+    """Return costs (k,) of boxes (k, 2, 2) of a label, with other labels in boxes (2, 2)."""
+    for lower, upper in other_boxes:
+        gap = np.maximum(boxes[:, 0] - upper, lower - boxes[:, 1]).max(axis=1)
+        cost = cost + np.where(gap < 4 * point_size, 1000.0, 0)
+    return cost
 
 
 def _length_inside(segment: Array, lower: Array, upper: Array) -> Array:
@@ -137,8 +155,10 @@ def _length_inside(segment: Array, lower: Array, upper: Array) -> Array:
     entry = np.where(direction == 0, -np.inf, np.fmin(*crossings)).max(axis=1)
     end = np.where(direction == 0, np.inf, np.fmax(*crossings)).min(axis=1)
     share = np.maximum(np.minimum(end, 1.0) - np.maximum(entry, 0.0), 0.0)
-    is_outside = ((direction == 0) & ((start < lower) | (start > upper))).any(axis=1)
-    return np.asarray(np.where(is_outside, 0.0, share) * np.linalg.norm(direction))
+    return np.asarray(
+        np.where(((direction == 0) & ((start < lower) | (start > upper))).any(axis=1), 0.0, share)
+        * np.linalg.norm(direction)
+    )
 
 
 def find_clear_point(

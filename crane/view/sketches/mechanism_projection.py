@@ -73,9 +73,14 @@ class _MechanismProjection:
         for index, (joint, position) in enumerate(self.loop_frames):
             self.points[joint].append(position)
             if index % 2:
-                name = self.machine.closure.equations.loops[index // 2].name
-                mate = self.loop_frames[index - 1][1]
-                pins.append(SketchPin(name, mate, position, index // 2 + 1))
+                pins.append(
+                    SketchPin(
+                        self.machine.closure.equations.loops[index // 2].name,
+                        self.loop_frames[index - 1][1],
+                        position,
+                        index // 2 + 1,
+                    )
+                )
         if self.tip is not None:
             self.points[self.tip_body].append(self.tip)
         joints = range(1, len(self.parents))
@@ -92,7 +97,7 @@ class _MechanismProjection:
         ground = [
             (at, np.array([0.0, -1.0])) for at in _distinct_points(self.points[0], self.size)
         ]
-        if self._has_base():
+        if collars and self._has_base():
             base_point, collar = self.outer[0][0], collars[0]
             ground = [item for item in ground if np.abs(item[0] - collar.position).max() > 0]
             position = self.origins[1]
@@ -104,7 +109,14 @@ class _MechanismProjection:
             if len(base_line := _distinct_points([base_point, collar.position], self.size)) > 1:
                 bodies.append(SketchBody(base_line, -1, False, base_point))
         return SketchMechanism(
-            pins, collars, slides, bodies, ground, self._regions(), self.tip, self.size
+            pins,
+            collars,
+            slides,
+            bodies,
+            ground,
+            self._regions(),
+            self.tip,
+            self.size,
         )
 
     def _project_placement(self, joint: int, placement: pin.SE3) -> Array:
@@ -126,12 +138,11 @@ class _MechanismProjection:
         return outer_points
 
     def _has_base(self) -> bool:
-        """Return whether the first joint is revolute about an axis through the world's origin."""
+        """Return whether the first joint axis goes through the world's origin."""
         first, axis = self.origins[1], self.axes[1]
         tolerance = COINCIDENCE_TOLERANCE * self.machine.closure.characteristic_length
         return bool(
-            self.turns[1]
-            and self.axis_cosines[1] < _MIN_PIN_COSINE
+            self.axis_cosines[1] < _MIN_PIN_COSINE
             and np.linalg.norm(first - (first @ axis) * axis) < tolerance
         )
 
@@ -156,8 +167,11 @@ class _MechanismProjection:
         position, parent = self.origins[joint], self.parents[joint]
         pins = [*self.outer[joint], *([self.origins[parent]] if parent else [])]
         previous_origin = self.origins[parent] if parent else self.outer[0][0]
-        axial_distances = [float((point - previous_origin) @ axis) for point in self.outer[joint]]
-        length = max(axial_distances, key=abs, default=0.0)
+        length = max(
+            [float((point - previous_origin) @ axis) for point in self.outer[joint]],
+            key=abs,
+            default=0.0,
+        )
         min_distance = _COLLAR_DISTANCE_SHARE * self.size
         if (
             (parent == 0 and not (joint == 1 and self._has_base()))
@@ -236,8 +250,9 @@ class _MechanismProjection:
         """Return the corners that each loop encloses: its pin and those of both branches."""
         regions = {}
         supports = self.model.supports
-        pairs = zip(self.loop_frames[::2], self.loop_frames[1::2], strict=True)
-        for number, ((first_joint, position), (second_joint, _)) in enumerate(pairs, start=1):
+        for number, ((first_joint, position), (second_joint, _)) in enumerate(
+            zip(self.loop_frames[::2], self.loop_frames[1::2], strict=True), start=1
+        ):
             shared = set(supports[first_joint]) & set(supports[second_joint])
             paths = [
                 [j for j in reversed(list(supports[body])) if j not in shared and self.turns[j]]

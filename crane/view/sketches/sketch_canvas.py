@@ -81,26 +81,31 @@ class SketchCanvas:
         """Draw a revolute joint whose axis lies in the plane."""
         axis_point = axis * self.point_size
         self.draw_box(position - 7 * axis_point, position + 7 * axis_point, 11.0, INK_COLOUR, 4.5)
-        axis_line = np.array([position - 20 * axis_point, position + 20 * axis_point])
-        self.draw_line(axis_line, INK_COLOUR, 0.8, linestyle=(0, (8, 2, 1.5, 2)), zorder=5)
+        self.draw_line(
+            np.array([position - 20 * axis_point, position + 20 * axis_point]),
+            INK_COLOUR,
+            0.8,
+            linestyle=(0, (8, 2, 1.5, 2)),
+            zorder=5,
+        )
         self.draw_marker(position, 4.0, f"joint {name}", DOT_MARKER | {"markersize": 0.1}, 7.0)
 
     def draw_ground(
         self, position: Array, down_direction: Array, ground_gap: float | None
     ) -> None:
         """Draw the ground: a support under a pin, or a hatched line below a point [points]."""
-        lateral = self.point_size * np.array([-down_direction[1], down_direction[0]])
+        lateral = np.array([-down_direction[1], down_direction[0]])
         gap = 11.0 if ground_gap is None else ground_gap
         ground_point = position + gap * self.point_size * down_direction
         if ground_gap is None:
-            support = np.array([position, ground_point - 7 * lateral, ground_point + 7 * lateral])
+            width = 7 * self.point_size * lateral
+            support = np.array([position, ground_point - width, ground_point + width])
             self.axes.add_patch(
                 Polygon(support, facecolor="white", edgecolor=INK_COLOUR, linewidth=1.2, zorder=2)
             )
             self.occupied_segments += [support[[0, 1]], support[[0, 2]]]
-        self.draw_hatching(
-            ground_point - 15 * lateral, ground_point + 15 * lateral, down_direction
-        )
+        half_length = 15 * self.point_size * lateral
+        self.draw_hatching(ground_point - half_length, ground_point + half_length, down_direction)
 
     def draw_hatching(self, start: Array, end: Array, down_direction: Array) -> None:
         """Draw a line from start to end [m], hatched on the side of a unit vector."""
@@ -109,10 +114,17 @@ class SketchCanvas:
         count = max(int(np.linalg.norm(end - start) / (5 * self.point_size)), 2)
         for share in (np.arange(count) + 0.9) / count:
             line_point = start + share * (end - start)
-            stroke = np.array(
-                [line_point, line_point + 6 * self.point_size * (down_direction - 0.8 * direction)]
+            self.axes.plot(
+                *np.array(
+                    [
+                        line_point,
+                        line_point + 6 * self.point_size * (down_direction - 0.8 * direction),
+                    ]
+                ).T,
+                color=INK_COLOUR,
+                linewidth=0.7,
+                zorder=2,
             )
-            self.axes.plot(*stroke.T, color=INK_COLOUR, linewidth=0.7, zorder=2)
         offset = 3 * self.point_size * down_direction
         self.occupied_segments.append(np.array([start + offset, end + offset]))
         self.occupied_segments.append(np.array([start + 2 * offset, end + 2 * offset]))
@@ -163,18 +175,22 @@ def marker_options(style: dict[str, Any]) -> dict[str, Any]:
 def convex_hull(points: Array) -> Array:
     """Return the corners (k, 2) of the convex hull of points (n, 2), counterclockwise."""
     ordered = sorted(map(tuple, points.tolist()))
-    hull: list[HullCorner] = []
-    for row in (ordered, ordered[::-1]):
-        chain: list[HullCorner] = []
-        for x, y in row:
-            while len(chain) > 1:
-                (a, b), (c, d) = chain[-2:]
-                if (c - a) * (y - b) - (d - b) * (x - a) > 0:
-                    break
-                chain.pop()
-            chain.append((x, y))
-        hull += chain[:-1]
-    return np.array(hull or ordered)
+    return np.array(_half_hull(ordered) + _half_hull(ordered[::-1]) or ordered)
+
+
+def _half_hull(ordered: Sequence[HullCorner]) -> list[HullCorner]:
+    """Return the lower hull of points from left to right, without the last one."""
+    chain: list[HullCorner] = []
+    for corner in ordered:
+        while len(chain) > 1 and not _turns_left(chain[-2], chain[-1], corner):
+            chain.pop()
+        chain.append(corner)
+    return chain[:-1]
+
+
+def _turns_left(one: HullCorner, two: HullCorner, three: HullCorner) -> bool:
+    (a, b), (c, d), (x, y) = one, two, three
+    return (c - a) * (y - b) - (d - b) * (x - a) > 0
 
 
 _MAX_WIDTH, _MAX_HEIGHT, _MIN_WIDTH = 454.0, 353.0, 331.0  # of the axes [points]
@@ -271,7 +287,7 @@ def create_sketch_layout(
 
 def _mechanism_bounds(mechanism: SketchMechanism) -> tuple[Array, Array]:
     """Return the lower and upper corner (2,) of all points [m]."""
-    points = [item.position for item in (*mechanism.pins, *mechanism.collars)]
+    points = [x.position for x in mechanism.pins] + [x.position for x in mechanism.collars]
     points += [end for x in mechanism.slides for end in (x.start, x.mouth, x.rod_outer_end)]
     points += [corner for body in mechanism.bodies for corner in body.points]
     points += [position for position, _ in mechanism.ground]

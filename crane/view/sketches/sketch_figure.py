@@ -127,8 +127,14 @@ def sketch_figure(
     )
     # small regions above large ones
     for number, corners in sorted(mechanism.regions.items(), key=lambda x: -_polygon_area(x[1])):
-        tint = REGION_COLOURS[(number - 1) % len(REGION_COLOURS)]
-        canvas.axes.add_patch(Polygon(corners, facecolor=tint, linewidth=0, zorder=1))
+        canvas.axes.add_patch(
+            Polygon(
+                corners,
+                facecolor=REGION_COLOURS[(number - 1) % len(REGION_COLOURS)],
+                linewidth=0,
+                zorder=1,
+            )
+        )
     for i, ghost in enumerate(ghosts):
         _draw_ghost(canvas, ghost, mechanism, i)
     for body in sorted(mechanism.bodies, key=lambda body: body.carries_tip):
@@ -139,10 +145,9 @@ def sketch_figure(
         canvas.draw_ground(position, down_direction, _ground_gap(mechanism, position))
     for item in mechanism.collars:
         canvas.draw_collar(item.name, item.position, item.axis)
-    if show_centres_of_mass:
-        for body in mechanism.bodies:
-            if body.chain >= 0:
-                _draw_centre_of_mass(canvas, body.centre_of_mass)
+    for body in mechanism.bodies:
+        if show_centres_of_mass and body.chain >= 0:
+            _draw_centre_of_mass(canvas, body.centre_of_mass)
     if mechanism.tip is not None:
         canvas.draw_marker(mechanism.tip, 5.4, "tip", TIP_MARKER, 6.0)
     _draw_pins(canvas, mechanism)
@@ -198,8 +203,10 @@ def _draw_ghost(
 
 
 def _outlines(mechanism: SketchMechanism) -> list[Array]:
-    slides = (np.array([x.start, x.rod_outer_end]) for x in mechanism.slides)
-    return [*(body.points for body in mechanism.bodies), *slides]
+    return [
+        *(body.points for body in mechanism.bodies),
+        *(np.array([x.start, x.rod_outer_end]) for x in mechanism.slides),
+    ]
 
 
 def _number_regions(canvas: SketchCanvas, mechanism: SketchMechanism) -> None:
@@ -223,8 +230,11 @@ def _ground_gap(mechanism: SketchMechanism, position: Array) -> float | None:
     tolerance = COINCIDENCE_TOLERANCE * mechanism.size
     if any(np.abs(x.position - position).max() < tolerance for x in mechanism.pins):
         return None
-    is_on_collar = (np.abs(x.position - position).max() < tolerance for x in mechanism.collars)
-    return 7.0 if any(is_on_collar) else 0.0
+    return (
+        7.0
+        if any(np.abs(x.position - position).max() < tolerance for x in mechanism.collars)
+        else 0.0
+    )
 
 
 def _draw_centre_of_mass(canvas: SketchCanvas, position: Array) -> None:
@@ -328,15 +338,24 @@ def _create_labels(mechanism: SketchMechanism) -> list[SketchLabel]:
     for x in mechanism.pins:
         if number := x.loop_number:
             number_text = chr(0x2460 + number - 1) if number <= 20 else f"({number})"
-            text = f"{number_text} {format_joint_symbol(x.name)}"
-            labels.append(SketchLabel(text, x.position, 6.0, "label"))
+            labels.append(
+                SketchLabel(
+                    f"{number_text} {format_joint_symbol(x.name)}", x.position, 6.0, "label"
+                )
+            )
     labels += [
         SketchLabel(format_joint_symbol(item.name), item.position, 8.0, "label")
         for item in mechanism.collars
     ]
     for slide in mechanism.slides:
-        middle = slide.rod_inner_end if slide.is_rail else (slide.start + slide.mouth) / 2
-        labels.append(SketchLabel(format_joint_symbol(slide.name), middle, 6.0, "label"))
+        labels.append(
+            SketchLabel(
+                format_joint_symbol(slide.name),
+                slide.rod_inner_end if slide.is_rail else (slide.start + slide.mouth) / 2,
+                6.0,
+                "label",
+            )
+        )
     if mechanism.tip is not None:
         labels.append(SketchLabel("tip", mechanism.tip, 7.0, "label tip"))
     return labels

@@ -155,14 +155,22 @@ class CircuitCanvas:
         self, points: Sequence[ArrayLike], is_filled: bool = False, **options: Any
     ) -> None:
         """Draw a closed outline, white or filled."""
-        style = {
-            "facecolor": INK_COLOUR if is_filled else "white",
-            "edgecolor": INK_COLOUR,
-            "linewidth": 0.8,
-            "zorder": 3.0,
-            "joinstyle": "miter",
-        } | options
-        self.axes.add_patch(Polygon(np.array(points, dtype=float), closed=True, **style))
+        self.axes.add_patch(
+            Polygon(
+                np.array(points, dtype=float),
+                closed=True,
+                **(
+                    {
+                        "facecolor": INK_COLOUR if is_filled else "white",
+                        "edgecolor": INK_COLOUR,
+                        "linewidth": 0.8,
+                        "zorder": 3.0,
+                        "joinstyle": "miter",
+                    }
+                    | options
+                ),
+            )
+        )
 
     def draw_box(self, corner: SheetPoint, opposite_corner: SheetPoint, **options: Any) -> None:
         """Draw a white rectangle with sides along the sheet."""
@@ -171,13 +179,21 @@ class CircuitCanvas:
 
     def draw_circle(self, position: SheetPoint, radius: float, **options: Any) -> None:
         """Draw a circle, white by default."""
-        style = {
-            "facecolor": "white",
-            "edgecolor": INK_COLOUR,
-            "linewidth": 0.8,
-            "zorder": 3.0,
-        } | options
-        self.axes.add_patch(Circle(position, radius, **style))
+        self.axes.add_patch(
+            Circle(
+                position,
+                radius,
+                **(
+                    {
+                        "facecolor": "white",
+                        "edgecolor": INK_COLOUR,
+                        "linewidth": 0.8,
+                        "zorder": 3.0,
+                    }
+                    | options
+                ),
+            )
+        )
 
     def draw_arrow(
         self, start: SheetPoint, end: SheetPoint, *, size: float = 3.2, **options: Any

@@ -218,8 +218,14 @@ class _CircuitDrawing:
             lane = left + 5.0 * (risers.index(net) if net in risers else len(risers))
             heights = [row[net] for row in rail_heights_by_row if net in row]
             for y in heights:
-                wires = [wire for wire in canvas.wires if wire.net == net]
-                ends = sorted({end[0] for w in wires for end in (w.start, w.end) if end[1] == y})
+                ends = sorted(
+                    {
+                        end[0]
+                        for w in [wire for wire in canvas.wires if wire.net == net]
+                        for end in (w.start, w.end)
+                        if end[1] == y
+                    }
+                )
                 for first, second in itertools.pairwise([lane, *ends]):
                     canvas.draw_wire(net, (first, y), (second, y), is_signal=is_signal)
                 canvas.draw_text(left - 4, y, label, f"rail {net}", ha="right")
@@ -261,11 +267,12 @@ def _split_into_rows(functions: Sequence[CircuitFunction]) -> list[list[CircuitF
             supply = function.valve.supply
             inlet_net = f"C {supply} {counts[supply]}" if counts[supply] else supply
             counts[supply] += 1
-            outlet_net = f"C {supply} {counts[supply]}"
-            function = replace(function, centre_nets=(inlet_net, outlet_net))
+            function = replace(function, centre_nets=(inlet_net, f"C {supply} {counts[supply]}"))
         connected.append(function)
-    indices = np.array_split(range(len(functions)), -(-len(functions) // _FUNCTIONS_PER_ROW))
-    return [[connected[i] for i in row] for row in indices]
+    return [
+        [connected[i] for i in row]
+        for row in np.array_split(range(len(functions)), -(-len(functions) // _FUNCTIONS_PER_ROW))
+    ]
 
 
 def _pack_items(items: Sequence[SupplyItem], max_width: float) -> list[list[SupplyItem]]:

@@ -178,8 +178,13 @@ class CircuitSection:
                 valve_symbols.draw_relief_valve(
                     canvas, pose, f"cross {joint}.{inlet}", nets, paths
                 )
-            text = f"Δp {format_pressure(self._function.cylinder.cross_relief)}"
-            canvas.draw_text(text_x, y + 23, text, f"label cross {joint}", ha="left")
+            canvas.draw_text(
+                text_x,
+                y + 23,
+                f"Δp {format_pressure(self._function.cylinder.cross_relief)}",
+                f"label cross {joint}",
+                ha="left",
+            )
         elif kind == "regeneration":
             component, middle = f"regeneration {joint}", y + 10
             paths = [(self._lanes["b"], middle)], [(self._lanes["a"], middle)]
@@ -208,8 +213,7 @@ class CircuitSection:
             path = [(lane, top), (position, top)]
             middle = top - valve_symbols.RELIEF_HALF_LENGTH - 3
             pose = SymbolPose(position, middle, 2, is_mirrored=sign < 0)
-            nets = net, TANK_NODE
-            valve_symbols.draw_relief_valve(canvas, pose, component, nets, (path, []))
+            valve_symbols.draw_relief_valve(canvas, pose, component, (net, TANK_NODE), (path, []))
             valve_symbols.draw_tank(
                 canvas,
                 ((position, middle - valve_symbols.RELIEF_HALF_LENGTH)),
@@ -312,9 +316,11 @@ class CircuitSection:
             )
             texts = [f"{format_area(cylinder.area_a)} | {format_area(cylinder.area_b)} cm²"]
         if function.stroke < 1e6 and not cylinder.motor:
-            stroke_text = f"stroke {format_number(1e3 * function.stroke)} mm"
-            angle_text = f"{format_number(function.stroke * 57.29578)}°"
-            texts.append(angle_text if function.is_revolute else stroke_text)
+            texts.append(
+                f"{format_number(function.stroke * 57.29578)}°"
+                if function.is_revolute
+                else f"stroke {format_number(1e3 * function.stroke)} mm"
+            )
         canvas.draw_labels(
             (x, y + TOP_HEIGHT - NAME_TEXT_SIZE / 2), component,
             format_joint_symbol(function.joint), map(escape_label, texts), SECTION_WIDTH - 8,

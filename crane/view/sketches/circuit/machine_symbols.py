@@ -38,8 +38,10 @@ def draw_regulator(
         canvas.draw_line(
             [(left, y + 6), (left, y - 6), (left + 13, y - 6)], gid=f"{component} power"
         )
-        values = [1.5 + 1.2 * k for k in range(9)]
-        canvas.draw_line([(left + s, y - 6 + 15.0 / s) for s in values], linewidth=1.1)
+        canvas.draw_line(
+            [(left + s, y - 6 + 15.0 / s) for s in [1.5 + 1.2 * k for k in range(9)]],
+            linewidth=1.1,
+        )
 
 
 def draw_engine(canvas: CircuitCanvas, position: SheetPoint, component: str) -> None:
@@ -81,9 +83,14 @@ def draw_rotary_drive(
 ) -> None:
     """Draw a rotary drive of limited angle, its shaft upwards."""
     pose, half_height = SymbolPose(*position), BARREL_HALF_HEIGHT
-    angles = [k * math.pi / 24 for k in range(25)]
     canvas.draw_shape(
-        pose(*[(18 * math.cos(t), -half_height + 16 * math.sin(t)) for t in angles]), gid=component
+        pose(
+            *[
+                (18 * math.cos(t), -half_height + 16 * math.sin(t))
+                for t in [k * math.pi / 24 for k in range(25)]
+            ]
+        ),
+        gid=component,
     )
     _draw_ports(canvas, pose, component, nets)
     for sign in (-1, 1):
@@ -149,8 +156,9 @@ def draw_accumulator(
     """Draw an accumulator with gas above its diaphragm, its port below."""
     pose = SymbolPose(*position)
     canvas.add_port(component, net, pose.transform_point(0, -17))
-    angles = [k * math.pi / 16 for k in range(17)]
-    upper_half = [(8 * math.cos(t), 9 + 8 * math.sin(t)) for t in angles]
+    upper_half = [
+        (8 * math.cos(t), 9 + 8 * math.sin(t)) for t in [k * math.pi / 16 for k in range(17)]
+    ]
     canvas.draw_shape(pose(*upper_half, *((-x, -y) for x, y in upper_half)), gid=component)
     canvas.draw_line(pose((-8, 0), (8, 0)))
     canvas.draw_shape(pose((-3.6, 11), (3.6, 11), (0, 4.5)))

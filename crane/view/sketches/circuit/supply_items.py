@@ -65,15 +65,15 @@ def create_supply_items(
     if hydraulics.engine is not None:
         items.append(_create_engine(hydraulics.engine))
     for i, (name, supply) in enumerate(hydraulics.pumps.items()):
-        has_load_sensing = supply.control == "load-sensing" and any(
-            x.has_load_sensing for x in functions if x.valve.supply == name
-        )
         # to the previous pump, to the engine, or to an unknown drive
         items.append(
             _create_pump(
                 name,
                 supply,
-                has_load_sensing,
+                (
+                    supply.control == "load-sensing"
+                    and any(x.has_load_sensing for x in functions if x.valve.supply == name)
+                ),
                 116.0 if i else 64.0 if hydraulics.engine is not None else 24.0,
             )
         )
@@ -240,17 +240,27 @@ def _create_element(name: str, element: CircuitElement) -> SupplyItem:
             pose = SymbolPose(position, y - 20, 2 if ends_in_tank else 0, ends_in_tank)
             paths = [(position, rails[net])], ()
             _draw_element(canvas, element, pose, component, paths if ends_in_tank else paths[::-1])
-            bottom = (position, y - 20 - _HALF_LENGTHS.get(element.kind, THROTTLE_HALF_LENGTH))
-            valve_symbols.draw_tank(canvas, bottom, f"tank {component}", TANK_NODE, drop=4)
+            valve_symbols.draw_tank(
+                canvas,
+                (position, y - 20 - _HALF_LENGTHS.get(element.kind, THROTTLE_HALF_LENGTH)),
+                f"tank {component}",
+                TANK_NODE,
+                drop=4,
+            )
         else:
-            lanes = zip(nets, (position - 18, position + 18), strict=True)
             source_path, target_path = (
-                [(lane, rails[net]), (lane, y - 24)] for net, lane in lanes
+                [(lane, rails[net]), (lane, y - 24)]
+                for net, lane in zip(nets, (position - 18, position + 18), strict=True)
             )
             pose = SymbolPose(position, y - 24, 3, is_mirrored=True)
             _draw_element(canvas, element, pose, component, (source_path, target_path))
-        labels = [escape_label(text) for text in texts]
-        canvas.draw_labels((position, y - 52), component, escape_label(name), labels, 62)
+        canvas.draw_labels(
+            (position, y - 52),
+            component,
+            escape_label(name),
+            [escape_label(text) for text in texts],
+            62,
+        )
 
     wires = [(nets[0], 16.0), (nets[1], 52.0)]
     if TANK_NODE in nets:
