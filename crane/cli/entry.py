@@ -39,8 +39,8 @@ Simulate, identify, rate and design machines with closed kinematic chains.
 {commands}
 
 crane COMMAND --help shows arguments and options. --version shows the version.
-All commands take --strict (reject physically impossible inertias), --trust-xacro
-(allow xacro files to run Python) and --debug.
+All commands take --strict (reject physically impossible inertias),
+--trust-xacro (allow xacro files to run Python) and --debug.
 """
 
 
