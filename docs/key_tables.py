@@ -52,7 +52,7 @@ def _section(path: str) -> SectionSchema:
 
 def _key_rows(section: SectionSchema) -> list[tuple[str, ...]]:
     has_ranges = any(getattr(key, "plausible", None) for key in section.keys.values())
-    head = ("key", "type, unit", *["usual"] * has_ranges, "default", "meaning")
+    head = ("key", "type, unit", *["usual range"] * has_ranges, "default", "meaning")
     rows = [head, ("---",) * len(head)]
     for name, key in section.keys.items():
         usual = [_usual_text(name, section.component)] * has_ranges
@@ -114,8 +114,8 @@ def _unit_rows() -> list[tuple[str, ...]]:
     units: dict[str, dict[str, None]] = {}
     for quantity in (*PLAUSIBLE_RANGES.values(), *ROTARY_RANGES.values()):
         names = [name for group in quantity.other_units for name, _ in group]
-        units.setdefault(quantity.unit or "a share", {}).update(dict.fromkeys(names))
-    rows = [("number in", "units that are tried"), ("---", "---")]
+        units.setdefault(quantity.unit or "dimensionless", {}).update(dict.fromkeys(names))
+    rows = [("SI unit", "other units tried"), ("---", "---")]
     rows += [(unit, ", ".join(names)) for unit, names in units.items() if names]
     return rows
 

@@ -57,7 +57,7 @@ def info(
         typer.Argument(
             metavar="[PATTERN]",
             help="List joints, frames, columns and parameters whose names contain this text, or "
-            "match it where it has * or ?.",
+            "match it if it contains * or ?.",
         ),
     ] = None,
     parameters: Annotated[
@@ -162,13 +162,13 @@ def cylinder(
         float | None,
         typer.Option(
             metavar="M",
-            help="Length between the pins when retracted in m; stroke and four bores by default.",
+            help="Retracted length between the pins in m; by default the stroke plus four bores.",
         ),
     ] = None,
 ) -> None:
-    """Add a hydraulic cylinder of steel between two points.
+    """Add a hydraulic steel cylinder between two points.
 
-    The cylinder becomes the actuator in place of the joint that it turns.
+    The cylinder becomes the actuator, instead of the joint that it rotates.
     """
     print(
         crane.formats.add_cylinder(

@@ -41,7 +41,7 @@ def study(
         list[str] | None,
         typer.Option(
             metavar="EXPRESSION",
-            help="A measure, as peak_X2 or load(4, 0) / mass; may be repeated; all by default.",
+            help="A measure, e.g. peak_X2 or load(4, 0) / mass; may be repeated; all by default.",
         ),
     ] = None,
     require: Requirements = None,

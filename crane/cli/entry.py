@@ -33,14 +33,14 @@ _HELP = """\
 Simulate, identify, rate and design machines with closed kinematic chains.
 
   crane info patu655                            describe a bundled machine
-  crane simulate mini_forwarder --task lift     simulate a task of it
-  crane view simulate                           show the run in a browser
+  crane simulate mini_forwarder --task lift     simulate a task of a machine
+  crane view simulate                           show this run in a browser
 
 {commands}
 
 crane COMMAND --help shows arguments and options. --version shows the version.
-All commands take --strict (refuse inertias that no body has), --trust-xacro
-(xacro files may run Python) and --debug.
+All commands take --strict (reject physically impossible inertias),
+--trust-xacro (allow xacro files to run Python) and --debug.
 """
 
 

@@ -41,8 +41,8 @@ def convert(
         str | None,
         typer.Option(
             metavar="FORMAT",
-            help="urdf+ (one URDF with its loops), urdf (loops cut), mjcf or machine; by the "
-            "suffix of OUT by default.",
+            help="Format: urdf+ (one URDF with its loops), urdf (loops cut), mjcf or machine "
+            "(machine file); derived from the suffix of OUT by default.",
         ),
     ] = None,
 ) -> None:
@@ -89,7 +89,7 @@ def import_log(
     columns: Annotated[
         Path,
         typer.Argument(
-            metavar="COLUMNS", help="A text file with a line per column of the recording."
+            metavar="COLUMNS", help="A text file with one line per column of the recording."
         ),
     ],
     window: TimeOptions,

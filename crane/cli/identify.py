@@ -59,7 +59,7 @@ class PeriodicMotionOptions(OptionBlock):
     acceleration: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="JOINT=VALUE", help="Largest acceleration of a joint; may be repeated."
+            metavar="JOINT=VALUE", help="Maximum acceleration of a joint; may be repeated."
         ),
     ] = None
 
@@ -81,10 +81,11 @@ class SignalOptions(OptionBlock):
     ] = 20.0
     sensors: ComparedColumns = None
     rate: Annotated[
-        float, typer.Option(help="Largest rate of the signals, in spool strokes per second.")
+        float, typer.Option(help="Maximum rate of the signals, in spool strokes per second.")
     ] = 2.0
     margin: Annotated[
-        float, typer.Option(metavar="SHARE", help="Share of a stroke kept free at both ends.")
+        float,
+        typer.Option(metavar="FRACTION", help="Fraction of a stroke kept free at both ends."),
     ] = 0.1
 
     def arguments(self) -> dict[str, Any]:
@@ -106,7 +107,8 @@ def excite(
     criterion: Annotated[
         str,
         typer.Option(
-            metavar="NAME", help="logdet or condition, of the information or regressor matrix."
+            metavar="NAME",
+            help="Criterion: logdet or condition, of the information or regressor matrix.",
         ),
     ] = "logdet",
     seed: Seed = 0,
@@ -114,18 +116,18 @@ def excite(
         list[str] | None,
         typer.Option(
             metavar="NAME=VALUE",
-            help="Standard deviation of the force of a joint, 1 % of its limit by default; with "
-            "--fit, of a column; may be repeated.",
+            help="Standard deviation of the noise of a joint's force, by default 1 % of its "
+            "limit, or with --fit of a column; may be repeated.",
         ),
     ] = None,
     step: Annotated[
-        float, typer.Option(metavar="SECONDS", help="Step of the written samples.")
+        float, typer.Option(metavar="SECONDS", help="Interval of the written samples.")
     ] = 0.01,
 ) -> None:
     """Design an excitation: a motion or valve signals.
 
-    A motion determines base parameters best; valve signals, with --fit, the parameters that
-    calibrate fits.
+    A motion is optimized for the base parameters. With --fit, valve signals are optimized for the
+    parameters that crane calibrate fits.
     """
     from crane.description.machine_lookup import command_line_arguments
 
@@ -167,16 +169,16 @@ class ModelOptions(OptionBlock):
         list[str] | None,
         typer.Option(
             metavar="NAME[=NUMBERS]",
-            help="A term of the model, as q*.rotor_inertia, q1.presliding=1e-4, q5+q6.viscous; "
-            "NAME=off leaves it out; may be repeated.",
+            help="A term of the model, e.g. q*.rotor_inertia, q1.presliding=1e-4, q5+q6.viscous; "
+            "NAME=off removes it; may be repeated.",
         ),
     ] = None
     prior: Annotated[
         list[str] | None,
         typer.Option(
             metavar="[NAME=]STD",
-            help="Prior standard deviation: of all parameters as a share, as 0.3; or by name, as "
-            "bodies=10%, q1.viscous=200+-50; none: no prior; may be repeated.",
+            help="Prior standard deviation: relative and of all parameters, e.g. 0.3; or by name, "
+            "e.g. bodies=10%, q1.viscous=200+-50; none: no prior; may be repeated.",
         ),
     ] = None
     feasible: Annotated[
@@ -197,13 +199,15 @@ def identify(
     method: Method = "wls",
     bandwidth: Annotated[
         float | None,
-        typer.Option(metavar="HZ", help="Passband of the filter; by the motion by default."),
+        typer.Option(
+            metavar="HZ", help="Passband of the filter; derived from the motion by default."
+        ),
     ] = None,
     slow: Annotated[
         list[str] | None,
         typer.Option(
             metavar="JOINT=VALUE",
-            help="Velocity in m/s or rad/s below which samples of a joint are left out; may be "
+            help="Velocity in m/s or rad/s below which samples of a joint are excluded; may be "
             "repeated.",
         ),
     ] = None,
@@ -212,15 +216,15 @@ def identify(
         typer.Option(
             "--try",
             metavar="NAME=VALUES",
-            help="Values of which cross-validation of the training data chooses one, as "
-            "bandwidth=5,10 or, of a prior, bodies=1%,10%; may be repeated.",
+            help="Values from which cross-validation of the training data selects one, e.g. "
+            "bandwidth=5,10 or, for a prior, bodies=1%,10%; may be repeated.",
         ),
     ] = None,
     trust: Trust = False,
 ) -> None:
     """Estimate inertial parameters and joint friction.
 
-    The recordings have coordinates and forces. Held-out data validate the estimate.
+    The recordings contain coordinates and forces. The estimate is validated with held-out data.
     """
     from crane.common.samples import as_number
     from crane.identification.mechanics.cross_validation import format_trials, identify_options
@@ -360,20 +364,24 @@ def circuit(
     method: Annotated[
         str | None,
         typer.Option(
-            metavar="METHOD", help="Method for orifices: weak (the default), chambers or ls."
+            metavar="METHOD",
+            help="Method for orifices: weak (the default; force equation, integrated over "
+            "windows), chambers (pressure equations of both chambers, integrated likewise) or ls "
+            "(force equation at every sample, by least squares).",
         ),
     ] = None,
     period: Annotated[
         float | None,
         typer.Option(
-            metavar="SECONDS", help="Period of a periodic motion to average, for orifices."
+            metavar="SECONDS",
+            help="Period over which a periodic motion is averaged, for orifices.",
         ),
     ] = None,
     validation: Validation = None,
 ) -> None:
     """Estimate orifices, valve or friction of a cylinder.
 
-    The recordings have valve signals and pressures. Bulk modulus is estimated with the orifices.
+    The recordings contain valve signals and pressures. The model orifices includes bulk modulus.
     """
     from crane.identification.hydraulics.cylinder_equations import required_channels
 
@@ -419,7 +427,7 @@ def calibrate(
     validation: Validation = None,
     sensors: ComparedColumns = None,
 ) -> None:
-    """Fit parameters through simulations of valve signals."""
+    """Fit parameters by simulation of recorded valve signals."""
     from crane.recordings.measured_recordings import recording_file
 
     fits, window = parse_fits(fit), parse_window(train)

@@ -43,13 +43,14 @@ Tasks = Annotated[
     list[str] | None,
     typer.Option(
         metavar="TASK",
-        help="A task of the machine file to measure with; may be repeated; all by default.",
+        help="A task of the machine file that is evaluated; may be repeated; all by default.",
     ),
 ]
 Frame = Annotated[
     str | None,
     typer.Option(
-        metavar="LINK", help="Link that carries the load or is the tool; the tip by default."
+        metavar="LINK",
+        help="Link that carries the load or represents the tool; the tip by default.",
     ),
 ]
 Bucket = Annotated[
@@ -71,7 +72,7 @@ Outputs = Annotated[
     str | None,
     typer.Option(
         metavar="NAMES",
-        help="Outputs, as X_lift,tip_z,pressure_X_lift_a; joints and pressures by default.",
+        help="Outputs, e.g. X_lift,tip_z,pressure_X_lift_a; joints and pressures by default.",
     ),
 ]
 ComparedColumns = Annotated[
@@ -79,20 +80,20 @@ ComparedColumns = Annotated[
     typer.Option(
         "--sensors",
         metavar="COLUMNS",
-        help="Measured columns, as X_lift,pressure_X_lift_a; strokes and pressures by default.",
+        help="Measured columns, e.g. X_lift,pressure_X_lift_a; strokes and pressures by default.",
     ),
 ]
 _FIT_OPTION = typer.Option(
     metavar="NAME[=START,LOW~HIGH]",
-    help="A parameter to fit, as payload.mass, friction.*.viscous, sensor.q2.zero; auto: all that "
-    "the recordings determine; may be repeated.",
+    help="A parameter to fit, e.g. payload.mass, friction.*.viscous, sensor.q2.zero; auto: all "
+    "parameters that the recordings determine; may be repeated.",
 )
 Fit = Annotated[list[str], _FIT_OPTION]
 OptionalFit = Annotated[list[str] | None, _FIT_OPTION]
 _BY_OPTION = typer.Option(
     "--by",
     metavar="NAME",
-    help="A parameter to differentiate by, as payload.mass, oil.bulk_modulus, lift_eye.x; may be "
+    help="A parameter of the derivatives, e.g. payload.mass, oil.bulk_modulus, lift_eye.x; may be "
     "repeated.",
 )
 Parameters = Annotated[list[str], _BY_OPTION]
@@ -101,23 +102,27 @@ Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
 Method = Annotated[
     str,
     typer.Option(
-        metavar="METHOD", help="wls (joints weighted by their noise), ols, or huber (robust)."
+        metavar="METHOD",
+        help="Estimator: wls (joints weighted by their noise, the default), ols (ordinary least "
+        "squares) or huber (robust).",
     ),
 ]
 TrainingWindow = Annotated[
     str | None,
     typer.Option(
-        "--train", metavar="FROM:TO", help="Seconds of the training data; the rest is held out."
+        "--train",
+        metavar="FROM:TO",
+        help="Start and end of the training data in s; the rest is used for validation.",
     ),
 ]
 Validation = Annotated[
     list[Path] | None,
-    typer.Option(metavar="FILE", help="A recording that is held out; may be repeated."),
+    typer.Option(metavar="FILE", help="A held-out recording for validation; may be repeated."),
 ]
 Trust = Annotated[
     bool,
     typer.Option(
-        "--trust", help="Use a recording that looks wrong, with a warning instead of an error."
+        "--trust", help="Use a recording that fails a check, with a warning instead of an error."
     ),
 ]
 Requirements = Annotated[
@@ -125,7 +130,7 @@ Requirements = Annotated[
     typer.Option(
         "--require",
         metavar="A>=B",
-        help="A constraint of measures, with >=, <= or ==; may be repeated.",
+        help="A constraint on measures, with >=, <= or ==; may be repeated.",
     ),
 ]
 UserMeasures = Annotated[
@@ -133,10 +138,10 @@ UserMeasures = Annotated[
     typer.Option(
         "--measures",
         metavar="FILE.py",
-        help="Python file with functions of a machine as measures.",
+        help="Python file with functions that compute measures of a machine.",
     ),
 ]
-Force = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,7 +154,7 @@ class ChangeOptions(OptionBlock):
         typer.Option(
             "--set",
             metavar="NAME=VALUE",
-            help="Another value of a parameter, as payload.mass=200; may be repeated.",
+            help="New value of a parameter, e.g. payload.mass=200; may be repeated.",
         ),
     ] = None
 
@@ -189,7 +194,7 @@ class PackageOptions(OptionBlock):
     packages: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="FOLDER", help="A folder of packages that files refer to; may be repeated."
+            metavar="FOLDER", help="A folder of packages to which files refer; may be repeated."
         ),
     ] = None
     argument: Annotated[
@@ -210,15 +215,19 @@ class AssemblyOptions(PackageOptions):
 
     active: Annotated[
         str | None,
-        typer.Option(metavar="JOINTS", help="Active joints, as lift,tilt, instead of the file's."),
+        typer.Option(
+            metavar="JOINTS", help="Active joints, e.g. lift,tilt, instead of those of the file."
+        ),
     ] = None
     free: Annotated[
         str | None,
-        typer.Option(metavar="JOINTS", help="Active joints without an actuator, as swing,sway."),
+        typer.Option(metavar="JOINTS", help="Active joints without an actuator, e.g. swing,sway."),
     ] = None
     floating: Annotated[
         bool,
-        typer.Option("--floating", help="Give the root a floating base: a vehicle, a humanoid."),
+        typer.Option(
+            "--floating", help="Give the root a floating base, e.g. of a vehicle or humanoid."
+        ),
     ] = False
 
     def assembly(self) -> dict[str, Any]:
@@ -264,7 +273,7 @@ class RecordingOptions(TimeOptions):
     columns: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="File that assigns the columns of a raw log, as for import."
+            metavar="FILE", help="File that assigns the columns of a log, as for crane import."
         ),
     ] = None
 

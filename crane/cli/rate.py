@@ -81,13 +81,13 @@ def breakout(
         str | None, typer.Option(metavar="JOINT", help="The joint whose drive moves the arm.")
     ] = None,
     weights: Annotated[
-        bool, typer.Option("--weights", help="Include the machine's weight and tipping.")
+        bool, typer.Option("--weights", help="Include the weight of the machine and its tipping.")
     ] = False,
     direction: Annotated[
         str | None,
         typer.Option(
             metavar="DIRECTION",
-            help="Chart the largest tool force in this direction instead: up, down, in, out, "
+            help="Chart the maximum tool force in this direction instead: up, down, in, out, "
             "tangent or normal to the path of the tool (=-tangent, =-normal), or X,Y,Z.",
         ),
     ] = None,
@@ -125,33 +125,43 @@ class RatingOptions(OptionBlock):
     hydraulic: Annotated[
         float | None,
         typer.Option(
-            metavar="SHARE", help="Share of the hydraulic lifting load instead of the rule's."
+            metavar="FRACTION",
+            help="Rated fraction of the hydraulic lifting load, instead of that of the rule.",
         ),
     ] = None
     tipping: Annotated[
         float | None,
-        typer.Option(metavar="SHARE", help="Share of the tipping load instead of the rule's."),
+        typer.Option(
+            metavar="FRACTION",
+            help="Rated fraction of the tipping load, instead of that of the rule.",
+        ),
     ] = None
     raising: Annotated[
         list[str] | None,
         typer.Option(
             metavar="JOINT",
-            help="A drive that raises the load; the others hold it; may be repeated; by the rule "
-            "by default.",
+            help="A drive that raises the load, while the others hold it; derived from the rule "
+            "by default; may be repeated.",
         ),
     ] = None
     slew: Annotated[
         str | None,
         typer.Option(
             metavar="DEG,...",
-            help="Slew angles; by default home, and a quarter turn of a machine that tips.",
+            help="Slew angles; by default that of home, and a quarter turn if the machine tips.",
         ),
     ] = None
     slope: Annotated[
-        float, typer.Option(metavar="DEG", help="Slope of the ground towards the worst side.")
+        float,
+        typer.Option(
+            metavar="DEG", help="Slope of the ground in the most unfavourable direction."
+        ),
     ] = 0.0
     friction: Annotated[
-        bool, typer.Option("--friction", help="Raising drives overcome joint friction.")
+        bool,
+        typer.Option(
+            "--friction", help="Include joint friction, which the raising drives overcome."
+        ),
     ] = False
 
     def arguments(self) -> dict[str, Any]:
@@ -264,7 +274,7 @@ def power(
         list[Path] | None,
         typer.Option(
             metavar="RECORDING",
-            help="A run to compare with, of the machine that it names; may be repeated.",
+            help="A run for comparison, with the machine recorded in it; may be repeated.",
         ),
     ] = None,
     moved: Annotated[

@@ -48,10 +48,10 @@ ControllerName = Annotated[
     typer.Option(
         "--controller",
         metavar="NAME",
-        help="pi, computed-torque, valve-pd, valve-feedforward or tip-velocity; by default that "
-        "of the machine's gains, else computed-torque. Without a task and a path it holds the "
-        "home configuration, and by default no controller acts: drive forces are zero, valves "
-        "have their neutral signals.",
+        help="Controller: pi, computed-torque, valve-pd, valve-feedforward or tip-velocity; by "
+        "default the one whose gains the machine file contains, otherwise computed-torque. "
+        "Without task and path it holds the home configuration, and by default there is no "
+        "controller: drive forces are zero and valves have their neutral signals.",
     ),
 ]
 Duration = Annotated[
@@ -120,8 +120,8 @@ class MotionOptions(OptionBlock):
         str | None,
         typer.Option(
             metavar="METHOD",
-            help="Suppress sway after the motion: flat, zv or zvd; none only starts it with the "
-            "load at rest. With valves, add --controller valve-feedforward.",
+            help="Method that suppresses sway after the motion: flat, zv or zvd; with none, the "
+            "load is only at rest initially. With valves, add --controller valve-feedforward.",
         ),
     ] = None
     duration: Duration = None
@@ -149,13 +149,16 @@ class IntegrationOptions(OptionBlock):
         str | None,
         typer.Option(
             metavar="METHOD",
-            help="Integration method: DOP853 (the default), Radau (stiff), BDF or LSODA of "
-            "scipy, with error control; rosenbrock, for circuits; rk4, with --step as step size.",
+            help="Integration method: DOP853 (default without valve control), rosenbrock (default "
+            "with valve control), Radau (for stiff machines), BDF or LSODA (of scipy), all with "
+            "error control, or rk4 with fixed steps of --step.",
         ),
     ] = None
     tolerance: Annotated[
         float | None,
-        typer.Option(help="Relative error of a step in the method's error control, as 1e-8."),
+        typer.Option(
+            help="Relative error of a step in the error control of the method, e.g. 1e-8."
+        ),
     ] = None
 
 
@@ -180,7 +183,7 @@ def simulate(
         typer.Option(
             metavar="FRAME=WRENCH",
             help="An external force: FX,FY,FZ in N, followed by MX,MY,MZ in N m if needed, or a "
-            "CSV file with columns time, force_x ... moment_z; FRAME@frame=... turns with the "
+            "CSV file with columns time, force_x ... moment_z; FRAME@frame=... rotates with the "
             "frame; may be repeated.",
         ),
     ] = None,
@@ -188,13 +191,14 @@ def simulate(
     npz: Annotated[
         bool,
         typer.Option(
-            "--npz", help="Write the recording as npz: smaller than CSV, and faster to read."
+            "--npz",
+            help="Write the recording as npz, which is smaller than CSV and faster to read.",
         ),
     ] = False,
 ) -> None:
     """Simulate a task, a path, or measured valve signals.
 
-    Without these it simulates the home configuration, held by a controller or released.
+    Without these, the motion from home is simulated, with or without a controller.
     """
     loaded = add_task_loads(options.load(machine), motion.task)
     loaded = loaded.with_external_forces(*map(parse_load, load or ()))
@@ -311,7 +315,7 @@ def sway(
         str, typer.Option(metavar="KG,...", help="Masses of the payload.")
     ] = "0,100,200,300,400,500",
     damping: Annotated[
-        float, typer.Option(help="Damping ratio of the feedback of sway; 0 for none.")
+        float, typer.Option(help="Damping ratio of the sway feedback; 0: no feedback.")
     ] = 0.2,
 ) -> None:
     """Compare methods that suppress the sway of a load."""
@@ -339,7 +343,7 @@ def modes(
     drive: Annotated[
         str | None,
         typer.Option(
-            metavar="INPUTS", help="valves or forces; valves by default if there are any."
+            metavar="INPUTS", help="Inputs: valves or forces; valves by default if there are any."
         ),
     ] = None,
     outputs: Outputs = None,
@@ -348,7 +352,7 @@ def modes(
         typer.Option(
             metavar="NAME=VALUES",
             help="A joint or parameter and its values start:stop:count, over which modes are "
-            "drawn; may be repeated.",
+            "plotted; may be repeated.",
         ),
     ] = None,
 ) -> None:
@@ -381,7 +385,7 @@ def sensitivities(
     step: Step = 1e-3,
     outputs: Outputs = None,
 ) -> None:
-    """Compute derivatives of a motion by parameters."""
+    """Compute sensitivities of a motion to parameters."""
     loaded = add_task_loads(options.load(machine), task)
     control = task_control(loaded, task, controller)
     with progress_bar("simulating") as progress:

@@ -20,8 +20,11 @@ from crane.description.key_types import (
 )
 from crane.description.soil_cutting import SOILS
 
-_FRAME = "a link that moves"
-_CHANNEL_NAME = TextKey("name in recordings; required where a frame has two", default_text="frame")
+_FRAME = "moving link on which the force acts"
+_CHANNEL_NAME = TextKey(
+    "name in recordings; required if several forces of this kind act on the frame",
+    default_text="name of the frame",
+)
 _WRENCH_KEYS: dict[str, Key] = {
     "frame": TextKey(_FRAME, default=REQUIRED),
     "force": VariantKey(
@@ -32,16 +35,17 @@ _WRENCH_KEYS: dict[str, Key] = {
         "moment [x, y, z] about the origin of the frame, or one such list for each time",
         (NumberListKey("", "N m", size=3), RowListKey("", "N m", size=3)), default_text="0",
     ),
-    "times": NumberListKey("times, in order", "s", default_text="constant"),
+    "times": NumberListKey("times, in ascending order", "s", default_text="constant"),
     "axes": TextKey(
-        "`world`, or `frame` for a wrench that turns with the link", choices=AXES, default="world"
+        "axes of the components: `world`, or `frame` if they rotate with the link",
+        choices=AXES, default="world",
     ),
     "name": _CHANNEL_NAME,
 }  # fmt: skip
 LOAD = section_schema("load of", _WRENCH_KEYS)
 TASK_LOAD = section_schema(
     "load of",
-    _WRENCH_KEYS | {"phases": NumberListKey("values of `phase`, instead of `times`")},
+    _WRENCH_KEYS | {"phases": NumberListKey("values of the channel `phase`, instead of `times`")},
     exclusive=(
         (
             ("phases",), ("times",),
@@ -50,24 +54,27 @@ TASK_LOAD = section_schema(
     ),
 )  # fmt: skip
 _CONTACT_LAW: dict[str, Key] = {
-    "stiffness": NumberKey("of ground and body", "N/m", minimum=0.0, default=DEFAULT_STIFFNESS),
+    "stiffness": NumberKey(
+        "stiffness of the contact between ground and body", "N/m", minimum=0.0,
+        default=DEFAULT_STIFFNESS,
+    ),
     "damping": NumberKey(
-        "one over the approach speed without restitution", "s/m", minimum=0.0,
+        "reciprocal of the approach speed at which there is no restitution", "s/m", minimum=0.0,
         default=DEFAULT_DAMPING,
     ),
     "friction": NumberKey("coefficient of friction", minimum=0.0, default=DEFAULT_FRICTION),
     "smoothing": NumberKey(
-        "velocity over which the friction changes its sign", "m/s", minimum=0.0,
+        "velocity range over which friction changes its sign", "m/s", minimum=0.0,
         default=DEFAULT_SMOOTHING,
     ),
 }  # fmt: skip
 GROUND = section_schema(
     "'ground'",
     {
-        "height": NumberKey("height of a plane at $x = y = 0$", "m"),
-        "normal": NumberListKey("normal of a plane, upwards", size=3),
+        "height": NumberKey("height of the plane at $x = y = 0$", "m"),
+        "normal": NumberListKey("normal of the plane, upwards", size=3),
         "profile": RowListKey(
-            "points [x, z] of rising x, instead of a plane", "m", size=2, default_text="none"
+            "points [x, z] with increasing x, instead of a plane", "m", size=2, default_text="none"
         ),
         **_CONTACT_LAW,
     },
@@ -76,12 +83,14 @@ GROUND = section_schema(
 _CONTACT_SIZE: dict[str, Key] = {
     "radius": NumberKey("radius of a wheel or ball", "m", minimum=0.0, default=0.0),
     "area": NumberKey(
-        "area of a foot, whose pressure is recorded", "m2", minimum=0.0, default=0.0
+        "area of a foot; its ground pressure is recorded", "m2", minimum=0.0, default=0.0
     ),
     "lateral_stiffness": NumberKey(
-        "stiffness along the ground of a tyre or foot; 0: none", "N/m", minimum=0.0, default=0.0
+        "stiffness of a tyre or foot along the ground; 0: none", "N/m", minimum=0.0, default=0.0
     ),
-    "lateral_damping": NumberKey("damping with it", "N s/m", minimum=0.0, default=0.0),
+    "lateral_damping": NumberKey(
+        "damping along the ground, with `lateral_stiffness`", "N s/m", minimum=0.0, default=0.0
+    ),
 }
 CONTACT_LAW_KEYS = tuple(_CONTACT_LAW)
 CONTACT = section_schema(
@@ -94,48 +103,55 @@ CONTACT = section_schema(
     },
 )
 _WITHOUT_KIND = "required without `kind`"
-_OF_KIND = "0, or that of `kind`"
+_OF_KIND = "0, or the value of `kind`"
 SOIL = section_schema(
     "'soil'",
     {
-        "kind": TextKey("a soil of the table below", choices=tuple(SOILS)),
-        "unit_weight": NumberKey("$\\gamma$", "N/m3", minimum=0.0, default_text=_WITHOUT_KIND),
-        "cohesion": NumberKey("$c$", "Pa", minimum=0.0, default_text=_WITHOUT_KIND),
+        "kind": TextKey("name of a soil in the table below", choices=tuple(SOILS)),
+        "unit_weight": NumberKey(
+            "unit weight $\\gamma$", "N/m3", minimum=0.0, default_text=_WITHOUT_KIND
+        ),
+        "cohesion": NumberKey("cohesion $c$", "Pa", minimum=0.0, default_text=_WITHOUT_KIND),
         "friction": NumberKey(
-            "$\\phi$, at most 1.05; 0 for clay that is cut too fast to drain", "rad", minimum=0.0,
-            default_text=_WITHOUT_KIND,
+            "angle of internal friction $\\phi$, at most 1.05; 0 for clay that is cut too fast "
+            "to drain", "rad", minimum=0.0, default_text=_WITHOUT_KIND,
         ),
         "tool_friction": NumberKey(
-            "$\\delta$ of soil on the tool, at most `friction`", "rad", minimum=0.0,
-            default_text=_OF_KIND,
+            "friction angle $\\delta$ between soil and tool, at most `friction`", "rad",
+            minimum=0.0, default_text=_OF_KIND,
         ),
         "adhesion": NumberKey(
-            "$c_a$ to the tool, at most `cohesion`", "Pa", minimum=0.0, default_text=_OF_KIND
+            "adhesion $c_a$ of soil to the tool, at most `cohesion`", "Pa", minimum=0.0,
+            default_text=_OF_KIND,
         ),
-        "surcharge": NumberKey("$q$ on the surface", "Pa", minimum=0.0, default_text=_OF_KIND),
+        "surcharge": NumberKey(
+            "surcharge $q$ on the surface", "Pa", minimum=0.0, default_text=_OF_KIND
+        ),
     },
 )  # fmt: skip
 CUTTER = section_schema(
     "cutter of",
     {
         "frame": TextKey(
-            "a link that moves, whose origin is the middle of the edge", default=REQUIRED
+            "moving link whose origin is the middle of the edge", default=REQUIRED
         ),
         "width": NumberKey("width of the edge", "m", minimum=0.0, default=REQUIRED),
         "length": NumberKey(
-            "length of the blade, up from the edge", "m", minimum=0.0, default=REQUIRED
+            "length of the blade, upwards from the edge", "m", minimum=0.0, default=REQUIRED
         ),
         "blade": NumberListKey(
-            "direction from the edge up the blade, in axes of the frame", size=3, default=REQUIRED
+            "direction from the edge up the blade, in the axes of the frame", size=3,
+            default=REQUIRED,
         ),
         "cutting": NumberListKey(
-            "direction into the soil that is cut, in axes of the frame", size=3, default=REQUIRED
+            "direction into the soil that is cut, in the axes of the frame", size=3,
+            default=REQUIRED,
         ),
         "thickness": NumberKey(
             "thickness of the edge; 0: sharp", "m", minimum=0.0, default=0.0
         ),
         "smoothing": NumberKey(
-            "velocity over which the resistance sets in", "m/s", minimum=0.0,
+            "velocity range over which the resistance builds up", "m/s", minimum=0.0,
             default=DEFAULT_SMOOTHING,
         ),
         "name": _CHANNEL_NAME,

@@ -24,8 +24,8 @@ from crane.description.specification import DEFAULT_RAMP_TIME, LOOP_TYPES, TIP_C
 ALL_ITEM = "all"  # an item whose keys hold for all items beside it
 EXTENDS_KEY = "extends"  # the key that names the file a machine file is a variant of
 MOTION_KEYS = ("tip", "active", "via", "joystick", "phases")  # of which a task has one
-_COORDINATE = ("m", "rad")  # units of a coordinate, of a sliding and of a turning joint
-_BETWEEN = NameListKey("two frames on two bodies, or on one body and the world", size=2)
+_COORDINATE = ("m", "rad")  # units of a coordinate, of a prismatic and of a revolute joint
+_BETWEEN = NameListKey("two frames, on two bodies or on a body and the world", size=2)
 
 CHAIN = section_schema(
     "chain",
@@ -33,7 +33,7 @@ CHAIN = section_schema(
         "name": TextKey("name of the chain, unique", default=REQUIRED),
         "urdf": FileKey("URDF of the chain", default=REQUIRED),
         "parent": TextKey(
-            "frame of an earlier chain that the root link coincides with",
+            "frame of an earlier chain with which the root link coincides",
             default_text="the world, for the first chain",
         ),
     },
@@ -48,7 +48,7 @@ LOOP = section_schema(
         "predecessor": TextKey("first frame (link)", default=REQUIRED),
         "successor": TextKey("second frame, of another body", default=REQUIRED),
         "axis": NumberListKey(
-            "direction of the joint, the same in both frames, of any length",
+            "direction of the joint axis, the same in both frames; any length",
             size=3, default=(0.0, 0.0, 1.0),
         ),
     },
@@ -59,38 +59,40 @@ COUPLING = section_schema(
     {
         "name": TextKey("name of the coupling, unique", default=REQUIRED),
         "joints": MapKey(
-            "factors of two joints at least",
+            "factors of at least two joints",
             _FACTOR,
             "joint",
             default=REQUIRED,
             attribute="factors",
         ),
-        "offset": NumberKey("value of the sum", *_COORDINATE, default=0.0),
+        "offset": NumberKey("value of the weighted sum", *_COORDINATE, default=0.0),
     },
 )
 FRICTION = section_schema(
     "friction of",
     {
-        "coulomb": NumberKey("$F_C$", "N", "N m", minimum=0.0),
-        "coulomb_offset": NumberKey("$D_C$, difference between the directions", "N", "N m"),
-        "viscous": NumberKey("$F_V$", "N s/m", "N m s/rad", minimum=0.0),
+        "coulomb": NumberKey("Coulomb friction $F_C$", "N", "N m", minimum=0.0),
+        "coulomb_offset": NumberKey(
+            "$D_C$, direction-dependent part of Coulomb friction", "N", "N m"
+        ),
+        "viscous": NumberKey("viscous friction $F_V$", "N s/m", "N m s/rad", minimum=0.0),
         "viscous_offset": NumberKey(
-            "$D_V$, difference between the directions", "N s/m", "N m s/rad"
+            "$D_V$, direction-dependent part of viscous friction", "N s/m", "N m s/rad"
         ),
         "smoothing": NumberKey(
-            "$v_s$, for a gradient: $s = \\tanh(v / v_s)$; a joint at rest then creeps "
-            "([theory](theory.md#7-control-and-simulation))",
+            "$v_s$, makes friction differentiable: $s = \\tanh(v / v_s)$; a joint that should be "
+            "at rest then creeps ([theory](theory.md#7-control-and-simulation))",
             "m/s", "rad/s", minimum=0.0,
         ),
         "stiction": NumberKey(
-            "$F_S$, by how much friction at rest exceeds `coulomb`", "N", "N m", minimum=0.0
+            "$F_S$, excess of the breakaway force over `coulomb`", "N", "N m", minimum=0.0
         ),
         "stribeck": NumberKey(
-            "$v_{St}$, velocity over which stiction vanishes", "m/s", "rad/s", minimum=0.0,
+            "$v_{St}$, Stribeck velocity, over which $F_S$ decays", "m/s", "rad/s", minimum=0.0,
             zero_error="'{key}' of {title} is 0, give a velocity",
         ),
         "drives": FlagKey(
-            "whether an offset larger than its mean is meant", default=False,
+            "`yes`: an offset larger than the mean of both directions is intended", default=False,
             attribute="is_driving",
         ),
     },
@@ -99,11 +101,11 @@ FRICTION = section_schema(
 FORCE = section_schema(
     "force element of",
     {
-        "joint": TextKey("joint that it acts on, active or passive", default=REQUIRED),
+        "joint": TextKey("joint on which the element acts, active or passive", default=REQUIRED),
         "between": _BETWEEN,
-        "stiffness": NumberKey("stiffness", "N/m", "N m/rad", minimum=0.0),
-        "rest": NumberKey("coordinate at which the spring has no force", *_COORDINATE),
-        "damping": NumberKey("damping", "N s/m", "N m s/rad", minimum=0.0),
+        "stiffness": NumberKey("spring stiffness", "N/m", "N m/rad", minimum=0.0),
+        "rest": NumberKey("coordinate at which the spring force is zero", *_COORDINATE),
+        "damping": NumberKey("damping coefficient", "N s/m", "N m s/rad", minimum=0.0),
         "force": NumberKey("constant force", "N", "N m"),
     },
     ForceElement,
@@ -119,14 +121,16 @@ GAS_SPRING = section_schema(
     "gas spring of",
     {
         "area": NumberKey(
-            "positive where the gas drives the joint in its positive direction, else negative",
+            "effective piston area; positive if the gas drives the joint in its positive "
+            "direction, otherwise negative",
             "m2", "m3/rad", zero_error=_NOT_ZERO,
         ),
-        "pressure": NumberKey("at `rest`, above the ambient pressure", "Pa", minimum=0.0),
-        "volume": NumberKey("at `rest`", "m3", minimum=0.0, zero_error=_NOT_ZERO),
-        "rest": NumberKey("coordinate that pressure and volume belong to", *_COORDINATE),
+        "pressure": NumberKey("gas pressure at `rest`, above ambient pressure", "Pa", minimum=0.0),
+        "volume": NumberKey("gas volume at `rest`", "m3", minimum=0.0, zero_error=_NOT_ZERO),
+        "rest": NumberKey("coordinate at which `pressure` and `volume` hold", *_COORDINATE),
         "exponent": NumberKey(
-            "polytropic exponent; 1: slow, at constant temperature; 1.4: fast, without heat flow",
+            "polytropic exponent; 1: slow changes, at constant temperature; 1.4: fast changes, "
+            "without heat flow",
             minimum=0.0, zero_error=_NOT_ZERO,
         ),
         "between": _BETWEEN,
@@ -137,9 +141,9 @@ ROPE = section_schema(
     "rope",
     {
         "between": _BETWEEN,
-        "length": NumberKey("length", "m", minimum=0.0, zero_error=_NOT_ZERO),
+        "length": NumberKey("length of the unloaded rope", "m", minimum=0.0, zero_error=_NOT_ZERO),
         "stiffness": NumberKey("stiffness", "N/m", minimum=0.0, zero_error=_NOT_ZERO),
-        "damping": NumberKey("damping per force", "s/m", minimum=0.0),
+        "damping": NumberKey("damping relative to the spring force", "s/m", minimum=0.0),
     },
     Rope,
 )
@@ -150,7 +154,9 @@ END_STOP = section_schema(
             "stiffness", "N/m", "N m/rad", minimum=0.0,
             zero_error="the {title} has no stiffness, give one",
         ),
-        "damping": NumberKey("damping per force", "s/m", "s/rad", minimum=0.0),
+        "damping": NumberKey(
+            "damping relative to the spring force", "s/m", "s/rad", minimum=0.0
+        ),
     },
     EndStop,
 )  # fmt: skip
@@ -158,7 +164,7 @@ PAYLOAD = section_schema(
     "'payload'",
     {
         "urdf": FileKey(
-            "URDF of the load, without moving joints and loops, with a mass", default=REQUIRED
+            "URDF of the load; it has a mass, and no moving joints or loops", default=REQUIRED
         )
     },
 )
@@ -168,7 +174,7 @@ _RATE = NumberKey("", "m/s", "rad/s")
 VIA_POINT = section_schema(
     "via point of",
     {
-        "time": NumberKey("time", "s", minimum=0.0, default=REQUIRED),
+        "time": NumberKey("time of the point", "s", minimum=0.0, default=REQUIRED),
         "rates": MapKey("velocities of the coordinates", _RATE, "coordinate"),
     },
     others=_JOINT_VALUE,
@@ -178,9 +184,11 @@ PHASE = section_schema(
     "phase",
     {
         "name": TextKey("name of the phase", default=REQUIRED),
-        "levers": MapKey("levers, -1 to 1", _LEVER, "joint"),
-        "until": MapKey("positions at which they return to neutral", _JOINT_VALUE, "joint"),
-        "within": NumberKey("longest duration", "s", default=REQUIRED),
+        "levers": MapKey("lever positions, -1 to 1", _LEVER, "joint"),
+        "until": MapKey(
+            "joint positions at which the levers return to neutral", _JOINT_VALUE, "joint"
+        ),
+        "within": NumberKey("maximum duration", "s", default=REQUIRED),
     },
 )
 _UNPHASED = MOTION_KEYS[:-1]
@@ -190,31 +198,36 @@ _SEVERAL_MOTIONS = f"{{title}} has more than one of {MOTIONS}, give one"
 TASK = section_schema(
     "task",
     {
-        "description": TextKey("one line on what it is", default=""),
+        "description": TextKey("description, one line", default=""),
         "duration": NumberKey(
-            "duration", "s", minimum=0.0, zero_error="{title} takes no time, give a duration",
-            default_text="required, not with `via`, `phases`",
+            "duration of the task", "s", minimum=0.0,
+            zero_error="{title} takes no time, give a duration",
+            default_text="required without `via`, `phases`",
         ),
         "tip": MapKey(
-            "polynomials of the position of the tip in the world", _POLYNOMIAL,
-            " or ".join(TIP_COORDINATES), default_text="one of these",
+            "polynomials in time of the tip position in the world", _POLYNOMIAL,
+            " or ".join(TIP_COORDINATES),
+            default_text="exactly one of `tip`, `active`, `via`, `joystick`, `phases`",
         ),
-        "active": MapKey("polynomials of all active joints", _POLYNOMIAL, "joint"),
+        "active": MapKey("polynomials in time of all active joints", _POLYNOMIAL, "joint"),
         "via": ListKey(
-            "points in time, of the tip or of active joints", SectionKey(section=VIA_POINT)
+            "timed points of the tip or of active joints", SectionKey(section=VIA_POINT)
         ),
         "joystick": MapKey(
-            "levers of the valves, pairs of time and lever", NumberListKey("", ""), "joint"
+            "lever positions of the valves, as pairs of time and position",
+            NumberListKey("", ""), "joint",
         ),
         "phases": ListKey(
-            "levers of the valves that are held until positions", SectionKey(section=PHASE)
+            "lever positions of the valves, each constant until joints reach given positions",
+            SectionKey(section=PHASE),
         ),
         "ramp": NumberKey(
-            "with `phases`: time from neutral to a full lever", "s", minimum=0.0,
-            default=DEFAULT_RAMP_TIME,
+            "with `phases`: time in which a lever moves from neutral to its full position", "s",
+            minimum=0.0, default=DEFAULT_RAMP_TIME,
         ),
         "start": MapKey(
-            "active coordinates where levers begin", _JOINT_VALUE, "joint", default_text="home"
+            "initial active coordinates of a task with levers", _JOINT_VALUE, "joint",
+            default_text="home",
         ),
         "loads": ListKey("external forces during the task", SectionKey(section=TASK_LOAD)),
     },
@@ -248,21 +261,22 @@ IDENTIFICATION = section_schema(
     "'identification'",
     {
         "terms": MapKey(
-            "[terms](identification.md#terms-and-what-is-known-before) added to the usual ones, "
-            "or left out",
+            "[model terms](identification.md#model-terms-and-priors) added to the default ones, "
+            "or `off` to remove one",
             VariantKey("", (FlagKey(), NumberKey(), NumberListKey())), "term",
         ),
         "prior": MapKey(
-            "prior knowledge of parameters: 50, 10 %, 609 +- 60",
+            "priors of parameters, e.g. 50, 10 %, 609 +- 60",
             VariantKey("", (NumberKey(), TextKey())), "parameter",
         ),
         "bandwidth": NumberKey(
             "bandwidth of the low-pass filter", "Hz", minimum=0.0,
-            zero_error="'{key}' is 0, give one in Hz", default_text="by the motion",
+            zero_error="'{key}' is 0, give one in Hz", default_text="derived from the motion",
         ),
         "slow": MapKey(
-            "velocity below which rows are left out", NumberKey("", "m/s", "rad/s", minimum=0.0),
-            _PATTERN,
+            "velocity below which samples are excluded",
+            NumberKey("", "m/s", "rad/s", minimum=0.0), _PATTERN,
+            default_text="derived from friction and motion",
         ),
     },
 )  # fmt: skip
@@ -270,17 +284,18 @@ SENSOR = section_schema(
     "sensor",
     {
         "column": TextKey(
-            "reading in a log of another program, as in a "
-            "[file of columns](recording.md#logs-of-other-programs): `s1_mm - 820`",
+            "column of a log of another program, or an expression as in a "
+            "[file of columns](recording.md#logs-of-other-programs), e.g. `s1_mm - 820`",
             default_text="name of the quantity",
         ),
         "unit": TextKey("unit of that column", default_text="SI unit"),
         "zero": NumberKey("offset, in the unit of the quantity"),
-        "scale": NumberKey("factor, not 0"),
-        "delay": NumberKey("delay", "s"),
+        "scale": NumberKey("scale factor, not 0"),
+        "delay": NumberKey("delay of the sensor", "s"),
         "noise": NumberKey(
-            "standard deviation, weight of the channel in a calibration",
-            default_text="from the recording",
+            "standard deviation of the noise, which sets the weight of the channel in a "
+            "calibration",
+            default_text="derived from the recording",
         ),
     },
     Sensor,
@@ -292,33 +307,34 @@ MACHINE = section_schema(
     "the machine file",
     {
         EXTENDS_KEY: TextKey(
-            "path of the machine file, or name of the bundled machine, that this one is a "
-            "[variant](#extends) of"
+            "path of the machine file, or name of the bundled machine, of which this one is a "
+            "[variant](#extends)"
         ),
         "name": TextKey("name of the machine", default=REQUIRED),
-        "source": TextKey("where its parameters come from", default=""),
+        "source": TextKey("source of the parameters", default=""),
         "chains": ListKey("open sub-chains", SectionKey(section=CHAIN), default=REQUIRED),
         "floating": NameListKey(
-            "freedoms of the root of the first chain",
+            "degrees of freedom of the root of the first chain",
             choices=FLOATING_FREEDOMS, default_text="none: fixed to the world",
         ),
-        "loops": ListKey("joints that close the chains", SectionKey(section=LOOP)),
-        "couplings": ListKey("linear constraints of joints", SectionKey(section=COUPLING)),
+        "loops": ListKey("joints that close the chains into loops", SectionKey(section=LOOP)),
+        "couplings": ListKey("linear constraints between joints", SectionKey(section=COUPLING)),
         "active": NameListKey(
-            "driven joints, in the order of $q_A$; more than degrees of freedom share the load",
-            default_text="those of the best condition, with a warning",
+            "driven joints, in the order of $q_A$; redundant ones share the load",
+            default_text="the set with the best condition number, with a warning",
         ),
         "free": NameListKey(
-            "independent coordinates that no drive moves: only friction, springs and stops act",
-            default_text="what `active` leaves open, with a warning",
+            "independent coordinates without a drive: only friction, springs and end stops act",
+            default_text="the independent coordinates not in `active`, with a warning",
         ),
         "drives": MapKey(
-            "linear combinations of joints that motors act along",
+            "linear combinations of joints along which motors act",
             MapKey("", _FACTOR, "joint"), default_text="the joints under `active`",
         ),
         "home": MapKey("home configuration", _JOINT_VALUE, "joint", default_text="0 each"),
         "friction": MapKey(
-            "friction", SectionKey(section=FRICTION), "joint", default_text="none, or the URDF's"
+            "joint friction", SectionKey(section=FRICTION), "joint",
+            default_text="none, or the URDF's"
         ),
         "forces": ListKey("springs, dampers, constant forces", SectionKey(section=FORCE)),
         "gas_springs": MapKey(
@@ -333,27 +349,27 @@ MACHINE = section_schema(
         ),
         "soil": SectionKey("soil that cutters cut", section=SOIL),
         "cutters": ListKey("edges of blades and buckets", SectionKey(section=CUTTER)),
-        "supports": NameListKey("links that it stands on", default_text="the contacts"),
+        "supports": NameListKey("links on which the machine stands", default_text="all contacts"),
         "pins": MapKey(
-            "largest force that a pin bears", _PIN, "joint or loop", attribute="pin_capacities"
+            "maximum permitted force of a pin", _PIN, "joint or loop", attribute="pin_capacities"
         ),
         "end_stops": MapKey("end stops", SectionKey(section=END_STOP), "joint"),
         "rotor_inertia": MapKey(
-            "inertia of motors' rotors, seen from the joint",
+            "inertia of the motor rotors, reflected to the joint",
             NumberKey("", "kg", "kg m2", minimum=0.0), "joint", default_text="0 each",
         ),
-        "tip": TextKey("frame that paths and plots are about; a link that moves"),
+        "tip": TextKey("frame to which tasks and ratings refer; a moving link"),
         "payload": SectionKey(
-            "load that `payload.mass` puts on the tip", section=PAYLOAD,
+            "load at the tip, if `payload.mass` is set", section=PAYLOAD,
             default_text="a point mass",
         ),
         "tasks": MapKey("named motions", SectionKey(section=TASK)),
         "control": MapKey(
-            "PI gains, of all active joints or of none", SectionKey(section=CONTROL), "joint"
+            "PI gains of all active joints, or of none", SectionKey(section=CONTROL), "joint"
         ),
         "hydraulics": SectionKey("pumps, oil, cylinders, valves", section=HYDRAULICS),
         "sensors": MapKey(
-            "properties of sensors, and columns of logs", SectionKey(section=SENSOR), "quantity"
+            "properties of sensors and columns of logs", SectionKey(section=SENSOR), "quantity"
         ),
         "identification": SectionKey("settings of `crane identify`", section=IDENTIFICATION),
     },
