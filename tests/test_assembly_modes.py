@@ -224,8 +224,8 @@ def test_a_home_far_from_what_the_file_says_is_refused_unless_asked_for(tmp_path
         assert re.match(
             r"bucket\.yaml:8: the loops close only far from the home of the file: \w+ is 0\.9 "
             r"rad off; at the home of the file loop 'pin' is 539 mm open, and would close with "
-            r"no other length alone; correct home or the frames; if what was found is meant, keep it with "
-            r"crane check --write-home, or take it with --arg nearest_assembly:=true",
+            r"no other length alone; correct home or the frames; if what was found is meant, "
+            r"keep it with crane check --write-home, or take it with --arg nearest_assembly:=true",
             str(caught.value),
         )
         with pytest.warns(

@@ -467,8 +467,8 @@ UNITS = [
         [
             "four_bar.yaml:14: error: the loops close only far from the home of the file: rocker "
             "is 1.53 rad off; at the home of the file loop 'pin' is 367 mm open, and would close "
-            "with no other length alone; correct home or the frames; if what was found is meant, keep "
-            "it with crane check --write-home, or take it with --arg nearest_assembly:=true "
+            "with no other length alone; correct home or the frames; if what was found is meant, "
+            "keep it with crane check --write-home, or take it with --arg nearest_assembly:=true "
             "(arguments={'nearest_assembly': True} in Python)",
             "four_bar.yaml:14: warning: loop 'pin' can be assembled another way at home, and the "
             "file does not say which is meant; under 'home:' write coupler: 1.045, rocker: "
