@@ -209,10 +209,9 @@ class Machine(OneLineRepr):
 
     @property
     def load_expression(self) -> str:
-        """Text from which this machine can be loaded again, with its changes and locks.
+        """Text from which this machine can be loaded again, without trust in its xacro files.
 
         For example 'patu655 with {"changes": {"payload.mass": 200.0}, "lock": {"slew": 0.0}}'.
-        Trust in its xacro files is not part of it.
         """
         given = {
             "changes": dict(self.parameter_changes),
@@ -221,23 +220,17 @@ class Machine(OneLineRepr):
             "packages": self.packages,
             "arguments": dict(self.arguments),
         }
-        given = {name: what for name, what in (given | dict(self.chosen_joints)).items() if what}
-        return (
-            f"{self.load_name}{CHANGES_SEPARATOR}{json.dumps(given)}" if given else self.load_name
-        )
+        options = {name: x for name, x in (given | dict(self.chosen_joints)).items() if x}
+        return self.load_name + (CHANGES_SEPARATOR + json.dumps(options) if options else "")
 
     @property
     def command_line_arguments(self) -> str:
         """Command line arguments that load this machine again, quoted for a shell."""
-        load_options = LoadOptions(
-            self.packages,
-            self.arguments,
-            bool(self.floating_base),
-            trust_xacro=self.trusts_xacro,
-        )
+        is_floating, trust = bool(self.floating_base), self.trusts_xacro
+        options = LoadOptions(self.packages, self.arguments, is_floating, trust_xacro=trust)
         active, free = map(self.chosen_joints.get, ("active", "free"))
         changed = self.parameter_changes, self.locked_joints
-        return command_line_arguments(self.load_name, active, free, *changed, load_options)
+        return command_line_arguments(self.load_name, active, free, *changed, options)
 
     @property
     def coordinates(self) -> Coordinates:
