@@ -29,7 +29,7 @@ def crane_of(tmp_path):
 
 
 def test_the_crane_of_the_manual_is_ten_lines_and_moves(crane_of):
-    text = MANUAL.read_text().split("is ten lines:\n\n")[1].split("\n\n")[0]
+    text = MANUAL.read_text().split("described in ten lines:\n\n")[1].split("\n\n")[0]
     assert len(text.splitlines()) == 10
     machine = crane_of(text)
     circuit = machine.hydraulics

@@ -6,7 +6,7 @@ import itertools
 import math
 import string
 import warnings
-from collections.abc import Container, Sequence
+from collections.abc import Callable, Container, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -59,8 +59,9 @@ def read_hydraulics(
         supply_section = section.section("supply")
         if supply_section is None:
             raise section.error_at(None, "'hydraulics' has no 'supply', give its pressure")
-        supply = read_component(supply_section, supply_section.values())
-        supply_section.create(check_tank_pressure, supply, oil)
+        supply = read_component(
+            supply_section, supply_section.values(), check=lambda x: check_tank_pressure(x, oil)
+        )
     for key in ("cylinders", "motors"):
         section.apply_common_item(key, section.item_names(key))
     for key in ("valves", "control"):
@@ -158,18 +159,24 @@ def check_active_joint(active: tuple[str, ...], joint: str, location: str) -> No
 
 
 def read_component(
-    section: YamlSection, values: dict[str, Any], is_rotary: bool = False, **constants: Any
+    section: YamlSection,
+    values: dict[str, Any],
+    is_rotary: bool = False,
+    check: Callable[[Any], None] = lambda _: None,
+    **constants: Any,
 ) -> Any:
-    """The component that a section describes.
+    """The component that a section describes, with warnings about values in other units.
 
     Args:
         section: The section; its schema names the class.
         values: What has been read of it.
         is_rotary: Whether its joint turns.
+        check: Checks the component together with others.
         constants: Further arguments of the class.
     """
     assert section.schema.content is not None
     component = section.create(section.schema.content, **values, **constants)
+    section.create(check, component)
     for name, value in values.items():
         if name in section and isinstance(value, float):
             _warn_about_unit(section, name, value, is_rotary)
@@ -188,13 +195,15 @@ def _warn_about_unit(
         )
 
 
-def _check_relief(section: YamlSection, supply: Supply | None, cylinder: Cylinder) -> None:
-    if supply is None:
+def _check_relief(supply: Supply | None, cylinder: Cylinder) -> None:
+    if supply is not None:
+        check_relief_pressure(supply, cylinder)
+
+
+def _warn_about_relief(section: YamlSection, supply: Supply | None, cylinder: Cylinder) -> None:
+    if supply is None or implausible_value_text("relief", cylinder.relief):
         return
-    section.create(check_relief_pressure, supply, cylinder)
-    if 0 < cylinder.relief <= supply.pressure and not implausible_value_text(
-        "relief", cylinder.relief
-    ):
+    if 0 < cylinder.relief <= supply.pressure:
         warnings.warn(
             (
                 f"{section.source_location('relief')}: 'relief' of {section.title} is "
@@ -244,8 +253,9 @@ def _read_cylinder(
         area = count * math.pi / 4.0
         areas = {"area_a": area * bore**2, "area_b": area * (bore**2 - rod**2)}
     constants = {"joint": joint, "count": int(count), **areas, **holding_valves}
-    cylinder: Cylinder = read_component(item, values, is_rotary, **constants)
-    _check_relief(item, supply, cylinder)
+    check = partial(_check_relief, supply)
+    cylinder: Cylinder = read_component(item, values, is_rotary, check, **constants)
+    _warn_about_relief(item, supply, cylinder)
     return cylinder
 
 
@@ -261,8 +271,11 @@ def _read_motor(
         _warn_about_unit(item, key, value)
     constants: dict[str, Any] = dict.fromkeys(AREA_KEYS, size["displacement"] * size["gear"])
     constants |= dict.fromkeys(("hose_a", "hose_b"), size["volume"])
-    motor: Cylinder = read_component(item, values, joint=joint, motor=True, **constants)
-    _check_relief(item, supply, motor)
+    constants |= {"joint": joint, "motor": True}
+    motor: Cylinder = read_component(
+        item, values, check=partial(_check_relief, supply), **constants
+    )
+    _warn_about_relief(item, supply, motor)
     return motor
 
 
