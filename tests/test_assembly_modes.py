@@ -49,7 +49,7 @@ def test_two_strokes_that_differ_little_are_assembled_differently_and_both_are_t
     assert one != two
     for lines_told in (told, also):
         assert len(lines_told) == 1
-        assert lines_told[0].endswith("; 1 more such: crane check tells them")
+        assert lines_told[0].endswith("; 1 more such: crane check lists them")
     for stroke in (0.20, 0.25):
         assert check(bucket_linkage.write(tmp_path, stroke)).status == 1
 
@@ -240,7 +240,7 @@ def test_the_sketch_shows_all_that_are_near(tmp_path):
     path = bucket_linkage.write(tmp_path, 0.25)
     done = typed("sketch", path, "--out", tmp_path / "all.svg")
     assert done.stdout.startswith(
-        "dashed: 2 other assemblies that the file does not rule out; crane check tells how to "
+        "dashed: 2 other assemblies that the file does not rule out; crane check shows how to "
         "choose\n"
     )
     drawn = (tmp_path / "all.svg").read_text()

@@ -242,7 +242,7 @@ GRAPH = [
         "a chain that is not XML, and a slip elsewhere",
         [
             "four_bar.yaml:42: error: 'kp' of control of 'crank' is 'fast', give a number",
-            "rocker.urdf:1: error: not XML, Start tag expected, '<' not found, mend it",
+            "rocker.urdf:1: error: not XML, Start tag expected, '<' not found, correct it",
         ],
         whole("rocker", ROCKER),
         swap("kp: 50", "kp: fast"),
@@ -251,7 +251,7 @@ GRAPH = [
     seen(
         "no chain can be read",
         [
-            "ground.urdf:1: error: not XML, Start tag expected, '<' not found, mend it",
+            "ground.urdf:1: error: not XML, Start tag expected, '<' not found, correct it",
             "rocker.urdf: error: the file is empty, write a <robot> in it",
         ],
         whole(b"\xff\xfe\x00", GROUND),
@@ -926,7 +926,7 @@ def test_many_findings_end_somewhere(tmp_path):
     path.write_bytes(ODD["wide.urdf"])
     report = check(path)
     assert report.errors == 200
-    assert report.counts == "200 errors, no warnings; there is more, mend these first"
+    assert report.counts == "200 errors, no warnings; there may be more, correct these first"
 
 
 def test_links_in_a_row_need_no_stack(tmp_path):

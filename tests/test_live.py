@@ -50,7 +50,7 @@ def test_moves_keep_the_loops_closed(request, name):
     session, rng = Session(machine), np.random.default_rng(0)
     refused = 0
     for index in rng.integers(len(machine.active), size=300):
-        before = session.posture
+        before = session.readout
         value = rng.uniform(session.lower[index], session.upper[index])
         posture = session.move(machine.active[index], value)
         assert posture.residual < 1e-9
@@ -84,7 +84,7 @@ def test_payload_adds_the_weight_that_virtual_work_says(mini, shares, mass):
         mini.active, shares, session.lower, session.upper, strict=True
     ):
         session.move(joint, low + share * (high - low))
-    bare = session.posture.gravity
+    bare = session.readout.gravity
     loaded = session.set_payload(mass)
     lever = crane.Kinematics(mini).jacobian(loaded.q_a)[2]
     np.testing.assert_allclose(loaded.gravity - bare, 9.81 * mass * lever, atol=1e-9)
@@ -113,7 +113,7 @@ def test_there_is_a_way_back_from_every_edge(request, name):
     edges = 0
     while edges < 20:
         index = rng.integers(len(machine.active))
-        joint, before = machine.active[index], session.posture
+        joint, before = machine.active[index], session.readout
         value = rng.choice([session.lower[index], session.upper[index]])
         if not session.move(joint, value).refusal:
             continue
@@ -143,7 +143,7 @@ def test_wrong_moves(mini, five_bar):
         session.set_payload(-1.0)
     with pytest.raises(InputError, match="'five_bar' has no tip"):
         Session(five_bar).set_payload(1.0)
-    np.testing.assert_array_equal(session.posture.configuration, mini.home)
+    np.testing.assert_array_equal(session.readout.configuration, mini.home)
 
 
 def test_slider_ends(mini, five_bar):
@@ -273,7 +273,7 @@ def test_a_slider_moves_the_picture_with_little_work(patu):
             low, high = unit * patu.lower[i % 4], unit * patu.upper[i % 4]
             with at_most(4_000):
                 page.process_requests([(f"joint {joint}", rng.uniform(low, high))])
-            assert session.posture.residual < 1e-9
+            assert session.readout.residual < 1e-9
     finally:
         stop_server(server)
 

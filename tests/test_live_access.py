@@ -155,7 +155,7 @@ def test_a_mistake_does_not_end_it(live, monkeypatch):
         assert "a mistake" in page._warning_html.content
     page.process_requests([("home", 1.0)])
     assert "a mistake" not in page._warning_html.content
-    assert np.isfinite(page._session.posture.configuration).all()
+    assert np.isfinite(page._session.readout.configuration).all()
 
 
 class Elsewhere(BaseHTTPRequestHandler):

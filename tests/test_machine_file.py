@@ -35,17 +35,18 @@ TEXT = [
     ),
     case(
         "bracket not closed",
-        "four_bar.yaml:14: not YAML, expected ',' or ']', but got ':', mend it",
+        "four_bar.yaml:14: not YAML, expected ',' or ']', but got ':', correct it",
         swap("active: [crank]", "active: [crank"),
     ),
     case(
         "tab",
-        "four_bar.yaml:15: not YAML, found character '\\t' that cannot start any token, mend it",
+        "four_bar.yaml:15: not YAML, found character '\\t' that cannot start any token, "
+        "correct it",
         swap("  crank: 1.2", "\tcrank: 1.2"),
     ),
     case(
         "two documents",
-        "four_bar.yaml:5: not YAML, but found another document, mend it",
+        "four_bar.yaml:5: not YAML, but found another document, correct it",
         swap("\nchains:", "\n---\nchains:"),
     ),
     case(
@@ -59,19 +60,19 @@ TEXT = [
     case(
         "python object",
         "four_bar.yaml:2: not YAML, could not determine a constructor for the tag "
-        "'tag:yaml.org,2002:python/object:os.system', mend it",
+        "'tag:yaml.org,2002:python/object:os.system', correct it",
         swap("name: four_bar", "name: !!python/object:os.system x"),
     ),
     case(
         "impossible date",
         "four_bar.yaml:15: not YAML, '2024-13-45' is no value of its kind, quote it"
-        " if it is text, mend it",
+        " if it is text, correct it",
         swap("  crank: 1.2", "  crank: 2024-13-45"),
     ),
     case(
         "number without digits",
         "four_bar.yaml:15: not YAML, '0x_' is no value of its kind, quote it if it "
-        "is text, mend it",
+        "is text, correct it",
         swap("  crank: 1.2", "  crank: 0x_"),
     ),
     case(
@@ -482,7 +483,7 @@ NAMES = [
     ),
     case(
         "URDF is a machine file",
-        "four_bar.yaml:1: not XML, Start tag expected, '<' not found, mend it",
+        "four_bar.yaml:1: not XML, Start tag expected, '<' not found, correct it",
         swap("urdf: four_bar/rocker.urdf", "urdf: four_bar.yaml"),
     ),
     case(

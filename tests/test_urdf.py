@@ -15,13 +15,13 @@ XML = [
     case("empty file", "ground.urdf: the file is empty, write a <robot> in it", whole("", GROUND)),
     case(
         "not XML",
-        "ground.urdf:1: not XML, Start tag expected, '<' not found, mend it",
+        "ground.urdf:1: not XML, Start tag expected, '<' not found, correct it",
         whole("name: four_bar\n", GROUND),
     ),
     case(
         "tag not closed",
         "ground.urdf:30: not XML, Opening and ending tag mismatch: parent line 27 "
-        "and joint, mend it",
+        "and joint, correct it",
         swap('<parent link="crank_arm"/>', '<parent link="crank_arm">', GROUND),
     ),
     case(

@@ -139,7 +139,7 @@ def sketch(
         if others:
             many = f"{len(others)} other assemblies" if len(others) > 1 else "the other assembly"
             print(
-                f"dashed: {many} that the file does not rule out; crane check tells how to choose"
+                f"dashed: {many} that the file does not rule out; crane check shows how to choose"
             )
     print(f"written to {figure}")
 

@@ -232,7 +232,7 @@ def _reversed(
     found: list[int] = []
     for rows, columns in structure.blocks:
         block, joints = structure.independent_rows[rows], passive[columns]
-        if not np.isin(joints, search.said).all():
+        if not np.isin(joints, search.specified).all():
             continue
         home, guess = (np.linalg.slogdet(x[np.ix_(block, joints)])[0] for x in jacobians)
         if home * guess < 0:

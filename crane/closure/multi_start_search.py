@@ -194,7 +194,7 @@ class MultiStartSearch:
             equations.coordinates,
             equations.coordinate_units,
         )
-        self.said, self._extra_starts = specified, extra_starts
+        self.specified, self._extra_starts = specified, extra_starts
         self._in_loops = (equations.sign != 0).any(axis=0)
         self._periodic = periodic_coordinates(equations)
         self._unlimited_periodic = (
@@ -254,7 +254,7 @@ class MultiStartSearch:
     def distance_from_guess(self, q: Array) -> tuple[float, float, float]:
         """Distances from the guess: largest of specified joints, their norm, largest of all."""
         differences = self.coordinate_differences(q, self.initial_guess)
-        specified = differences[self.said]
+        specified = differences[self.specified]
         return (
             round(float(specified.max(initial=0.0)), 3),
             round(float(np.linalg.norm(specified)), 3),
@@ -272,7 +272,7 @@ class MultiStartSearch:
         Returns:
             Its column, and the scaled distance.
         """
-        joints = self.said[self._in_loops[self.said]]
+        joints = self.specified[self._in_loops[self.specified]]
         if not len(joints):
             return 0, 0.0
         off = (q - self.initial_guess) / self._coordinate_units

@@ -62,7 +62,7 @@ class Sensor:
             check = as_nonnegative_number if name in ("delay", "noise") else as_number
             check(getattr(self, name), f"{name} of a sensor", "")
         if self.scale == 0:
-            raise InputError("scale of a sensor is 0, which tells nothing, give another")
+            raise InputError("scale of a sensor is 0, so that it measures nothing, give another")
 
     @property
     def is_ideal(self) -> bool:

@@ -182,7 +182,7 @@ def warn_about_assembly_modes(
     )
     remainder = ""
     if len(alternatives) > 1 and not thorough:
-        remainder = f"; {len(alternatives) - 1} more such: crane check tells them"
+        remainder = f"; {len(alternatives) - 1} more such: crane check lists them"
         alternatives = alternatives[:1]
     for alternative in alternatives:
         warnings.warn(

@@ -86,7 +86,7 @@ def _read_root(file: Path) -> etree._Element:
             raise document_type_error from None
         text = (error.msg or "broken").splitlines()[0].split(", line")[0].rstrip(" !")
         raise DescriptionError(
-            f"{file.name}:{error.lineno or 1}: not XML, {text}, mend it"
+            f"{file.name}:{error.lineno or 1}: not XML, {text}, correct it"
         ) from None
     if root.getroottree().docinfo.doctype:
         raise document_type_error

@@ -319,7 +319,7 @@ def _start_configurations(
         row = int(np.flatnonzero(order == 0)[0])
         own.append(patch.configurations[patch.is_closed[:, row], row])
     if not pairs:
-        raise InputError(f"no posture of '{machine.name}' closes on the way from home")
+        raise InputError(f"no configuration of '{machine.name}' closes on the way from home")
     return np.concatenate(own), np.concatenate(pairs)
 
 

@@ -114,7 +114,7 @@ class ConfigurationSearch(Strokes):
             if patch is not None:
                 self._patches.append(patch)
         if not self._patches:
-            raise InputError(f"no posture of '{machine.name}' closes on the way from home")
+            raise InputError(f"no configuration of '{machine.name}' closes on the way from home")
         self.configurations = np.concatenate(
             [patch.configurations[patch.is_closed] for patch in self._patches]
         )

@@ -192,10 +192,10 @@ def _check_sample_count(values: Array, notes: Mapping[str, str]) -> None:
     Raises:
         RecordingError: They differ.
     """
-    said = notes.get(SAMPLE_COUNT_NOTE, str(len(values)))
-    if said != str(len(values)):
+    declared = notes.get(SAMPLE_COUNT_NOTE, str(len(values)))
+    if declared != str(len(values)):
         raise RecordingError(
-            f"has {len(values)} of the {said[:20]} samples that it says, {_TRUNCATION_HINT}"
+            f"has {len(values)} of the {declared[:20]} samples that it says, {_TRUNCATION_HINT}"
         )
 
 

@@ -140,7 +140,7 @@ class CheckReport:
                 f"{number or 'no'} {word}{'s' * (number != 1)}"
                 for number, word in ((self.errors, "error"), (self.warnings, "warning"))
             ]
-        ) + ("; there is more, mend these first" if self.is_truncated else "")
+        ) + ("; there may be more, correct these first" if self.is_truncated else "")
 
 
 def check(

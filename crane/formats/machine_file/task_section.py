@@ -217,7 +217,7 @@ def _read_phased_task(
     """A task of levers that are held until joints have reached their positions."""
     start_positions = _read_start(name, item, spaces["active"])
     limits = {x: (joint.limits.lower, joint.limits.upper) for x, joint in tree.joints.items()}
-    positions = {  # what is beyond the limits is told at home
+    positions = {  # values beyond the limits are reported at home
         joint: position
         for joint, position in (home | start_positions).items()
         if joint not in limits or limits[joint][0] <= position <= limits[joint][1]

@@ -211,7 +211,7 @@ def parse_yaml_file(file: Path) -> LocatedMapping:
         mark = getattr(error, "problem_mark", None)
         line = f":{mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or "broken"
-        raise DescriptionError(f"{file.name}{line}: not YAML, {problem}, mend it") from None
+        raise DescriptionError(f"{file.name}{line}: not YAML, {problem}, correct it") from None
     except RecursionError:
         raise DescriptionError(f"{file.name}: nested too deep, simplify it") from None
     if data is None:

@@ -303,8 +303,8 @@ class ChartSwitchingIntegrator:
             if self._integrator.offset < 0:
                 raise self._integrator.python_stepper.halt_error(behind_time, state)
         self.notes.append(
-            f"at t = {behind_time:.4g} s the linkage passes a posture from which it could go on "
-            "in several ways: it goes on as it moves"
+            f"at t = {behind_time:.4g} s the linkage passes a configuration from which it could "
+            "go on in several ways: it goes on as it moves"
         )
         return i
 
@@ -355,8 +355,8 @@ class ChartSwitchingIntegrator:
             verb = "pass" if len(left_columns) > 1 else "passes"
             self.notes.append(
                 f"{names} {verb} a dead centre at t = {times[behind_indices[0]]:.4g} s: from "
-                "there on active coordinates alone do not tell the posture, take passive "
-                "joints with them"
+                "there on active coordinates alone do not determine the configuration, take "
+                "passive joints with them"
             )
         at.v_a[:] = np.einsum("nij,nj->ni", velocity_maps, at.v_a)
         at.friction[:] = np.einsum(

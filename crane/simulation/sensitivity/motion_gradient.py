@@ -78,8 +78,10 @@ class Gradient(OneLineRepr):
         for i in order:
             cells = " | ".join(f"{x:.3g}" for x in 0.01 * self.values[i] * slopes[:, i])
             lines.append(f"| {self.parameters[i]} | {self.values[i]:.6g} | {cells} |")
-        said = ", ".join(f"{head} = {x:.6g}" for head, x in zip(heads, total, strict=True))
-        return "\n".join([*lines, "", f"{said}; {len(order)} of {len(self.parameters)} numbers."])
+        values = ", ".join(f"{head} = {x:.6g}" for head, x in zip(heads, total, strict=True))
+        return "\n".join(
+            [*lines, "", f"{values}; {len(order)} of {len(self.parameters)} numbers."]
+        )
 
 
 def gradient(

@@ -176,7 +176,7 @@ class VariantEvaluation:
             return self._task_values[name]
         if name in stroke_measures(machine):
             if name not in self._stroke_values:
-                raise InputError(f"'{name}' has no value: no posture closes")
+                raise InputError(f"'{name}' has no value: no configuration closes")
             return self._stroke_values[name]
         return self._parameter_value(name)
 

@@ -129,7 +129,7 @@ class LivePage:
         self._sliders: dict[str, Any] = {}
         with gui.add_folder("Active joints"):
             for joint, lower, upper, value in zip(
-                machine.active, session.lower, session.upper, session.posture.q_a, strict=True
+                machine.active, session.lower, session.upper, session.readout.q_a, strict=True
             ):
                 unit, scale = DISPLAY_UNITS[machine.unit(joint)]
                 self._add_slider(
@@ -153,7 +153,7 @@ class LivePage:
                 self._play_button = self._add_button(_PLAY_KEY, "Play")
         with gui.add_folder("Numbers"):
             self._readout_html = gui.add_html("")
-        self._update_widgets(session.posture)
+        self._update_widgets(session.readout)
         if playback is not None:
             self.process_requests([(_TIME_KEY, playback.start)])
 

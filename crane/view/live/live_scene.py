@@ -155,14 +155,14 @@ def _motion_bounds(visuals: Sequence[Visual], session: Session) -> tuple[Array, 
 
     Joints with a range of half a turn or more stay at home, because the space would be too large.
     """
-    machine, home_readout = session.machine, session.posture
+    machine, home_readout = session.machine, session.readout
     points = []
     for joint, lower, upper in zip(machine.active, session.lower, session.upper, strict=True):
         is_full_swing = machine.unit(joint) == "rad" and upper - lower >= np.pi
         for value in () if is_full_swing else (lower, upper):
             session.move(joint, value)
             points.append(_shape_corners(visuals, session))
-            session.posture = home_readout
+            session.readout = home_readout
     points.append(_shape_corners(visuals, session))
     all_points = np.concatenate(points)
     return all_points.min(axis=0), all_points.max(axis=0)

@@ -79,7 +79,7 @@ _MAX_STEP_SHARE = 1 / 128  # of a move, at most
 _MIN_STEP_SHARE = 1e-11  # of a move, at which it gives up
 _STEPS_PER_CALL = 32  # steps that are tried before their length is thought over
 _MAX_CONDITION_NUMBER = (
-    1e4  # condition number above which a posture counts as on the branch's edge
+    1e4  # condition number above which a configuration counts as at the end of its branch
 )
 _UNLIMITED_ANGLE_RANGE, _UNLIMITED_STROKE_RANGE = (
     np.pi,
@@ -151,7 +151,7 @@ class Session:
         self.max_payload = round_up_to_nice(
             sum(inertia.mass for inertia in list(machine.model.inertias)[1:]) / 2
         )
-        self.posture = self._compute_readout(machine.home)
+        self.readout = self._compute_readout(machine.home)
 
     def move(self, joint: str, value: float) -> Readout:
         """Move one active joint; all others are held.
@@ -179,7 +179,7 @@ class Session:
                 f"{joint} = {value:.6g} {unit} is outside of {lower:.6g} to {upper:.6g}, "
                 "choose a value within"
             )
-        target = self.posture.q_a.copy()
+        target = self.readout.q_a.copy()
         target[index] = value
         path = self._path_configurations(target)
         if path is None:
@@ -192,7 +192,7 @@ class Session:
             if readout.condition_number < _MAX_CONDITION_NUMBER:
                 break
         else:
-            readout = self._compute_readout(self.posture.configuration)
+            readout = self._compute_readout(self.readout.configuration)
         if readout.q_a[index] != value:
             shown_unit, scale = DISPLAY_UNITS[unit]
             readout = replace(
@@ -200,7 +200,7 @@ class Session:
                 refusal=f"{joint} stops at {scale * readout.q_a[index]:.4g} {shown_unit}: beyond "
                 f"it loop '{readout.weakest_loop}' leaves its assembly branch or cannot be closed",
             )
-        self.posture = readout
+        self.readout = readout
         return readout
 
     def set_active_coordinates(self, q_a: ArrayLike) -> Readout:
@@ -209,17 +209,17 @@ class Session:
         The machine does not move if the loops cannot be closed there.
         """
         try:
-            self.posture = self._compute_readout(
-                self.machine.closure.solve(q_a, initial_guess=self.posture.configuration)
+            self.readout = self._compute_readout(
+                self.machine.closure.solve(q_a, initial_guess=self.readout.configuration)
             )
         except ClosureError as error:
-            self.posture = replace(self.posture, refusal=str(error))
-        return self.posture
+            self.readout = replace(self.readout, refusal=str(error))
+        return self.readout
 
     def go_home(self) -> Readout:
         """Move to the home configuration."""
-        self.posture = self._compute_readout(self.machine.home)
-        return self.posture
+        self.readout = self._compute_readout(self.machine.home)
+        return self.readout
 
     def set_payload(self, mass: float) -> Readout:
         """Set the mass of the payload at the tip [kg].
@@ -233,17 +233,17 @@ class Session:
             self.machine.with_payload(Payload(self.machine.tip, mass)), backend="pinocchio"
         )
         self.payload_mass = float(mass)
-        self.posture = replace(
-            self._compute_readout(self.posture.configuration), refusal=self.posture.refusal
+        self.readout = replace(
+            self._compute_readout(self.readout.configuration), refusal=self.readout.refusal
         )
-        return self.posture
+        return self.readout
 
     def link_poses(self, links: list[str]) -> Array:
         """Return the poses (len(links), 4, 4) of links in the world."""
         model = self.machine.model
         data = model.createData()
         pinocchio_configuration = self.machine.coordinates.configuration(
-            self.posture.configuration
+            self.readout.configuration
         )
         pin.framesForwardKinematics(model, data, pinocchio_configuration)
         return np.array(
@@ -265,10 +265,10 @@ class Session:
         closure = self.machine.closure
         if not closure.is_compiled:
             return None
-        cursor, start = closure.compiled_closure.new_cursor(), self.posture.q_a
+        cursor, start = closure.compiled_closure.new_cursor(), self.readout.q_a
         path: list[Array] = []
         completed_share, step = 0.0, _MAX_STEP_SHARE
-        if not closure.compiled_closure.start_cursor_at(cursor, self.posture.configuration):
+        if not closure.compiled_closure.start_cursor_at(cursor, self.readout.configuration):
             return path
         while completed_share < 1.0 and step > _MIN_STEP_SHARE:
             shares = np.unique(

@@ -110,7 +110,7 @@ def open_in_browser(path: str | Path) -> bool:
 def _machine_data(machine: Machine, scene: Scene, recording: Recording | None) -> dict[str, Any]:
     return {
         "machine": machine.name,
-        "task": "home posture" if recording is None else label(recording),
+        "task": "home configuration" if recording is None else label(recording),
         "tree": joint_tree(machine),
         "tip": None if machine.tip is None else frame_data(machine, machine.tip),
         "payload": payload_frame_data(machine),
