@@ -325,7 +325,7 @@ def feasible_set(
 
 def actuators_of(mass: float) -> dict[str, float]:
     """Both actuators with another mass, 19 % of it in the rod, slender bodies."""
-    nominal = crane.description.parameters(crane.formats.read("mini_forwarder"))
+    nominal = crane.description.parameters(crane.formats.read_machine_spec("mini_forwarder"))
     changes = {}
     for actuator in ("A1", "A2"):
         for part in ("barrel", "rod"):
