@@ -110,8 +110,8 @@ class FormulaLoop:
         arguments = {"counts": ("count",), "functions": ("formula",), "arrays": names}
         with program.add_routine("loop", **arguments) as r:
             with r.loop(r.count) as i:
-                rows = r.q.row(i, q.shape[1]), r.x.row(i, self._x.shape[1])
-                r.call("formula", r.geometry, r.numbers, *rows, r.out.row(i, formula.size))
+                rows = r.q.row_pointer(i, q.shape[1]), r.x.row_pointer(i, self._x.shape[1])
+                r.call("formula", r.geometry, r.numbers, *rows, r.out.row_pointer(i, formula.size))
             r.return_value(r.count)
         program.compile()
         constants = formula._constants
