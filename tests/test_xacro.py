@@ -162,7 +162,7 @@ REFUSED = {
     "broken": (
         ('<link name="base"/>', '<link name="base">'),
         "arm.urdf.xacro:12: not XML, Opening and ending tag mismatch: link line 5 and robot, "
-        "mend it",
+        "correct it",
     ),
 }
 

@@ -123,7 +123,7 @@ def check(
 ) -> None:
     """Check the description of a machine for errors.
 
-    The exit status is 0 without findings, 1 with warnings only, 2 with errors.
+    The exit status is 0 without errors and warnings, 1 with warnings only, 2 with errors.
     """
     values = assembly.assembly()
     driven = values["active"], values["free"]

@@ -177,7 +177,7 @@ class ModelOptions(OptionBlock):
         list[str] | None,
         typer.Option(
             metavar="[NAME=]STD",
-            help="Prior standard deviation: relative and of all parameters, e.g. 0.3; or by name, "
+            help="Prior standard deviation, relative of all parameters, e.g. 0.3; or by name, "
             "e.g. bodies=10%, q1.viscous=200+-50; none: no prior; may be repeated.",
         ),
     ] = None
@@ -224,7 +224,8 @@ def identify(
 ) -> None:
     """Estimate inertial parameters and joint friction.
 
-    The recordings contain coordinates and forces. The estimate is validated with held-out data.
+    The recordings contain coordinates and forces. --train or --validation select held-out data,
+    which validate the estimate.
     """
     from crane.common.samples import as_number
     from crane.identification.mechanics.cross_validation import format_trials, identify_options
@@ -381,7 +382,8 @@ def circuit(
 ) -> None:
     """Estimate orifices, valve or friction of a cylinder.
 
-    The recordings contain valve signals and pressures. The model orifices includes bulk modulus.
+    The recordings contain valve signals and pressures. The model 'orifices' also
+    estimates the bulk modulus.
     """
     from crane.identification.hydraulics.cylinder_equations import required_channels
 

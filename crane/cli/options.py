@@ -93,8 +93,8 @@ OptionalFit = Annotated[list[str] | None, _FIT_OPTION]
 _BY_OPTION = typer.Option(
     "--by",
     metavar="NAME",
-    help="A parameter of the derivatives, e.g. payload.mass, oil.bulk_modulus, lift_eye.x; may be "
-    "repeated.",
+    help="A parameter by which results are differentiated, e.g. payload.mass, oil.bulk_modulus, "
+    "lift_eye.x; may be repeated.",
 )
 Parameters = Annotated[list[str], _BY_OPTION]
 OptionalParameters = Annotated[list[str] | None, _BY_OPTION]

@@ -148,7 +148,8 @@ class RatingOptions(OptionBlock):
         str | None,
         typer.Option(
             metavar="DEG,...",
-            help="Slew angles; by default that of home, and a quarter turn if the machine tips.",
+            help="Slew angles; by default that of home, and a quarter turn from it if the "
+            "machine tips.",
         ),
     ] = None
     slope: Annotated[

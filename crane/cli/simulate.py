@@ -50,8 +50,8 @@ ControllerName = Annotated[
         metavar="NAME",
         help="Controller: pi, computed-torque, valve-pd, valve-feedforward or tip-velocity; by "
         "default the one whose gains the machine file contains, otherwise computed-torque. "
-        "Without task and path it holds the home configuration, and by default there is no "
-        "controller: drive forces are zero and valves have their neutral signals.",
+        "Without task and path, a given controller holds the home configuration; without one, "
+        "drive forces are zero and valves have their neutral signals.",
     ),
 ]
 Duration = Annotated[
@@ -120,8 +120,8 @@ class MotionOptions(OptionBlock):
         str | None,
         typer.Option(
             metavar="METHOD",
-            help="Method that suppresses sway after the motion: flat, zv or zvd; with none, the "
-            "load is only at rest initially. With valves, add --controller valve-feedforward.",
+            help="Method that suppresses sway after the motion: flat, zv or zvd; 'none' only "
+            "starts with the load at rest. With valves, add --controller valve-feedforward.",
         ),
     ] = None
     duration: Duration = None
