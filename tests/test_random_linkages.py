@@ -165,6 +165,7 @@ def test_random_linkages_move_as_constraint_dynamics_says(plan):
     DRAWN["kept"] += 1
 
 
+@pytest.mark.slow
 def test_most_draws_are_kept():
     """Most draws are used; `pytest -s` prints the reasons of the others."""
     if not DRAWN:
