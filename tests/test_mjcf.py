@@ -167,7 +167,6 @@ TENDON = (
 @pytest.mark.parametrize(
     ("old", "new", "line"),
     [
-        ("<mujoco>", '<mujoco><option gravity="0 0 -1.62"/>', "gravity is 0 0 -1.62 m/s2"),
         (
             '<connect name="side"',
             '<connect name="side" active="false"',
@@ -179,7 +178,6 @@ TENDON = (
             "stiffness of ball and free joints (ball)",
         ),
         ("<mujoco>", '<mujoco><option density="1"/>', "; forces of the air"),
-        ("<mujoco>", f"<mujoco>{OFF.format('gravity')}", "gravity is 0 0 0 m/s2, a machine's is"),
         (
             "<mujoco>",
             f"<mujoco>{OFF.format('equality')}",
@@ -431,7 +429,7 @@ def test_what_is_left_out_is_told_in_three_lines(tmp_path):
     """Whatever the file has: what is lost, what is taken otherwise, what MuJoCo says."""
     pytest.importorskip("mujoco")
     more = (
-        '<mujoco><option gravity="0 0 -1.62" density="1"/><compiler settotalmass="9"/>'
+        '<mujoco><option density="1"/><compiler settotalmass="9"/>'
         '<visual/><sensor><jointpos joint="wheel"/><gyro site="top"/></sensor>'
     )
     text = LOOPED.replace("<mujoco>", more).replace("<motor", '<motor gear="3" ctrlrange="0 1"')
@@ -443,9 +441,8 @@ def test_what_is_left_out_is_told_in_three_lines(tmp_path):
     for what in ("limits of tendons (rope)", "contacts of 6 geoms (floor", "the air", "2 sensors"):
         assert what in lines[1]
     assert lines[2] == (
-        "some.xml: otherwise than in MuJoCo: gravity is 0 0 -1.62 m/s2, a machine's is 0 0 -9.81; "
-        "drives take forces in N and N m, without gains, gears, dynamics and limits of the "
-        "actuators (drive)"
+        "some.xml: otherwise than in MuJoCo: drives take forces in N and N m, without gains, "
+        "gears, dynamics and limits of the actuators (drive)"
     )
 
 

@@ -19,7 +19,13 @@ from crane.description.key_types import (
     section_schema,
 )
 from crane.description.sensors import Sensor
-from crane.description.specification import DEFAULT_RAMP_TIME, LOOP_TYPES, TIP_COORDINATES, PIGains
+from crane.description.specification import (
+    DEFAULT_RAMP_TIME,
+    LOOP_TYPES,
+    STANDARD_GRAVITY,
+    TIP_COORDINATES,
+    PIGains,
+)
 
 ALL_ITEM = "all"  # an item whose keys hold for all items beside it
 EXTENDS_KEY = "extends"  # the key that names the file a machine file is a variant of
@@ -312,6 +318,10 @@ MACHINE = section_schema(
         ),
         "name": TextKey("name of the machine", default=REQUIRED),
         "source": TextKey("source of the parameters", default=""),
+        "gravity": NumberListKey(
+            "acceleration of gravity, in the axes of the world; 0, 0, 0 for none", "m/s2", size=3,
+            default=STANDARD_GRAVITY, default_text="0, 0, -9.81, or that of the files of `chains`",
+        ),
         "chains": ListKey("open sub-chains", SectionKey(section=CHAIN), default=REQUIRED),
         "floating": NameListKey(
             "degrees of freedom of the root of the first chain",

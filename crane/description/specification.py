@@ -364,6 +364,9 @@ class PayloadSpec:
     tree: Tree
 
 
+STANDARD_GRAVITY = (0.0, 0.0, -9.81)  # [m/s2]
+
+
 @dataclass(frozen=True)
 class MachineSpec:
     """A machine as described by its file; see docs/machine_file.md for the keys."""
@@ -397,6 +400,7 @@ class MachineSpec:
     pin_capacities: Mapping[str, float] = field(
         default_factory=dict
     )  # by joint or loop, most force [N]
+    gravity: tuple[float, ...] = STANDARD_GRAVITY  # (3,) [m/s2]
 
     @property
     def force_elements(self) -> tuple[AnyForceElement, ...]:

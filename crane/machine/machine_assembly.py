@@ -195,6 +195,7 @@ def assemble_tree(spec: MachineSpec) -> pin.Model:
         )
     model = pin.Model()
     model.name = spec.name
+    model.gravity.linear = np.array(spec.gravity)
     root = tree.root_link
     frame = pin.Frame(
         root,

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from crane.common.units import format_quantity
 from crane.description.sensors import Sensor
+from crane.description.specification import STANDARD_GRAVITY
 from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.frame_jacobians import FrameDistances
 from crane.machine.machine import Machine
@@ -34,6 +35,8 @@ def machine_facts(machine: Machine) -> Iterator[MachineFact]:
     if machine.source:
         yield MachineFact("source", machine.source)
     yield MachineFact("file", str(machine.path))
+    if machine.gravity != STANDARD_GRAVITY:
+        yield MachineFact("gravity", f"{' '.join(f'{x:g}' for x in machine.gravity)} m/s2")
     yield _chain_fact(machine)
     yield _joint_fact(machine)
     yield from _loop_facts(machine)

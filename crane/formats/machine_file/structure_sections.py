@@ -21,6 +21,7 @@ from crane.description.pinocchio_conversion import se3_from_xyz_rpy
 from crane.description.specification import (
     AXISLESS_TYPES,
     LOOP_TYPES,
+    STANDARD_GRAVITY,
     Chain,
     Coupling,
     Drive,
@@ -203,14 +204,15 @@ def read_chains(
     top: YamlSection, path: Path
 ) -> tuple[
     tuple[Chain, ...], TreeBuilder, dict[str, Friction], tuple[Coupling, ...],
-    tuple[ForceElement, ...],
+    tuple[ForceElement, ...], tuple[float, ...],
 ]:  # fmt: skip
-    """The sub-chains, their tree, and the friction, couplings and springs of their URDFs."""
+    """The sub-chains, their tree, the friction, couplings and springs of their URDFs, gravity."""
     chains: list[Chain] = []
     tree = TreeBuilder()
     friction: dict[str, Friction] = {}
     couplings: tuple[Coupling, ...] = ()
     springs: tuple[ForceElement, ...] = ()
+    gravities: dict[tuple[float, ...], str] = {}  # name of a chain that states each
     for item in top.list_items("chains"):
         tree.is_complete &= top.is_complete
         was_complete = tree.is_complete
@@ -223,6 +225,8 @@ def read_chains(
             friction |= urdf.friction
             couplings += urdf.couplings
             springs += urdf.springs
+            if urdf.gravity is not None:
+                gravities.setdefault(urdf.gravity, chain.name)
     tree.is_complete &= top.is_complete
     if not chains and tree.is_complete:
         report_error(top.error_at("chains", "there are no chains, add one under 'chains:'"))
@@ -231,7 +235,24 @@ def read_chains(
         tree.add_floating_base(check_freedoms(top.names("floating")))
     if not tree.joints and tree.is_complete:
         report_error(top.error_at("chains", "no joint of these chains moves, add one"))
-    return tuple(chains), tree, friction, couplings, springs
+    gravity = _read_gravity(top, gravities)
+    return tuple(chains), tree, friction, couplings, springs, gravity
+
+
+def _read_gravity(
+    top: YamlSection, gravities: Mapping[tuple[float, ...], str]
+) -> tuple[float, ...]:
+    """The gravity of the file, or else the only one that its chains state."""
+    if "gravity" in top or not gravities:
+        with error_recovery(harmless=True):
+            if len(gravity := top.numbers("gravity")) == 3:
+                return gravity
+            raise top.error_at("gravity", f"gravity has {len(gravity)} numbers, give 3: [x, y, z]")
+    if len(gravities) > 1:
+        names = " and ".join(f"'{name}'" for name in gravities.values())
+        problem = f"the chains {names} have different gravity, write 'gravity' in this file"
+        report_error(top.error_at("chains", problem))
+    return next(iter(gravities), STANDARD_GRAVITY)
 
 
 def _read_chain(

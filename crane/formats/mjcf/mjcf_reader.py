@@ -123,6 +123,9 @@ class _MjcfReader:
             source_locations=source_locations(loops, couplings) | home_locations,
             free=free,
             drives=drives,
+            gravity=(0.0,) * 3
+            if "GRAVITY" in mjcf.disabled_features
+            else to_vector(self.model.opt.gravity),
         )
         return with_rotation_vectors(spec)
 

@@ -33,9 +33,10 @@ def write_mjcf(machine: Machine, path: str | Path) -> None:
     the axis; couplings become `joint`, or `tendon` if they have more than two joints. Each drive
     has a motor, with a fixed tendon if it acts along several joints; if the drives are not the
     active joints, a text lists these. Frames are sites, the home configuration is the key "home".
-    Coulomb and viscous friction, springs and rotor inertias are written; damping of force elements
-    along joints becomes viscous friction; force elements and ropes between frames become spatial
-    tendons. A warning lists what is left out. Shapes are not written, so there are no contacts.
+    Gravity, Coulomb and viscous friction, springs and rotor inertias are written; damping of force
+    elements along joints becomes viscous friction; force elements and ropes between frames become
+    spatial tendons. A warning lists what is left out. Shapes are not written, so there are no
+    contacts.
 
     Args:
         machine: The machine with its parameter changes, locked joints and payload.
@@ -96,7 +97,8 @@ class _MjcfWriter:
         """Return the file's content."""
         add = etree.SubElement
         add(self.root, "compiler", angle="radian", autolimits="false", inertiafromgeom="false")
-        add(self.root, "option", timestep="0.001", gravity="0 0 -9.81", integrator="implicitfast")
+        gravity = format_numbers(self.machine.gravity)
+        add(self.root, "option", timestep="0.001", gravity=gravity, integrator="implicitfast")
         self._add_texts()
         self.bodies[0] = add(self.root, "worldbody")
         pending = [(joint, self.bodies[0]) for joint in reversed(self._child_joints(0))]

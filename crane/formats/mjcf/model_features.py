@@ -20,7 +20,6 @@ from crane.description.force_elements import ForceElement, Friction, Rope
 from crane.description.specification import Drive
 from crane.formats.mjcf.mujoco_file import MujocoFile, nonzero_rows
 
-_STANDARD_GRAVITY = (0.0, 0.0, -9.81)
 _COUNTED_FEATURES = {"sensor": "nsensor", "camera": "ncam", "skin": "nskin", "plugin": "nplugin"}
 _TENDON_FIELDS = {  # fields of tendons by the feature that they define
     "stiffness": ("tendon_stiffness", "tendon_stiffnesspoly"),
@@ -328,10 +327,6 @@ def note_unsupported_features(mjcf: MujocoFile) -> None:
 
 def _note_world(mjcf: MujocoFile, disabled: set[str]) -> None:
     model = mjcf.model
-    gravity = np.zeros(3) if "GRAVITY" in disabled else model.opt.gravity
-    if not np.allclose(gravity, _STANDARD_GRAVITY, rtol=0, atol=1e-9):
-        given = " ".join(f"{x:g}" for x in gravity)
-        mjcf.note_difference(f"gravity is {given} m/s2, a machine's is 0 0 -9.81")
     if np.any(model.body_gravcomp):
         mjcf.note_unsupported("gravity compensation")
     if model.opt.density or model.opt.viscosity:

@@ -16,7 +16,7 @@ from lxml import etree
 from crane.common.atomic_output import replace_file
 from crane.common.errors import CraneWarning, InputError, format_one_line
 from crane.description.kinematic_tree import Tree
-from crane.description.specification import Coupling, LoopSpec
+from crane.description.specification import STANDARD_GRAVITY, Coupling, LoopSpec
 from crane.formats.robot_files import open_robots
 from crane.formats.visuals.urdf_shapes import find_mesh_file
 from crane.formats.xml_file import (
@@ -46,6 +46,8 @@ def write_urdf_plus(machine: Machine, path: str | Path) -> None:
     """
     tree = with_floating_joints(machine)
     robot = etree.Element("robot", name=machine.name)
+    if machine.gravity != STANDARD_GRAVITY:
+        robot.set("gravity", format_numbers(machine.gravity))
     loop_frames = {  # the reader adds them with the loops
         frame
         for loop in machine.closure.equations.loops
