@@ -14,7 +14,7 @@ from linkages import WRITERS, assert_same, postures, rewritten
 import crane
 from crane.common.errors import CraneError, CraneWarning
 from crane.formats.checks import check
-from crane.formats.mjcf.model_features import colliding_geoms
+from crane.formats.mjcf.unsupported_features import colliding_geoms
 
 TREE = """<mujoco model="tree">
   <compiler angle="degree" eulerseq="zyx"/>
@@ -217,10 +217,8 @@ TENDON = (
         ),
         (
             "<actuator>",
-            '<worldbody><site name="roof" pos="0 0 9"/></worldbody><tendon><spatial name="cable">'
-            '<site site="top"/><site site="roof"/></spatial></tendon>'
-            '<actuator><motor name="winch" tendon="cable"/>',
-            "actuators by sites, bodies and tendons in space (winch); contacts of 5 geoms",
+            '<actuator><motor name="thruster" site="top"/>',
+            "tendons around geoms and cranks that break (thruster); contacts of 5 geoms",
         ),
         ("<actuator>", '<sensor><jointpos joint="crank"/></sensor><actuator>', "; 1 sensor"),
         (
@@ -231,7 +229,6 @@ TENDON = (
         *(
             ('<motor name="drive"', f'<{kind} name="drive"', "limits of the actuators (drive)")
             for kind in (
-                'motor gear="2"',
                 'motor ctrlrange="-1 1"',
                 'motor forcerange="-1 1"',
                 'position kp="3"',
@@ -442,7 +439,7 @@ def test_what_is_left_out_is_told_in_three_lines(tmp_path):
         assert what in lines[1]
     assert lines[2] == (
         "some.xml: otherwise than in MuJoCo: drives take forces in N and N m, without gains, "
-        "gears, dynamics and limits of the actuators (drive)"
+        "dynamics and limits of the actuators (drive)"
     )
 
 

@@ -302,6 +302,14 @@ class MujocoFile(ConversionNotes):
         number = index + (object_type != "BODY")
         return self.element_name(object_type, index).strip() or f"{object_type.lower()}{number}"
 
+    def kinematics(self, qpos: np.ndarray) -> Any:
+        """Return MuJoCo's `MjData` with sites, axes of joints and tendons at coordinates (nq,)."""
+        data = self._mujoco.MjData(self.model)
+        data.qpos[:] = qpos
+        for step in ("mj_kinematics", "mj_comPos", "mj_tendon"):
+            getattr(self._mujoco, step)(self.model, data)
+        return data
+
     def joint_type(self, joint: int) -> str:
         """Return the type of a joint: HINGE, SLIDE, BALL or FREE."""
         return self.enumeration_name("Joint", self.model.jnt_type[joint])
