@@ -78,7 +78,7 @@ def test_lengths_moments_and_accelerations_are_mujoco_s(loader):
     first, start = oracle.data.actuator_length.copy(), lengths(loader, loader.home)
     random = np.random.default_rng(2)
     for part in random.uniform(-1, 1, (8, 3, len(home))):
-        q_a, v_a = home + 0.04 * part[0], part[1]
+        q_a, v_a = home + 0.02 * part[0], part[1]
         q = loader.closure.solve(q_a)
         gamma = loader.closure.gamma(q)
         oracle.place(q, gamma @ v_a)
