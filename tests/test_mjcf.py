@@ -139,7 +139,13 @@ def test_equality_constraints(tmp_path):
 
 BAD_MJCF = [
     ("<connect ", "<connekt ", r"bad.xml:15: MuJoCo refuses it (Schema violation: unrecognized "),
-    ('polycoef="0.1 -2 0 0 0"', 'polycoef="0.1 -2 0.5 0 0"', "bad.xml:17: the constraint 'gear'"),
+    (
+        '<joint name="gear" joint1="wheel" joint2="rocker" polycoef="0.1 -2 0 0 0"/>',
+        '<tendon name="gear" tendon1="a" tendon2="b" polycoef="0 1 2"/></equality><tendon><fixed '
+        'name="a"><joint joint="wheel" coef="1"/></fixed><fixed name="b"><joint joint="crank" '
+        'coef="1"/><joint joint="rocker" coef="1"/></fixed></tendon><equality>',
+        "bad.xml:17: the constraint 'gear' has higher powers of a tendon of 2 joints",
+    ),
     ("<worldbody>", '<include file="parts.xml"/><worldbody>', "bad.xml:2: there is no file 'par"),
     ("<mujoco>", "<mujoko>", "bad.xml:22: not XML, Opening and ending tag mismatch"),
     ("anchor=\"0.5 0 0.1", "anchor=\"0.5 0 0,1", "bad.xml:15: MuJoCo refuses it (bad format in"),

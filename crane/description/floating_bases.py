@@ -63,7 +63,7 @@ def _is_unconstrained(spec: MachineSpec, series: list[Joint]) -> bool:
     force_element_joints |= {part.joint for part in spec.end_stops}
     driven_joints = set(spec.active or ()) - set(spec.free)
     driven_joints |= {joint for drive in spec.drives for joint in drive.factors}
-    coupled_joints = {joint for coupling in spec.couplings for joint in coupling.factors}
+    coupled_joints = {joint for coupling in spec.couplings for joint in coupling.joints}
     if names & (force_element_joints | driven_joints | coupled_joints):
         return False
     return not any(

@@ -71,6 +71,11 @@ COUPLING = section_schema(
             default=REQUIRED,
             attribute="factors",
         ),
+        "powers": MapKey(
+            "coefficients of the square, cube and fourth power of joints, added to the sum",
+            NumberListKey("", size=3),
+            "joint",
+        ),
         "offset": NumberKey("value of the weighted sum", *_COORDINATE, default=0.0),
     },
 )

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from crane.common.errors import InputError, suggest_names
@@ -146,19 +146,41 @@ class LoopSpec:
 
 @dataclass(frozen=True)
 class Coupling:
-    """A linear constraint of joints, sum factor q = offset: a gear, a joint that mimics another.
+    """A constraint of joints: a gear, a joint that mimics another, a cam.
+
+        sum factor q + sum (a q^2 + b q^3 + c q^4) = offset
 
     Attributes:
         name: Its name.
         factors: By joint, the first that of the joint which follows.
         offset: [rad], [m].
         source_location: Where it was written, for errors.
+        powers: Coefficients (a, b, c) of the higher powers by joint; none for a linear constraint.
     """
 
     name: str
     factors: Mapping[str, float]
     offset: float
     source_location: str
+    powers: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Joints that it binds."""
+        return tuple(dict.fromkeys((*self.factors, *self.powers)))
+
+    def without_joints(self, values: Mapping[str, float]) -> "Coupling":
+        """Return what it asks of its other joints with some at coordinates."""
+        offset = self.offset
+        for joint, value in values.items():
+            offset -= self.factors.get(joint, 0.0) * value
+            powers = enumerate(self.powers.get(joint, ()), start=2)
+            offset -= sum(coefficient * value**power for power, coefficient in powers)
+        factors, others = (
+            {joint: x for joint, x in terms.items() if joint not in values}
+            for terms in (self.factors, self.powers)
+        )
+        return replace(self, factors=factors, powers=others, offset=offset)
 
 
 @dataclass(frozen=True)

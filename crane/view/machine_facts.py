@@ -110,7 +110,13 @@ def _loop_facts(machine: Machine) -> Iterator[MachineFact]:
         tuple((x.name, x.type, f"{x.predecessor} to {x.successor}") for x in loops),
     )
     for coupling in closure.equations.couplings:
-        terms = _format_sum(coupling.factors)
+        powers = {
+            f"{joint}^{power}": x
+            for joint, numbers in coupling.powers.items()
+            for power, x in enumerate(numbers, start=2)
+            if x
+        }
+        terms = _format_sum({**coupling.factors, **powers})
         yield MachineFact("coupling", f"{coupling.name}, {terms} = {coupling.offset:g}")
     if structure.blocks:
         order = [

@@ -260,7 +260,7 @@ def _machine_data(machine: Machine) -> dict[str, Any]:
     """The machine file, with empty chains and without payload."""
     equations = machine.closure.equations
     for coupling in equations.couplings:
-        if len(coupling.factors) < 2:
+        if len(coupling.joints) < 2:
             raise InputError(
                 f"coupling '{coupling.name}' holds {next(iter(coupling.factors))} alone, lock "
                 "that joint instead"

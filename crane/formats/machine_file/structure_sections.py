@@ -325,22 +325,32 @@ def read_loops(top: YamlSection, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
 
 
 def read_couplings(top: YamlSection, tree: TreeBuilder) -> tuple[Coupling, ...]:
-    """Linear constraints of joints."""
+    """Constraints of joints."""
     names: list[str] = []
 
     def read_coupling(item: YamlSection) -> Coupling:
         name, joints = item.text("name"), item.section("joints")
         if name in names:
             raise item.error_at("name", f"two couplings are named '{name}', rename one")
-        if joints is None or len(list(joints)) < 2:
+        factors = item.value_map("joints", YamlSection.number, tree.check_joint)
+        powers = item.value_map("powers", _read_powers, tree.check_joint)
+        coupling = Coupling(name, factors, item.number("offset"), item.source_location(), powers)
+        if joints is None or len(coupling.joints) < 2:
             raise item.error_at(
                 "joints", f"coupling '{name}' joins less than two joints, add some"
             )
-        factors = item.value_map("joints", YamlSection.number, tree.check_joint)
         names.append(name)
-        return Coupling(name, factors, item.number("offset"), item.source_location())
+        return coupling
 
     return top.read_items("couplings", read_coupling)
+
+
+def _read_powers(section: YamlSection, joint: str) -> tuple[float, ...]:
+    if len(powers := section.numbers(joint)) != 3:
+        raise section.error_at(
+            joint, f"'{joint}' has {len(powers)} coefficients, give 3: [a, b, c]"
+        )
+    return powers
 
 
 def read_drives(top: YamlSection, tree: TreeBuilder) -> tuple[Drive, ...]:

@@ -329,6 +329,8 @@ class _MjcfWriter:
         attributes = {"name": coupling.name, "solref": "0.002 1"}
         coefficients = [offset, *(derivatives or [0.0]), 0, 0, 0]
         tag = "joint"
+        if coupling.powers:
+            joints, coefficients = _solve_polynomial(coupling)
         if len(joints) > 2:
             tag, coefficients = "tendon", [coupling.offset, 0, 0, 0, 0]
             joints = [_add_fixed_tendon(tendons, coupling.name, coupling.factors)]
@@ -364,6 +366,23 @@ class _MjcfWriter:
             tendon.set(key, format_numbers(numbers))
         for link in links:
             etree.SubElement(tendon, "site", site=self._frame_site(link)[2])
+
+
+def _solve_polynomial(coupling: Coupling) -> tuple[list[str], list[float]]:
+    """Return follower and leader of a coupling with powers, and its five coefficients.
+
+    Raises:
+        InputError: It is no polynomial of one joint.
+    """
+    factors, (leader, *others) = coupling.factors, coupling.powers
+    followers = [joint for joint in coupling.joints if joint != leader]
+    if others or len(followers) != 1:
+        raise InputError(
+            f"coupling '{coupling.name}' is no polynomial of one joint, for which alone MJCF has "
+            "a constraint, write a machine file"
+        )
+    terms = [-coupling.offset, factors.get(leader, 0.0), *coupling.powers[leader]]
+    return [*followers, leader], [-x / factors[followers[0]] + 0.0 for x in terms]
 
 
 def _add_tendon(tendons: etree._Element, tag: str, name: str) -> etree._Element:

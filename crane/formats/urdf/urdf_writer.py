@@ -113,6 +113,11 @@ def _add_loop(tree: Tree, robot: etree._Element, loop: LoopSpec) -> None:
 
 def _add_coupling(machine: Machine, robot: etree._Element, coupling: Coupling) -> None:
     """Add a `<coupling>` if one represents the coupling, else a `<mimic>`."""
+    if coupling.powers:
+        raise InputError(
+            f"coupling '{coupling.name}' has powers, for which URDF+ has no place, write a "
+            "machine file"
+        )
     joints, derivatives, offset = solve_coupling(coupling)
     is_mimic = len(joints) <= 2 and coupling.name == f"{joints[0]}_mimic"
     ends = None if is_mimic or offset else _coupling_ends(machine, joints, derivatives)
