@@ -333,7 +333,7 @@ MACHINE = section_schema(
             choices=FLOATING_FREEDOMS, default_text="none: fixed to the world",
         ),
         "loops": ListKey("joints that close the chains into loops", SectionKey(section=LOOP)),
-        "couplings": ListKey("linear constraints between joints", SectionKey(section=COUPLING)),
+        "couplings": ListKey("constraints between joints", SectionKey(section=COUPLING)),
         "active": NameListKey(
             "driven joints, in the order of $q_A$; redundant ones share the load",
             default_text="the set with the best condition number, with a warning",

@@ -174,13 +174,11 @@ class Coupling:
         offset = self.offset
         for joint, value in values.items():
             offset -= self.factors.get(joint, 0.0) * value
-            powers = enumerate(self.powers.get(joint, ()), start=2)
-            offset -= sum(coefficient * value**power for power, coefficient in powers)
-        factors, others = (
-            {joint: x for joint, x in terms.items() if joint not in values}
-            for terms in (self.factors, self.powers)
-        )
-        return replace(self, factors=factors, powers=others, offset=offset)
+            for power, coefficient in enumerate(self.powers.get(joint, ()), start=2):
+                offset -= coefficient * value**power
+        factors = {joint: x for joint, x in self.factors.items() if joint not in values}
+        powers = {joint: x for joint, x in self.powers.items() if joint not in values}
+        return replace(self, factors=factors, powers=powers, offset=offset)
 
 
 @dataclass(frozen=True)

@@ -81,11 +81,11 @@ class _MjcfReader:
         for link, (body, placement, source_location) in frames.placements.items():
             self.links[link] = Link(link, source_location)
             self._add_fixed_joint(link, self.body_links[body], placement)
-        used_names = {*self.links, *self.joints, *(x.name for x in (*loops, *couplings))}
+        used_names = {*self.links, *self.joints, *(loop.name for loop in loops)}
         qpos = self._home_coordinates()
         cylinders = read_cylinders(mjcf, frames.link_of_site, used_names, qpos)
-        for part in cylinders.parts:
-            (self.links if isinstance(part, Link) else self.joints)[part.name] = part
+        self.links |= {x.name: x for x in cylinders.parts if isinstance(x, Link)}
+        self.joints |= {x.name: x for x in cylinders.parts if isinstance(x, Joint)}
         loops += tuple(cylinders.loops)
         effects = read_joint_effects(mjcf, self.series_joints, frames.link_of_site, cylinders)
         drives = read_drives(mjcf, self.series_joints, cylinders)

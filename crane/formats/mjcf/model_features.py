@@ -132,7 +132,9 @@ def _tendon_factors(
     if tendon in cylinders.tendon_factors:
         return cylinders.tendon_factors[tendon]
     factors = fixed_tendon_factors(mjcf, tendon)
-    return factors and {series_joints[joint][0]: factor for joint, factor in factors.items()}
+    if factors is None:
+        return None
+    return {series_joints[joint][0]: factor for joint, factor in factors.items()}
 
 
 def fixed_tendon_factors(mjcf: MujocoFile, tendon: int) -> dict[int, float] | None:
