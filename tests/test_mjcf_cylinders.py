@@ -116,6 +116,12 @@ def test_what_tendons_are(loader):
     fixed = np.linalg.norm([0.8, 0.05, -0.3]) + np.linalg.norm([0.5, -0.1, -0.7])
     assert joints["detour"].limits.upper == pytest.approx(2.6 - fixed, rel=1e-12)
     assert joints["lifter"].rotor_inertia == 3.0
+    # without a range of its own that of its hinge, in the plane of the boom
+    angle = np.array([1.2, -0.3]) + np.arctan2(0.1, 1.0)
+    eyelet = np.hypot(1.0, 0.1) * np.array([np.cos(angle), np.sin(angle)])
+    ends = np.linalg.norm(eyelet - np.array([[-0.2], [0.3]]), axis=0)
+    limits = joints["rope_1"].limits
+    np.testing.assert_allclose((limits.lower, limits.upper), ends, rtol=1e-12)
     assert not {"slew", "lift", "fold"} & set(loader.active)
     assert all(
         np.allclose(loader.home[loader.column(f"{x}_pin_z")], 0) for x in ("lifter", "knee_rod")

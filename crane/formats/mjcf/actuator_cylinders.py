@@ -22,6 +22,7 @@ from crane.formats.mjcf.mujoco_file import MujocoFile
 
 _MIN_LENGTH = 1e-9  # [m] of a strut, which has a direction
 _MIN_SINE = 0.1  # of the angle between a strut and the axis of a hinge that its first pin follows
+_RANGE_SAMPLES = 201  # over the range of a joint
 _MAX_STRUTS = 100  # each adds three joints
 _X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 _NAME_SUFFIXES = (
@@ -112,13 +113,18 @@ class _CylinderBuilder:
         limits = Limits(source_location=location)
         parts = (length / x[2] for length, x in zip(lengths, moving, strict=True))
         offset = float(self._data.ten_length[tendon]) - sum(parts)
+        bounds = None
         if len(shares) == 1 and self._model.tendon_limited[tendon]:
             (share,) = shares.values()
-            lower, upper = (self._model.tendon_range[tendon] - offset) / share
-            limits = Limits(max(float(lower), 0.0), float(upper), source_location=location)
+            bounds = (self._model.tendon_range[tendon] - offset) / share
         for i, pair in enumerate(new_pairs, start=1):
             first, second = next((x[0], x[1]) for x in moving if pair == {x[0], x[1]})
             strut = self._unique_name(name if len(new_pairs) == 1 else f"{name}_{i}")
+            if (
+                found := self._length_range(first, second) if bounds is None else bounds
+            ) is not None:
+                lower, upper = float(found[0]), float(found[1])
+                limits = Limits(max(lower, 0.0), upper, source_location=location)
             self._add_strut(strut, (first, second), self._vector(first, second), location, limits)
             self._struts[pair] = strut
         self.found.tendon_factors[tendon] = {self._struts[x]: y for x, y in shares.items()}
@@ -201,11 +207,34 @@ class _CylinderBuilder:
                      location)
         )  # fmt: skip
 
-    def _pin_direction(self, direction: np.ndarray, first: int, second: int) -> np.ndarray:
-        """Return a unit vector (3,) across a direction, along a hinge between two sites if any.
+    def _length_range(self, first: int, second: int) -> np.ndarray | None:
+        """Return least and largest distance of two sites between the limits of their only joint.
 
-        In a planar mechanism the second pin then stays at zero.
+        It is on the side of a dead centre on which home is; None with several joints or no limits.
         """
+        model, bodies = self._model, self._bodies_between(first, second)
+        joints = [i for i, body in enumerate(model.jnt_bodyid) if int(body) in bodies]
+        is_limited = (
+            len(joints) == 1 and model.jnt_limited[joints[0]] and model.jnt_type[joints[0]] >= 2
+        )
+        if not is_limited:
+            return None
+        index, qpos = int(model.jnt_qposadr[joints[0]]), np.array(self._data.qpos)
+        values = np.linspace(*model.jnt_range[joints[0]], _RANGE_SAMPLES)
+        home = int(np.abs(values - qpos[index]).argmin())
+        values[home] = qpos[index]
+        lengths = np.empty(len(values))
+        for i, value in enumerate(values):
+            qpos[index] = value
+            sites = self._mjcf.kinematics(qpos).site_xpos
+            lengths[i] = np.linalg.norm(sites[second] - sites[first])
+        turns = np.flatnonzero(np.diff(np.sign(np.diff(lengths)))) + 1
+        start = turns[turns <= home].max(initial=0)
+        end = turns[turns > home].min(initial=len(values) - 1)
+        return np.array([lengths[start : end + 1].min(), lengths[start : end + 1].max()])
+
+    def _bodies_between(self, first: int, second: int) -> set[int]:
+        """Return the bodies on the path between two sites in the tree."""
         bodies = set[int]()
         for site in (first, second):
             body, path = int(self._model.site_bodyid[site]), set[int]()
@@ -213,6 +242,14 @@ class _CylinderBuilder:
                 path.add(body)
                 body = int(self._model.body_parentid[body])
             bodies ^= path
+        return bodies
+
+    def _pin_direction(self, direction: np.ndarray, first: int, second: int) -> np.ndarray:
+        """Return a unit vector (3,) across a direction, along a hinge between two sites if any.
+
+        In a planar mechanism the second pin then stays at zero.
+        """
+        bodies = self._bodies_between(first, second)
         hinges = [
             joint
             for joint, body in enumerate(self._model.jnt_bodyid)

@@ -276,8 +276,13 @@ class _MjcfWriter:
                 effects |= {"limited": "true", "range": format_numbers(limits)}
             tendon.attrib.update(effects)
         else:
-            parts = (x.joint for x in struts if self._joint_effects(x.joint, "springlength"))
-            self.unsupported += [f"friction, springs and rotors of {joint}" for joint in parts]
+            alone = {tuple(x.factors) for x in self.machine.drives}  # written with their tendon
+            parts = (x.joint for x in struts if (x.joint,) not in alone)
+            self.unsupported += [
+                f"friction, springs and rotors of {joint}"
+                for joint in parts
+                if self._joint_effects(joint, "springlength")
+            ]
         etree.SubElement(actuator, "motor", motor | {"tendon": str(tendon.get("name"))})
 
     def _add_site(self, body: etree._Element, name: str, placement: pin.SE3) -> str:
