@@ -203,7 +203,7 @@ def identify(
             metavar="HZ", help="Passband of the filter; derived from the motion by default."
         ),
     ] = None,
-    slow: Annotated[
+    min_speed: Annotated[
         list[str] | None,
         typer.Option(
             metavar="JOINT=VALUE",
@@ -232,7 +232,7 @@ def identify(
     from crane.identification.mechanics.write_identified import check_rewritable
 
     window, terms, priors = parse_window(train), parse_terms(model.term), parse_priors(model.prior)
-    slowest, trials = parse_values("--slow", slow), parse_trials(tried)
+    min_speeds, trials = parse_values("--min-speed", min_speed), parse_trials(tried)
     loaded = options.load(machine)
     if priors is None:
         loaded = loaded.replace(estimation=replace(loaded.estimation, prior={}))
@@ -253,7 +253,7 @@ def identify(
         as_number(bandwidth, "the bandwidth", "Hz", greater_than=5 / shortest)
     settings: dict[str, Any] = {
         "method": method, "prior": priors, "feasible": model.feasible, "terms": terms,
-        "bandwidth": bandwidth, "slow": slowest, "trust": trust,
+        "bandwidth": bandwidth, "min_speed": min_speeds, "trust": trust,
     }  # fmt: skip
     if trials:
         with progress_bar("cross-validating") as progress:

@@ -85,13 +85,13 @@ class EstimationSettings:
         prior: Priors by name or pattern of parameters, such as "q1.viscous", or by link for all
             inertial parameters of a body.
         bandwidth: Cut-off frequency of the low-pass filter [Hz]; None: from the motion.
-        slow: Velocities [m/s], [rad/s] by joint or pattern below which rows are left out.
+        min_speed: Velocities [m/s], [rad/s] by joint or pattern below which rows are left out.
     """
 
     terms: Mapping[str, TermValues | None] = field(default_factory=dict)
     prior: Mapping[str, ParameterPrior] = field(default_factory=dict)
     bandwidth: float | None = None
-    slow: Mapping[str, float] = field(default_factory=dict)
+    min_speed: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

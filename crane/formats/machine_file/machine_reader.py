@@ -320,7 +320,7 @@ def read_estimation(top: YamlSection) -> EstimationSettings:
         section.value_map("terms", _read_term),
         section.value_map("prior", _read_prior),
         section.number("bandwidth") if "bandwidth" in section else None,
-        section.value_map("slow", YamlSection.number),
+        section.value_map("min_speed", YamlSection.number),
     )
 
 
@@ -330,7 +330,7 @@ def estimation_data(settings: EstimationSettings) -> dict[str, Any]:
         "terms": {name: _term_data(numbers) for name, numbers in settings.terms.items()},
         "prior": {name: str(known) for name, known in settings.prior.items()},
         "bandwidth": settings.bandwidth,
-        "slow": dict(settings.slow),
+        "min_speed": dict(settings.min_speed),
     }
     return {key: value for key, value in data.items() if value}
 
