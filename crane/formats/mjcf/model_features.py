@@ -199,8 +199,8 @@ def _add_tendon_effects(
         supported.add("damping")
     stiffness *= "stiffness" in supported
     damping *= "damping" in supported
-    if stiffness and ends is not None and not is_spring:
-        links = sites[ends[0]], sites[ends[1]]
+    links = None if ends is None else (sites[ends[0]], sites[ends[1]])
+    if stiffness and links is not None and not is_spring:
         effects.ropes.append(Rope(links, length=taut_length, stiffness=stiffness))
         stiffness = 0.0
     if factors is not None and len(factors) == 1:
@@ -217,12 +217,10 @@ def _add_tendon_effects(
             stiffness=stiffness,
             rest=slack_length - cylinders.tendon_offsets.get(tendon, 0.0),
         )
-    elif ends is not None:
-        links = sites[ends[0]], sites[ends[1]]
-        if stiffness or damping:
-            rest = taut_length if stiffness else 0.0
-            effects.springs.append(ForceElement("", stiffness, rest, damping, between=links))
-    else:
+    if factors is None and links is not None and (stiffness or damping):
+        rest = taut_length if stiffness else 0.0
+        effects.springs.append(ForceElement("", stiffness, rest, damping, between=links))
+    if links is None and (factors is None or len(factors) != 1):
         supported.clear()
     for feature, fields in _TENDON_FIELDS.items():
         if feature not in supported and any(
