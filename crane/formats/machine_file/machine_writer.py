@@ -166,6 +166,8 @@ class MachineDraft:
             for element in elements[:1]:
                 self._element_notes.setdefault(element, []).append(f"{name}: {note}")
             return bool(elements)
+        if section == "gravity":  # a list, whose items have no lines
+            return False
         key_path: KeyPath = path
         if section == "tree":
             key_path = "rotor_inertia", rest[0]
