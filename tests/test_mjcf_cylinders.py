@@ -154,3 +154,36 @@ def test_cylinders_without_mass_are_written_as_they_are_read(kind, loader, tmp_p
         assert again.tree.joints[joint].limits.upper == pytest.approx(
             loader.tree.joints[joint].limits.upper, rel=1e-12
         )
+
+
+PENDULUM = """<mujoco><compiler angle="radian"/><worldbody><site name="g" pos="{}"/>
+<body name="hand" mocap="true" pos="0 0 2"><site name="hand"/></body>
+<body><joint name="h" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 1 0 0" size=".05" mass="2"/>
+<site name="s" pos="0.5 0 0"/><site name="t_end" pos="0.2 0 0.1"/></body></worldbody>
+<tendon><spatial name="t">{}</spatial></tendon><actuator><motor name="a" tendon="t"/></actuator>
+</mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("ground", "path", "active", "drives"),
+    [
+        ("0 0 -1", "g s", ["t_"], {"t": {"t_": 1.0}}),  # another link is called t_end
+        ("-1 0 0", "g s", ["h"], {"t": {"t_": 1.0}}),  # a dead centre at home
+        ("0.3 1 -0.4", "g s g", ["t_"], {"t": {"t_": 2.0}}),
+        ("0 0 1", "hand s", ["t_"], {"t": {"t_": 1.0}}),
+        ("0 0 1", "g hand", ["h"], {"h": {"h": 1.0}}),  # nothing moves it
+        ("0.5 0 0", "g s", ["h"], {"h": {"h": 1.0}}),  # of length zero
+        ("0 0 1", "s t_end", ["h"], {"h": {"h": 1.0}}),  # within one body
+    ],
+)
+def test_odd_tendons(ground, path, active, drives, tmp_path):
+    """What moves at home is an active joint, what cannot move a machine is left out."""
+    sites = "".join(f'<site site="{site}"/>' for site in path.split())
+    (tmp_path / "odd.xml").write_text(PENDULUM.format(ground, sites))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        machine = crane.load(tmp_path / "odd.xml")
+    assert list(machine.active) == active
+    assert {x.name: dict(x.factors) for x in machine.drives} == drives
+    told = any("actuators by sites, bodies, tendons around" in str(x.message) for x in caught)
+    assert told == ("h" in drives)

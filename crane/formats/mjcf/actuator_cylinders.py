@@ -22,6 +22,7 @@ from crane.formats.mjcf.mujoco_file import MujocoFile
 
 _MIN_LENGTH = 1e-9  # [m] of a strut, which has a direction
 _MIN_SINE = 0.1  # of the angle between a strut and the axis of a hinge that its first pin follows
+_DEAD_CENTRE_TOLERANCE = 1e-6  # of the lever arm over the length
 _RANGE_SAMPLES = 201  # over the range of a joint
 _MAX_STRUTS = 100  # each adds three joints
 _X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
@@ -46,6 +47,7 @@ class MjcfCylinders:
         tendon_factors: By tendon the factors of joints in its length.
         tendon_offsets: By tendon its length [m] with these joints at zero.
         actuator_joints: By actuator with slider and crank the joint of the slider.
+        resting: Prismatic joints that do not move at first order at home, at a dead centre.
     """
 
     parts: list[Link | Joint] = field(default_factory=list)
@@ -54,6 +56,7 @@ class MjcfCylinders:
     tendon_factors: dict[int, dict[str, float]] = field(default_factory=dict)
     tendon_offsets: dict[int, float] = field(default_factory=dict)
     actuator_joints: dict[int, str] = field(default_factory=dict)
+    resting: set[str] = field(default_factory=set)
 
 
 def read_cylinders(
@@ -98,7 +101,9 @@ class _CylinderBuilder:
 
     def add_tendon(self, tendon: int) -> None:
         """Add the struts of a tendon, if it runs over sites and pulleys only."""
-        weld = self._model.body_weldid[self._model.site_bodyid]
+        weld = np.array(self._model.body_weldid)
+        weld[self._model.body_mocapid[weld] >= 0] = 0  # what a program moves stands still
+        weld = weld[self._model.site_bodyid]
         moving = [x for x in self._segments(tendon) if weld[x[0]] != weld[x[1]]]
         lengths = [float(np.linalg.norm(self._vector(*sites))) for *sites, _ in moving]
         shares: dict[frozenset[int], float] = {}  # in the length, by the two sites
@@ -127,6 +132,8 @@ class _CylinderBuilder:
                 limits = Limits(max(lower, 0.0), upper, source_location=location)
             self._add_strut(strut, (first, second), self._vector(first, second), location, limits)
             self._struts[pair] = strut
+            if self._is_resting(first, second, self._data.site_xpos[first]):
+                self.found.resting.add(strut)
         self.found.tendon_factors[tendon] = {self._struts[x]: y for x, y in shares.items()}
         self.found.tendon_offsets[tendon] = offset
 
@@ -166,6 +173,8 @@ class _CylinderBuilder:
         self.found.home[name] = length
         rod = vector - length * rotation[:, 2]
         self._add_strut(f"{name}_rod", (slider, crank), rod, location, link=slide)
+        if self._is_resting(slider, crank, self._data.site_xpos[crank] - rod):
+            self.found.resting.add(name)
 
     def _add_strut(
         self,
@@ -206,6 +215,18 @@ class _CylinderBuilder:
             LoopSpec(f"{name}_eye", "spherical", rod_end, self._links[sites[1]], _Z,
                      location)
         )  # fmt: skip
+
+    def _is_resting(self, first: int, second: int, start: np.ndarray) -> bool:
+        """Whether the distance from a point on the body of one site to another one is at rest."""
+        bodies, end = self._model.site_bodyid, self._data.site_xpos[second]
+        jacobians = (
+            self._mjcf.point_jacobian(self._data, point, int(bodies[site]))
+            for site, point in ((first, start), (second, end))
+        )
+        rates = (end - start) @ (-np.subtract(*jacobians))
+        return bool(
+            np.abs(rates).max() < _DEAD_CENTRE_TOLERANCE * float((end - start) @ (end - start))
+        )
 
     def _length_range(self, first: int, second: int) -> np.ndarray | None:
         """Return least and largest distance of two sites between the limits of their only joint.

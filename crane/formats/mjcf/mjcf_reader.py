@@ -108,7 +108,7 @@ class _MjcfReader:
         active = self._listed_joints("active")
         for drive in drives if not active else ():
             # one joint of each drive: its other joints depend on that, or are other coordinates
-            active += [x for x in drive.factors if x not in active][:1]
+            active += [x for x in drive.factors if x not in {*active, *cylinders.resting}][:1]
         free = tuple(self._listed_joints("free"))
         home, tip = self._read_home(qpos) | cylinders.home, self._read_tip(tree)
         mjcf.warn_about_notes()

@@ -310,6 +310,12 @@ class MujocoFile(ConversionNotes):
             getattr(self._mujoco, step)(self.model, data)
         return data
 
+    def point_jacobian(self, data: Any, point: np.ndarray, body: int) -> np.ndarray:
+        """Return the Jacobian (3, nv) of a point (3,) in the world that moves with a body."""
+        jacobian = np.zeros((3, self.model.nv))
+        self._mujoco.mj_jac(self.model, data, jacobian, None, point, body)
+        return jacobian
+
     def joint_type(self, joint: int) -> str:
         """Return the type of a joint: HINGE, SLIDE, BALL or FREE."""
         return self.enumeration_name("Joint", self.model.jnt_type[joint])
