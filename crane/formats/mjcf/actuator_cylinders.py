@@ -241,13 +241,14 @@ class _CylinderBuilder:
         if not is_limited:
             return None
         index, qpos = int(model.jnt_qposadr[joints[0]]), np.array(self._data.qpos)
-        values = np.linspace(*model.jnt_range[joints[0]], _RANGE_SAMPLES)
+        lower, upper = (float(x) for x in model.jnt_range[joints[0]])
+        values, data = np.linspace(lower, upper, _RANGE_SAMPLES), self._mjcf.kinematics(qpos)
         home = int(np.abs(values - qpos[index]).argmin())
         values[home] = qpos[index]
         lengths = np.empty(len(values))
         for i, value in enumerate(values):
             qpos[index] = value
-            sites = self._mjcf.kinematics(qpos).site_xpos
+            sites = self._mjcf.kinematics(qpos, data).site_xpos
             lengths[i] = np.linalg.norm(sites[second] - sites[first])
         turns = np.flatnonzero(np.diff(np.sign(np.diff(lengths)))) + 1
         start = turns[turns <= home].max(initial=0)

@@ -302,9 +302,14 @@ class MujocoFile(ConversionNotes):
         number = index + (object_type != "BODY")
         return self.element_name(object_type, index).strip() or f"{object_type.lower()}{number}"
 
-    def kinematics(self, qpos: np.ndarray) -> Any:
-        """Return MuJoCo's `MjData` with sites, axes of joints and tendons at coordinates (nq,)."""
-        data = self._mujoco.MjData(self.model)
+    def kinematics(self, qpos: np.ndarray, data: Any = None) -> Any:
+        """Return MuJoCo's `MjData` with sites, axes of joints and tendons at coordinates (nq,).
+
+        Args:
+            qpos: The coordinates.
+            data: What receives them; new if not given.
+        """
+        data = self._mujoco.MjData(self.model) if data is None else data
         data.qpos[:] = qpos
         for step in ("mj_kinematics", "mj_comPos", "mj_tendon"):
             getattr(self._mujoco, step)(self.model, data)
