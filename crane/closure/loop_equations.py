@@ -121,6 +121,7 @@ class LoopEquations:
             is_length.append(bool(self.coordinates.is_translation[column]))
             for name, coefficients in coupling.powers.items():
                 self.coupling_powers[:, i, self.coordinates.column(name)] = coefficients
+        self._has_powers = bool(self.coupling_powers.any())
         # (c, nv) which joints couplings bind
         self.is_coupled = (self.coupling_factors != 0) | self.coupling_powers.any(axis=0)
         self.names = (*(loop.name for loop in loops), *(item.name for item in couplings))
@@ -225,11 +226,13 @@ class LoopEquations:
         Args:
             q: (nq,) [m], [rad].
         """
+        residuals = self.coupling_factors @ q - self.coupling_offsets
         squares, cubes, fourths = self.coupling_powers
+        if not self._has_powers:
+            return residuals, self.coupling_factors, squares
         slopes = 2 * squares * q + 3 * cubes * q**2 + 4 * fourths * q**3
         curvatures = 2 * squares + 6 * cubes * q + 12 * fourths * q**2
-        linear = self.coupling_factors @ q - self.coupling_offsets
-        residuals = linear + squares @ q**2 + cubes @ q**3 + fourths @ q**4
+        residuals = residuals + squares @ q**2 + cubes @ q**3 + fourths @ q**4
         return residuals, self.coupling_factors + slopes, curvatures
 
     def evaluate(self, q: Array) -> tuple[Array, Array]:
@@ -243,7 +246,7 @@ class LoopEquations:
         """
         coupling_residuals, coupling_jacobian, _ = self.evaluate_couplings(q)
         if not self.loops:
-            return coupling_residuals, coupling_jacobian
+            return coupling_residuals, coupling_jacobian.copy()
         data, configuration = self.data, self.coordinates.configuration(q)
         # a vector for a single joint
         jacobian = pin.computeJointJacobians(self.model, data, configuration).reshape(6, -1)
