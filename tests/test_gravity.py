@@ -241,3 +241,25 @@ def test_gravity_on_the_command_line():
     assert done.stderr == "error: gravity.z is -3.0 and -2.0 at once, give one of them\n"
     with pytest.raises(CraneError, match=r"gravity has the shape \(2,\), give \(3,\)"):
         crane.load(DATA / "four_bar.yaml", gravity=(0, -1))
+
+
+@pytest.mark.parametrize("lateral", [0.0, 2e4])
+def test_ground_under_a_machine_drawn_in_x_and_y(lateral, tmp_path):
+    """A ball that is thrown on it rolls as on ground below z."""
+    (tmp_path / "stone.urdf").write_text(BODY.format(""))
+    places = []
+    for gravity, normal, place, turn in (
+        (GRAVITIES["earth"], (0, 0, 1), (0, 0, 0.5), 0.0),
+        (GRAVITIES["drawn in x and y"], (0, 1, 0), (0, 0.5, 0), -np.pi / 2),
+    ):
+        stone = crane.load(tmp_path / "stone.urdf", floating=True, gravity=gravity)
+        contact = crane.description.Contact(
+            "stone", crane.description.Ground(0.1, normal), 2e4, 0.5, 0.6, radius=0.3,
+            lateral_stiffness=lateral, lateral_damping=lateral / 100,
+        )  # fmt: skip
+        start = np.array([*place, turn, 0, 0]), np.array([1.0, 0.2, 0.0, 0.1, 0.2, 0.3])
+        run = crane.simulate(stone.with_external_forces(contact), initial=start, duration=0.8)
+        places.append(run.q[:, :3])
+    x, y, z = places[0].T
+    assert z.min() < 0.4
+    np.testing.assert_allclose(places[1], np.column_stack([x, z, -y]), rtol=0, atol=1e-9)
