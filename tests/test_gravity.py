@@ -263,3 +263,17 @@ def test_ground_under_a_machine_drawn_in_x_and_y(lateral, tmp_path):
     x, y, z = places[0].T
     assert z.min() < 0.4
     np.testing.assert_allclose(places[1], np.column_stack([x, z, -y]), rtol=0, atol=1e-9)
+
+
+def test_an_identified_machine_keeps_gravity(tmp_path):
+    """That of the machine as it was loaded, as an argument or in its file."""
+    import forwarder_motions
+
+    from crane.identification import identify, write_identified
+
+    moon = crane.load("mini_forwarder", gravity=GRAVITIES["oblique"])
+    found = identify(moon, forwarder_motions.motion(moon, duration=4.0), prior=0.1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)
+        again = crane.load(write_identified(found, tmp_path / "found"))
+    assert again.gravity == GRAVITIES["oblique"]
