@@ -120,6 +120,7 @@ def test_what_tendons_are(loader):
     angle = np.array([1.2, -0.3]) + np.arctan2(0.1, 1.0)
     eyelet = np.hypot(1.0, 0.1) * np.array([np.cos(angle), np.sin(angle)])
     ends = np.linalg.norm(eyelet - np.array([[-0.2], [0.3]]), axis=0)
+    assert joints["rope_2"].limits.upper < np.inf  # of another hinge
     limits = joints["rope_1"].limits
     np.testing.assert_allclose((limits.lower, limits.upper), ends, rtol=1e-12)
     assert not {"slew", "lift", "fold"} & set(loader.active)

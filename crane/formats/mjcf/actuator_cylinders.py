@@ -115,7 +115,6 @@ class _CylinderBuilder:
             return
         name = self._mjcf.name("TENDON", tendon)
         location = self._mjcf.source_location(name, "spatial")
-        limits = Limits(source_location=location)
         parts = (length / x[2] for length, x in zip(lengths, moving, strict=True))
         offset = float(self._data.ten_length[tendon]) - sum(parts)
         bounds = None
@@ -125,11 +124,10 @@ class _CylinderBuilder:
         for i, pair in enumerate(new_pairs, start=1):
             first, second = next((x[0], x[1]) for x in moving if pair == {x[0], x[1]})
             strut = self._unique_name(name if len(new_pairs) == 1 else f"{name}_{i}")
-            if (
-                found := self._length_range(first, second) if bounds is None else bounds
-            ) is not None:
-                lower, upper = float(found[0]), float(found[1])
-                limits = Limits(max(lower, 0.0), upper, source_location=location)
+            ends = self._length_range(first, second) if bounds is None else bounds
+            limits = Limits(source_location=location)
+            if ends is not None:
+                limits = Limits(max(float(ends[0]), 0.0), float(ends[1]), source_location=location)
             self._add_strut(strut, (first, second), self._vector(first, second), location, limits)
             self._struts[pair] = strut
             if self._is_resting(first, second, self._data.site_xpos[first]):
