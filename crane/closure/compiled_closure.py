@@ -1,6 +1,6 @@
 """Machine code that closes the loops of one machine by Newton's method."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from weakref import WeakValueDictionary
@@ -15,13 +15,15 @@ from crane.closure.kinematics_formulas import (
     PositionKinematics,
     folding_pattern,
     largest_scaled_value,
+    rotation_vector_derivative,
     tree_geometry,
+    wrap_rotation_vector,
 )
 from crane.closure.loop_equations import Cluster, LoopEquations, find_clusters
 from crane.closure.loop_formulas import LoopFormulas
 from crane.closure.newton_continuation import ClosedConfiguration
 from crane.codegen import Layout, LayoutView, Program, Scalar, Tape, max_abs, maximum
-from crane.codegen.symbolic import minimum
+from crane.codegen.symbolic import add_vectors, minimum, solve_linear_system, sum_scalars
 from crane.common.samples import Array
 
 # Scaled values: rad and characteristic length, as in `NewtonContinuation`.
@@ -83,7 +85,8 @@ class CompiledClosure:
         tolerances: (3,) scaled residual that counts as rounding; that counts as closed if it no
             longer decreases; scaled step whose square is rounding.
         follow_address: Address of the function `follow_targets`, for other machine code.
-        close_address: Address of the function `close`.
+        close_address: Address of the function `close`; of `project` with partly active rotations,
+            for the states of a simulation.
     """
 
     def __init__(
@@ -113,9 +116,20 @@ class CompiledClosure:
         program, self.programs = shared.closure_program, shared.programs
         self._closure_program = program
         self.follow_address = program.function_address("follow")
-        self.close_address = program.function_address("close")
+        self.close_address = program.function_address(
+            "project" if self._has_partly_active_rotations else "close"
+        )
         self._home = home
         self.tolerances = np.array([1e-15 * rounding_scale, 1e-13 * rounding_scale, 1e-9])
+
+    @property
+    def wraps_rotations(self) -> bool:
+        """Whether there are passive rotation vectors, whose length solutions limit to pi."""
+        return self._equations.coordinates.is_rotation_vector[self._passive_columns].any()
+
+    @cached_property
+    def _has_partly_active_rotations(self) -> bool:
+        return self._equations.coordinates.has_partial_rotations(self._active_columns)
 
     def _find_gamma_entries(self) -> tuple[Indices, Indices]:
         """Rows and columns of the nonzero entries of gamma: joints of the same cluster."""
@@ -155,6 +169,7 @@ class CompiledClosure:
             geometry.parents,
             geometry.is_revolute,
             geometry.floating_bases,
+            geometry.ball_joints,
             geometry.frame_bodies,
             folding_pattern(geometry.constants),
             tuple(loop.type for loop in equations.loops),
@@ -164,10 +179,14 @@ class CompiledClosure:
         )
 
     def _build(self, program: Program, signs: Array) -> None:
-        self.add_newton_formula(program, signs)
+        self._add_newton_formula(program, signs, "newton", holds_coordinates=True)
+        if self._has_partly_active_rotations:
+            self._add_newton_formula(program, signs, "newton_motion", holds_coordinates=False)
         self._add_predictor(program)
         self._add_gamma(program)
-        add_closure_routines(program, self._nq, self._n)
+        add_closure_routines(
+            program, self._nq, self._n, self._has_partly_active_rotations, self.wraps_rotations
+        )
 
     def cached_program(self, key: tuple, build: Callable[[Program], None]) -> Program:
         """A further program of this machine, kept in `programs`; see `Program.from_cache`.
@@ -290,7 +309,9 @@ class CompiledClosure:
             ),
         )
 
-    def add_newton_formula(self, program: Program, signs: Array) -> None:
+    def _add_newton_formula(
+        self, program: Program, signs: Array, name: str, holds_coordinates: bool
+    ) -> None:
         """Add `newton`: one Newton step with residual, gamma and singularity checks.
 
         "regular" is positive on the branch of home away from singular configurations, with
@@ -299,7 +320,7 @@ class CompiledClosure:
         home.
         """
         q, kinematics, loops = self.trace_kinematics(Tape(), 0, 1)
-        steps = loops.newton_step
+        steps = loops.newton_step(holds_coordinates)
         is_translation = [not kinematics.geometry.is_revolute[joint] for joint in steps]
         corrected = [x + steps.get(i, 0.0) for i, x in enumerate(q, start=1)]
         rows = [loops.gamma[loops.passive_joints[row]][k] for row, k in self._gamma_entry_pairs]
@@ -315,7 +336,7 @@ class CompiledClosure:
         for alignment in loops.alignments:
             worst = maximum(worst, -1.0 * alignment)
         program.add_formula(
-            "newton",
+            name,
             2,
             {
                 "residual": [loops.largest_residual()],
@@ -333,6 +354,54 @@ class CompiledClosure:
                 "gamma": rows,
             },
         )
+
+    def _coordinate_steps(self, q: Sequence[Scalar], motion: Mapping[int, Scalar]) -> list[Scalar]:
+        """Steps of the coordinates along a small motion of the joints, by column."""
+        steps = [motion.get(column, 0.0) for column in range(self._nq)]
+        for column in self._equations.coordinates.rotation_columns:
+            part = slice(column, column + 3)
+            steps[part] = rotation_vector_derivative(q[part], steps[part])
+        return steps
+
+    def _active_motion(
+        self,
+        q: Sequence[Scalar],
+        gamma: Mapping[int, Mapping[int, Scalar]],
+        change: Sequence[Scalar],
+    ) -> list[Scalar]:
+        """Motion (n,) of the active joints along which their coordinates change.
+
+        It differs from the change of the coordinates for parts of rotation vectors in loops.
+
+        Args:
+            q: (nq,).
+            gamma: Entries by column and active joint.
+            change: (n,) change of the active coordinates.
+        """
+        is_rotation = self._equations.coordinates.is_rotation_vector
+        turning = [
+            k
+            for k, column in enumerate(self._active_columns.tolist())
+            if is_rotation[column] and sum(k in row for row in gamma.values()) > 1
+        ]
+        if not turning:
+            return list(change)
+        rates = [
+            self._coordinate_steps(q, {column: row.get(k, 0.0) for column, row in gamma.items()})
+            for k in range(self._n)
+        ]
+        columns = self._active_columns.tolist()
+        right = []
+        for j in turning:
+            others = [rates[k][columns[j]] * change[k] for k in range(self._n) if k not in turning]
+            right.append([change[j] - sum_scalars(others)])
+        found, _ = solve_linear_system(
+            [[rates[k][columns[j]] for k in turning] for j in turning], right
+        )
+        out = list(change)
+        for k, (value,) in zip(turning, found, strict=True):
+            out[k] = value
+        return out
 
     def _largest_gamma_entry(self, rows: Sequence[Scalar], inverse_length: Scalar) -> Scalar:
         turns = self.geometry.is_revolute
@@ -381,11 +450,20 @@ class CompiledClosure:
         q, n = tape.load_vector(1, 0, self._nq), self._n
         target = tape.load_vector(2, 0, n)
         change = [target[k] - q[column] for k, column in enumerate(self._active_columns)]
-        moves: list[Scalar] = [0.0] * len(self._passive_columns)
+        gamma: dict[int, dict[int, Scalar]] = {}  # by column
+        for k, column in enumerate(self._active_columns):
+            gamma[int(column)] = {k: 1.0}
         for i, (row, k) in enumerate(self._gamma_entry_pairs):
-            moves[row] = moves[row] + tape.load(1, self._nq + i) * change[k]
-        for column, move in zip(self._passive_columns, moves, strict=True):
-            q[column] = q[column] + move
+            column = int(self._passive_columns[row])
+            gamma.setdefault(column, {})[k] = tape.load(1, self._nq + i)
+        change = self._active_motion(q, gamma, change)
+        motion: dict[int, Scalar] = {}
+        for column in range(self._nq):
+            motion[column] = 0.0
+            for k, entry in gamma.get(column, {}).items():
+                motion[column] = motion[column] + entry * change[k]
+        moves = [motion[int(column)] for column in self._passive_columns]
+        q = add_vectors(q, self._coordinate_steps(q, motion))
         for column, value in zip(self._active_columns, target, strict=True):
             q[column] = value
         move = largest_scaled_value(
@@ -404,6 +482,13 @@ class CompiledClosure:
                 )
             ],
         )
+        if self.wraps_rotations:
+            q = Tape().load_vector(0, 0, self._nq)
+            for column in self._equations.coordinates.rotation_columns:
+                part = slice(column, column + 3)
+                if np.isin(range(column, column + 3), self._passive_columns).all():
+                    q[part] = wrap_rotation_vector(q[part])
+            program.add_formula("wrap", 1, q)
 
     def inverse_characteristic_length(self, tape: Tape) -> Scalar:
         """One over the characteristic length, from the geometry constants as first argument."""

@@ -254,6 +254,16 @@ class LoopEquations:
             :, None
         ] * self.coordinate_units
 
+    def displace(self, q: Array, columns: Indices, step: Array) -> Array:
+        """Configuration (nq,) after a displacement of some columns [rad], [characteristic lengths].
+
+        Displacements are integrals of velocities: those of a rotation vector are rotations about
+        the axes of the child, see `Coordinates.rate_matrix`.
+        """
+        displacement = np.zeros(len(q))
+        displacement[columns] = step * self.coordinate_units[columns]
+        return q + self.coordinates.coordinate_derivatives(q, displacement)
+
     def name_of_row(self, row: int) -> str:
         """Name of the loop or coupling that an equation belongs to."""
         return self.names[self.loop_of_row[row]]

@@ -126,7 +126,8 @@ class Joint:
             square of the gear ratio [kg m2], or [kg] for a prismatic joint.
         is_cut: Whether it closed a cycle and has no ends, while findings are collected.
         floating_joint: Name of the joint with six degrees of freedom that it belongs to, see
-            `crane.description.floating_bases`.
+            `crane.description.rotation_vectors`.
+        ball_joint: Name of the joint of which it is one of three rotations, likewise.
     """
 
     name: str
@@ -141,6 +142,7 @@ class Joint:
     rotor_inertia: float = 0.0
     is_cut: bool = False
     floating_joint: str = ""
+    ball_joint: str = ""
 
     @property
     def is_movable(self) -> bool:
@@ -261,6 +263,7 @@ def joint_series(
         source_location: File and line.
     """
     floating_joint = name if tuple(freedoms) == (*_TRANSLATIONS, *_ROTATIONS) else ""
+    is_ball = tuple(freedoms[-len(_ROTATIONS) :]) == _ROTATIONS
     links = [end_links[0], *(f"{name}_{i}" for i in range(1, len(freedoms))), end_links[1]]
     found: list[Link | Joint] = [
         Link(link, source_location, composite_joint=name) for link in links[1:-1]
@@ -273,6 +276,7 @@ def joint_series(
             Joint(
                 f"{name}_{suffix}", kind, parent, child, source_location, xyz, rpy, axis,
                 floating_joint=floating_joint,
+                ball_joint=name if is_ball and suffix in ("rx", "ry", "rz") else "",
             )
         )  # fmt: skip
     return found

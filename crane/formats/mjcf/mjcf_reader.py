@@ -7,7 +7,6 @@ import numpy as np
 import pinocchio as pin
 
 from crane.common.errors import DescriptionError
-from crane.description.floating_bases import with_rotation_vectors
 from crane.description.kinematic_tree import (
     Joint,
     Limits,
@@ -20,6 +19,7 @@ from crane.description.kinematic_tree import (
     with_rotor_inertias,
 )
 from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
+from crane.description.rotation_vectors import with_rotation_vectors
 from crane.description.specification import Chain, MachineSpec, source_locations
 from crane.formats.machine_file.structure_sections import TreeBuilder
 from crane.formats.mjcf.equality_constraints import MjcfFrames, read_equality_constraints
