@@ -310,13 +310,13 @@ class PositionKinematics:
             else:
                 rotation, arm = self._joint_placement(i)
                 origin = add_vectors(self.origin[parent], arm)
-                if geometry.reference_body and parent == 0:
-                    inverse_rotation = transpose(rotation)
-                    self.rotation[0], self.origin[0] = (
-                        inverse_rotation,
-                        scale_vector(-1.0, matvec(inverse_rotation, origin)),
-                    )
-                    rotation, origin = identity, [0.0] * 3
+            if geometry.reference_body and parent == 0:
+                inverse_rotation = transpose(rotation)
+                self.rotation[0], self.origin[0] = (
+                    inverse_rotation,
+                    scale_vector(-1.0, matvec(inverse_rotation, origin)),
+                )
+                rotation, origin = identity, [0.0] * 3
             self.offsets.append(scale_vector(float(parent > 0), arm))
             self.rotation.append(rotation)
             self.origin.append(origin)
