@@ -203,6 +203,27 @@ class Coordinates:
                 r *= 1 - 2 * np.pi * np.round(length / (2 * np.pi)) / length
         return out
 
+    def cardan_angles(self, q: Array) -> tuple[Array, Array]:
+        """Coordinates (nv,) with Cardan angles R = R_x R_y R_z in place of rotation vectors.
+
+        Returns:
+            The coordinates, and the matrix (nv, nv) of their time derivatives by the velocities,
+            which is singular where the second angle is 90 degrees.
+        """
+        out, rates = q.copy(), np.eye(len(q))
+        for column in self.rotation_columns:
+            rotation = slice(column, column + 3)
+            first, second, third = out[rotation] = cardan_angles(pin.exp3(q[rotation]))
+            s, c = np.sin(third), np.cos(third)
+            # columns: axes of the three angles in the axes of the child
+            axes = [
+                [c * np.cos(second), s, 0],
+                [-s * np.cos(second), c, 0],
+                [np.sin(second), 0, 1],
+            ]
+            rates[rotation, rotation] = np.linalg.pinv(axes)
+        return out, rates
+
     def has_partial_rotations(self, columns: Indices) -> bool:
         """Whether columns contain a part of a rotation vector, but not all of it."""
         return any(
@@ -228,3 +249,12 @@ class Coordinates:
         for column in self.rotation_columns:
             out[column : column + 3] = unlimited
         return out
+
+
+def cardan_angles(rotation: Array) -> tuple[float, float, float]:
+    """Angles a, b, c with rotation = R_x(a) R_y(b) R_z(c), of any rotation matrix (3, 3)."""
+    first = np.arctan2(-rotation[1, 2], rotation[2, 2])
+    sine, cosine = np.sin(first), np.cos(first)
+    second = np.arctan2(rotation[0, 2], cosine * rotation[2, 2] - sine * rotation[1, 2])
+    x, y = cosine * rotation[1, :2] + sine * rotation[2, :2]
+    return float(first), float(second), float(np.arctan2(x, y))

@@ -142,9 +142,9 @@ class TreeGeometry:
     """The geometry of a machine, which its kinematics formulas depend on.
 
     Joint i (1 to nb) moves body i and turns about or slides along the body's z axis; body 0 is the
-    world. A ball joint is a series of three bodies, a floating base one of six on the world, at the
-    position of the last one, which alone has mass: their velocities are along and about the axes
-    of that body.
+    world. A ball joint is a series of three bodies, a floating base one of six on the world, all
+    at the position of the last one, which alone has mass: the velocities are along and about the
+    axes of that body.
 
     Attributes:
         parents: (nb + 1,) parent bodies.

@@ -255,7 +255,7 @@ class LoopEquations:
         ] * self.coordinate_units
 
     def displace(self, q: Array, columns: Indices, step: Array) -> Array:
-        """Configuration (nq,) after a displacement of some columns [rad], [characteristic lengths].
+        """Configuration (nq,) after a displacement of some columns, scaled by their units.
 
         Displacements are integrals of velocities: those of a rotation vector are rotations about
         the axes of the child, see `Coordinates.rate_matrix`.

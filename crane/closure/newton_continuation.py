@@ -136,9 +136,7 @@ class NewtonContinuation:
         return None
 
     def _scaled_passive_gamma(self, jacobian: Array) -> Array:
-        return solve_linear(
-            jacobian[:, self._passive_columns], -jacobian[:, self._active_columns]
-        )
+        return solve_linear(jacobian[:, self._passive_columns], -jacobian[:, self._active_columns])
 
     def _displacement_of(self, q: Array, passive_gamma: Array, active_step: Array) -> Array:
         """Scaled displacements (nv,) along which the active coordinates change by a step (n,).
@@ -323,9 +321,7 @@ class NewtonContinuation:
                 else start.q_a + next_progress * (target - start.q_a)
             )
             # towards a fold Newton only converges linearly
-            corrected = self._predict_and_correct(
-                current, q_a, 8 if step > _MIN_STEP * 16 else 40
-            )
+            corrected = self._predict_and_correct(current, q_a, 8 if step > _MIN_STEP * 16 else 40)
             if corrected is None:
                 step /= 2
                 continue

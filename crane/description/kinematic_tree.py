@@ -19,7 +19,7 @@ Placement = tuple[Vector, Vector]  # xyz [m], rpy [rad] as URDF has them: R_z(y)
 Freedom = tuple[str, str, Vector]  # of a composite joint: suffix, kind, axis
 
 _X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
-_ROTATIONS: tuple[Freedom, ...] = (
+ROTATIONS: tuple[Freedom, ...] = (
     ("rx", "revolute", _X), ("ry", "revolute", _Y), ("rz", "revolute", _Z),
 )  # fmt: skip
 _TRANSLATIONS: tuple[Freedom, ...] = (
@@ -127,7 +127,6 @@ class Joint:
         is_cut: Whether it closed a cycle and has no ends, while findings are collected.
         floating_joint: Name of the joint with six degrees of freedom that it belongs to, see
             `crane.description.rotation_vectors`.
-        ball_joint: Name of the joint of which it is one of three rotations, likewise.
     """
 
     name: str
@@ -142,7 +141,6 @@ class Joint:
     rotor_inertia: float = 0.0
     is_cut: bool = False
     floating_joint: str = ""
-    ball_joint: str = ""
 
     @property
     def is_movable(self) -> bool:
@@ -233,9 +231,9 @@ def joint_freedoms(kind: str, axis: Sequence[float]) -> tuple[Freedom, ...]:
         axis: Normal of the plane of a planar joint.
     """
     if kind == "spherical":
-        return _ROTATIONS
+        return ROTATIONS
     if kind == "floating":
-        return (*_TRANSLATIONS, *_ROTATIONS)
+        return (*_TRANSLATIONS, *ROTATIONS)
     normal = np.asarray(axis, dtype=np.float64)
     first = np.cross(np.eye(3)[np.argmin(np.abs(normal))], normal)
     first /= np.linalg.norm(first)
@@ -262,8 +260,7 @@ def joint_series(
         end_links: Parent and child link.
         source_location: File and line.
     """
-    floating_joint = name if tuple(freedoms) == (*_TRANSLATIONS, *_ROTATIONS) else ""
-    is_ball = tuple(freedoms[-len(_ROTATIONS) :]) == _ROTATIONS
+    floating_joint = name if tuple(freedoms) == (*_TRANSLATIONS, *ROTATIONS) else ""
     links = [end_links[0], *(f"{name}_{i}" for i in range(1, len(freedoms))), end_links[1]]
     found: list[Link | Joint] = [
         Link(link, source_location, composite_joint=name) for link in links[1:-1]
@@ -276,7 +273,6 @@ def joint_series(
             Joint(
                 f"{name}_{suffix}", kind, parent, child, source_location, xyz, rpy, axis,
                 floating_joint=floating_joint,
-                ball_joint=name if is_ball and suffix in ("rx", "ry", "rz") else "",
             )
         )  # fmt: skip
     return found

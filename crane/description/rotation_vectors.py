@@ -2,10 +2,10 @@
 
 A joint with three rotations is read as a series of three revolute joints (see
 `crane.description.kinematic_tree`), whose Cardan angles are singular where the second is 90
-degrees. Unless a spring, an end stop, a drive or a coupling acts on one of these angles, the
-series is one spherical joint. Its coordinates are the rotation vector r [rad] of the child in the
-frame of the joint, R = exp(r x), of length at most pi; its velocities are the relative angular
-velocity w [rad/s] in the axes of the child, and its forces moments about these axes [N m]:
+degrees. Unless a spring, an end stop or a coupling acts on one of these angles, the series is one
+spherical joint. Its coordinates are the rotation vector r [rad] of the child in the frame of the
+joint, R = exp(r x), of length at most pi; its velocities are the relative angular velocity w
+[rad/s] in the axes of the child, and its forces moments about these axes [N m]:
 
     r' = (1 + r x / 2 + c (r x)^2) w,   c = (1 - (t/2) cot(t/2)) / t^2,   t = |r|
 
@@ -23,6 +23,7 @@ from collections.abc import Mapping, Sequence
 
 from crane.common.errors import InputError
 from crane.description.kinematic_tree import (
+    ROTATIONS,
     Joint,
     Link,
     Tree,
@@ -33,7 +34,8 @@ from crane.description.kinematic_tree import (
 from crane.description.specification import MachineSpec
 
 FLOATING_FREEDOMS = ("x", "y", "z", "rx", "ry", "rz")
-ROTATION_COUNT = 3
+ROTATION_COUNT = len(ROTATIONS)
+_FIRST_ROTATION = ROTATIONS[0][0]
 
 
 def composite_joints(spec: MachineSpec) -> dict[str, tuple[str, ...]]:
@@ -41,11 +43,21 @@ def composite_joints(spec: MachineSpec) -> dict[str, tuple[str, ...]]:
 
     Six for a floating base, three for a ball joint.
     """
-    found = floating_bases(spec)
-    acted_on = _constrained_joints(spec)
-    for name, series in _series_by_joint(spec, "ball_joint").items():
-        names = tuple(joint.name for joint in series)
-        if name not in found and len(names) == ROTATION_COUNT and not acted_on & set(names):
+    found, constrained = floating_bases(spec), _constrained_joints(spec)
+    joints, links = spec.tree.joints, spec.tree.links
+    for joint in joints.values():
+        name = joint.name.removesuffix(f"_{_FIRST_ROTATION}")
+        names = tuple(f"{name}_{part}" for part, _, _ in ROTATIONS)
+        if joint.name != names[0] or name in found or constrained & set(names):
+            continue
+        series = [joints[x] for x in names if x in joints]
+        between = [part.child for part in series[:-1]]
+        if (
+            [(x.kind, x.axis) for x in series] == [(kind, axis) for _, kind, axis in ROTATIONS]
+            and [(x.parent, *x.xyz, *x.rpy) for x in series[1:]]
+            == [(link, *[0.0] * 6) for link in between]
+            and all(links[link].composite_joint is not None for link in between)
+        ):
             found[name] = names
     return found
 
@@ -66,27 +78,21 @@ def floating_bases(spec: MachineSpec) -> dict[str, tuple[str, ...]]:
 
 def floating_series(spec: MachineSpec) -> dict[str, tuple[str, ...]]:
     """Return the same, and the movable joints of series of which some are locked or missing."""
+    series_by_joint: dict[str, list[Joint]] = {}
+    for joint in spec.tree.joints.values():
+        if joint.floating_joint and joint.is_movable:
+            series_by_joint.setdefault(joint.floating_joint, []).append(joint)
     return {
         name: tuple(joint.name for joint in series)
-        for name, series in _series_by_joint(spec, "floating_joint").items()
+        for name, series in series_by_joint.items()
         if _is_unconstrained(spec, series)
     }
 
 
-def _series_by_joint(spec: MachineSpec, attribute: str) -> dict[str, list[Joint]]:
-    found: dict[str, list[Joint]] = {}
-    for joint in spec.tree.joints.values():
-        name = getattr(joint, attribute)
-        if name and joint.is_movable:
-            found.setdefault(name, []).append(joint)
-    return found
-
-
 def _constrained_joints(spec: MachineSpec) -> set[str]:
-    """Joints whose coordinates springs, end stops, drives or couplings act on."""
+    """Joints whose coordinates springs, end stops or couplings act on."""
     joints = {part.joint for part in spec.force_elements if part.between is None}
     joints |= {part.joint for part in spec.end_stops}
-    joints |= {joint for drive in spec.drives for joint in drive.factors}
     return joints | {joint for coupling in spec.couplings for joint in coupling.factors}
 
 
@@ -96,6 +102,7 @@ def _is_unconstrained(spec: MachineSpec, series: list[Joint]) -> bool:
     if body_of(parent_joints, series[0].parent) in parent_joints:
         return False  # another body carries it
     driven_joints = set(spec.active or ()) - set(spec.free)
+    driven_joints |= {joint for drive in spec.drives for joint in drive.factors}
     if {joint.name for joint in series} & (_constrained_joints(spec) | driven_joints):
         return False
     return not any(

@@ -148,8 +148,11 @@ class SimulatedMotion:
                 f"'{machine.name}' with its controller has no formulas to differentiate: lock "
                 "joints, or write the controller as a Law, and loads as ExternalForce"
             )
-        if machine.coordinates.floating_base_columns:
-            raise InputError(f"'{machine.name}' floats, sensitivities are of machines that stand")
+        if machine.coordinates.rotation_columns:
+            raise InputError(
+                f"'{machine.name}' floats or has ball joints, whose rotation vectors have no "
+                "sensitivities: lock them"
+            )
         if state_count(machine.external_forces):
             raise InputError(
                 f"'{machine.name}' has contacts that give way along the ground, sensitivities "
