@@ -122,14 +122,21 @@ class CompiledClosure:
         self._home = home
         self.tolerances = np.array([1e-15 * rounding_scale, 1e-13 * rounding_scale, 1e-9])
 
+    @cached_property
+    def _active_rotations(self) -> list[tuple[range, list[int]]]:
+        """Columns of each rotation vector, and the active ones of them."""
+        vectors = [range(body - 1, body + 2) for body in self.geometry.rotation_bodies]
+        active = set(self._active_columns.tolist())
+        return [(columns, [i for i in columns if i in active]) for columns in vectors]
+
     @property
     def wraps_rotations(self) -> bool:
         """Whether there are passive rotation vectors, whose length solutions limit to pi."""
-        return self._equations.coordinates.is_rotation_vector[self._passive_columns].any()
+        return any(not part for _, part in self._active_rotations)
 
     @cached_property
     def _has_partly_active_rotations(self) -> bool:
-        return self._equations.coordinates.has_partial_rotations(self._active_columns)
+        return any(part and len(part) < len(parts) for parts, part in self._active_rotations)
 
     def _find_gamma_entries(self) -> tuple[Indices, Indices]:
         """Rows and columns of the nonzero entries of gamma: joints of the same cluster."""
@@ -358,8 +365,8 @@ class CompiledClosure:
     def _coordinate_steps(self, q: Sequence[Scalar], motion: Mapping[int, Scalar]) -> list[Scalar]:
         """Steps of the coordinates along a small motion of the joints, by column."""
         steps = [motion.get(column, 0.0) for column in range(self._nq)]
-        for column in self._equations.coordinates.rotation_columns:
-            part = slice(column, column + 3)
+        for columns, _ in self._active_rotations:
+            part = slice(columns.start, columns.stop)
             steps[part] = rotation_vector_derivative(q[part], steps[part])
         return steps
 
@@ -378,11 +385,11 @@ class CompiledClosure:
             gamma: Entries by column and active joint.
             change: (n,) change of the active coordinates.
         """
-        is_rotation = self._equations.coordinates.is_rotation_vector
+        rotations = {column for _, active in self._active_rotations for column in active}
         turning = [
             k
             for k, column in enumerate(self._active_columns.tolist())
-            if is_rotation[column] and sum(k in row for row in gamma.values()) > 1
+            if column in rotations and sum(k in row for row in gamma.values()) > 1
         ]
         if not turning:
             return list(change)
@@ -484,9 +491,9 @@ class CompiledClosure:
         )
         if self.wraps_rotations:
             q = Tape().load_vector(0, 0, self._nq)
-            for column in self._equations.coordinates.rotation_columns:
-                part = slice(column, column + 3)
-                if np.isin(range(column, column + 3), self._passive_columns).all():
+            for columns, active in self._active_rotations:
+                part = slice(columns.start, columns.stop)
+                if not active:
                     q[part] = wrap_rotation_vector(q[part])
             program.add_formula("wrap", 1, q)
 

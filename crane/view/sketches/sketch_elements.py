@@ -107,7 +107,7 @@ def _revolute_axes(machine: Machine, data: pin.Data) -> tuple[Array, list[int]]:
     """Return the directions (k, 3) of all revolute axes, and the parent joint of each."""
     model, equations = machine.model, machine.closure.equations
     all_axes, axes, carriers = joint_axes(machine, data), [], []
-    for i, name in zip(machine.coordinates.joints, machine.joints, strict=True):
+    for i, name in zip(machine.coordinates.joints.tolist(), machine.joints, strict=True):
         if machine.unit(name) == "rad" and model.joints[i].nv == 1:
             axes.append(all_axes[i])
             carriers.append(int(model.parents[i]))
