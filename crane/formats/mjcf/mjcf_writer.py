@@ -11,6 +11,7 @@ from lxml import etree
 from crane.common.atomic_output import replace_file
 from crane.common.errors import CraneWarning, InputError
 from crane.description.force_elements import ForceElement, Friction, Rope, element_name
+from crane.description.kinematic_tree import ROTATIONS
 from crane.description.rotation_vectors import ROTATION_COUNT
 from crane.description.specification import Coupling, LoopSpec
 from crane.formats.urdf.urdf_writer import (
@@ -113,7 +114,15 @@ class _MjcfWriter:
             self._add_coupling(equality, tendons, coupling)
         for drive in self.machine.drives:
             target = {"joint": drive.name}
-            if dict(drive.factors) != {drive.name: 1.0}:
+            joints = {
+                self.model.names[int(self.machine.coordinates.joints[self.machine.column(joint)])]
+                for joint in drive.factors
+            }
+            if len(joints) == 1 and joints != set(drive.factors):  # about an axis of a ball
+                (ball,) = joints
+                gear = [drive.factors.get(f"{ball}_{part}", 0.0) for part, _, _ in ROTATIONS]
+                target = {"joint": ball, "gear": format_numbers(gear)}
+            elif dict(drive.factors) != {drive.name: 1.0}:
                 target = {"tendon": _add_fixed_tendon(tendons, drive.name, drive.factors)}
             add(actuator, "motor", {"name": drive.name, **target})
         force_elements: list[ForceElement | Rope] = [*self.machine.forces, *self.machine.ropes]
