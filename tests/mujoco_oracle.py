@@ -100,7 +100,8 @@ class Oracle:
                 out[dof] = along[self.machine.column(name)]
                 continue
             if (fly := self._floats(name)) is not None:
-                out[dof : dof + 6] = *(self._turned(q, fly[3:])[0] @ along[fly[:3]]), *along[fly[3:]]
+                turn = self._turned(q, fly[3:])[0]
+                out[dof : dof + 6] = *(turn @ along[fly[:3]]), *along[fly[3:]]
                 continue
             if model.jnt_type[joint] == 0:
                 out[dof : dof + 3] = [along[self.machine.column(f"{name}_{x}")] for x in "xyz"]

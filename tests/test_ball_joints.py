@@ -318,8 +318,8 @@ def stewart(folder):
     def link(name, mass, com, moments):
         place, (xx, yy, zz) = " ".join(map(str, com)), moments
         lines.append(
-            f'<link name="{name}"><inertial><origin xyz="{place}"/><mass value="{mass}"/>'
-            f'<inertia ixx="{xx}" iyy="{yy}" izz="{zz}" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+            f'<link name="{name}"><inertial><origin xyz="{place}"/><mass value="{mass}"/><inertia '
+            f'ixx="{xx}" iyy="{yy}" izz="{zz}" ixy="0" ixz="0" iyz="0"/></inertial></link>'
         )
 
     def joint(name, kind, parent, child, xyz, rpy=(0, 0, 0)):
@@ -386,3 +386,29 @@ def test_a_platform_on_struts_that_spin(tmp_path):
         columns = [machine.column(f"f{i}_r{x}") for x in "xyz"]
         assert np.linalg.norm(q[:, columns], axis=1).max() > 0.9 * np.pi
     assert energy_error(run) < 1e-10
+
+
+def test_recordings_have_quaternions_or_rotation_vectors(tmp_path):
+    """A recording by quaternions alone, of either sign, is the one by rotation vectors."""
+    machine = load(tmp_path, ROD)
+    run = crane.simulate(machine, None, [0.0, 1.0, 2.0, 0.3], 1.0, 1e-3)
+    quaternions = run.rotations("b").as_quat(scalar_first=True)
+    quaternions[::2] *= -1.0  # the same rotations
+    names = ["h_force", "b_rx_force", "b_ry_force", "b_rz_force"]
+    header = ["time [s]", "h [rad]", *(f"b_q{x}" for x in "wxyz"), *(f"{x} [N m]" for x in names)]
+    values = np.column_stack([run.time, run.q[:, 0], quaternions, 0 * run.tau])
+    rows = [",".join(header), *(",".join(map(repr, map(float, row))) for row in values)]
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
+    found = crane.recordings.read_measured(machine, tmp_path / "log.csv")
+    order = [found.joints.index(x) for x in run.joints]
+    assert angle_between(found.q[:, order][:, 1:], run.q[:, 1:]).max() < 1e-7
+    # central differences, off by h^2 / 6 times the second derivative
+    bend = np.abs(np.diff(run.v, 2, axis=0)).max()
+    np.testing.assert_allclose(found.v[:, order][1:-1], run.v[1:-1], atol=0.2 * bend)
+    angles = found.rotations("b").as_euler("XYZ")
+    again = Rotation.from_euler("XYZ", angles).as_rotvec()
+    assert angle_between(again, run.q[:, 1:]).max() < 1e-7
+    short = [rows[0], rows[1], rows[2].replace(repr(float(quaternions[1, 0])), "7.0")]
+    (tmp_path / "short.csv").write_text("\n".join(short) + "\n")
+    with pytest.raises(crane.CraneError, match="'b_qw' to 'b_qz' have the length .* at sample 1"):
+        crane.recordings.read_measured(machine, tmp_path / "short.csv")

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from crane.closure.coordinates import Coordinates, Indices
 from crane.common.errors import MechanismError
@@ -254,7 +255,7 @@ class LoopEquations:
             :, None
         ] * self.coordinate_units
 
-    def displace(self, q: Array, columns: Indices, step: Array) -> Array:
+    def displace(self, q: Array, columns: NDArray[Any], step: NDArray[Any]) -> Array:
         """Configuration (nq,) after a displacement of some columns, scaled by their units.
 
         Displacements are integrals of velocities: those of a rotation vector are rotations about
