@@ -1,6 +1,6 @@
 """Machine code that closes the loops of one machine by Newton's method."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from weakref import WeakValueDictionary
@@ -15,15 +15,14 @@ from crane.closure.kinematics_formulas import (
     PositionKinematics,
     folding_pattern,
     largest_scaled_value,
-    rotation_vector_derivative,
     tree_geometry,
-    wrap_rotation_vector,
 )
 from crane.closure.loop_equations import Cluster, LoopEquations, find_clusters
 from crane.closure.loop_formulas import LoopFormulas
 from crane.closure.newton_continuation import ClosedConfiguration
+from crane.closure.predictor_formulas import PredictorFormulas
 from crane.codegen import Layout, LayoutView, Program, Scalar, Tape, max_abs, maximum
-from crane.codegen.symbolic import add_vectors, minimum, solve_linear_system, sum_scalars
+from crane.codegen.symbolic import minimum
 from crane.common.samples import Array
 
 # Scaled values: rad and characteristic length, as in `NewtonContinuation`.
@@ -105,6 +104,9 @@ class CompiledClosure:
         self._gamma_entries = self._find_gamma_entries()
         rows, columns = self._gamma_entries
         self._gamma_entry_pairs = list(zip(rows.tolist(), columns.tolist(), strict=True))
+        self._predictor = PredictorFormulas(
+            self.geometry, active, passive, self._gamma_entry_pairs
+        )
         signs = self._determinant_signs(home)
         key = self._cache_key(signs)
         shared = _SHARED_CODE.get(key)
@@ -117,26 +119,10 @@ class CompiledClosure:
         self._closure_program = program
         self.follow_address = program.function_address("follow")
         self.close_address = program.function_address(
-            "project" if self._has_partly_active_rotations else "close"
+            "project" if self._predictor.has_partly_active_rotations else "close"
         )
         self._home = home
         self.tolerances = np.array([1e-15 * rounding_scale, 1e-13 * rounding_scale, 1e-9])
-
-    @cached_property
-    def _active_rotations(self) -> list[tuple[range, list[int]]]:
-        """Columns of each rotation vector, and the active ones of them."""
-        vectors = [range(body - 1, body + 2) for body in self.geometry.rotation_bodies]
-        active = set(self._active_columns.tolist())
-        return [(columns, [i for i in columns if i in active]) for columns in vectors]
-
-    @property
-    def wraps_rotations(self) -> bool:
-        """Whether there are passive rotation vectors, whose length solutions limit to pi."""
-        return any(not part for _, part in self._active_rotations)
-
-    @cached_property
-    def _has_partly_active_rotations(self) -> bool:
-        return any(part and len(part) < len(parts) for parts, part in self._active_rotations)
 
     def _find_gamma_entries(self) -> tuple[Indices, Indices]:
         """Rows and columns of the nonzero entries of gamma: joints of the same cluster."""
@@ -187,12 +173,16 @@ class CompiledClosure:
 
     def _build(self, program: Program, signs: Array) -> None:
         self._add_newton_formula(program, signs, "newton", holds_coordinates=True)
-        if self._has_partly_active_rotations:
+        if self._predictor.has_partly_active_rotations:
             self._add_newton_formula(program, signs, "newton_motion", holds_coordinates=False)
-        self._add_predictor(program)
+        self._predictor.add_to(program)
         self._add_gamma(program)
         add_closure_routines(
-            program, self._nq, self._n, self._has_partly_active_rotations, self.wraps_rotations
+            program,
+            self._nq,
+            self._n,
+            self._predictor.has_partly_active_rotations,
+            self._predictor.wraps_rotations,
         )
 
     def cached_program(self, key: tuple, build: Callable[[Program], None]) -> Program:
@@ -362,54 +352,6 @@ class CompiledClosure:
             },
         )
 
-    def _coordinate_steps(self, q: Sequence[Scalar], motion: Mapping[int, Scalar]) -> list[Scalar]:
-        """Steps of the coordinates along a small motion of the joints, by column."""
-        steps = [motion.get(column, 0.0) for column in range(self._nq)]
-        for columns, _ in self._active_rotations:
-            part = slice(columns.start, columns.stop)
-            steps[part] = rotation_vector_derivative(q[part], steps[part])
-        return steps
-
-    def _active_motion(
-        self,
-        q: Sequence[Scalar],
-        gamma: Mapping[int, Mapping[int, Scalar]],
-        change: Sequence[Scalar],
-    ) -> list[Scalar]:
-        """Motion (n,) of the active joints along which their coordinates change.
-
-        It differs from the change of the coordinates for parts of rotation vectors in loops.
-
-        Args:
-            q: (nq,).
-            gamma: Entries by column and active joint.
-            change: (n,) change of the active coordinates.
-        """
-        rotations = {column for _, active in self._active_rotations for column in active}
-        turning = [
-            k
-            for k, column in enumerate(self._active_columns.tolist())
-            if column in rotations and sum(k in row for row in gamma.values()) > 1
-        ]
-        if not turning:
-            return list(change)
-        rates = [
-            self._coordinate_steps(q, {column: row.get(k, 0.0) for column, row in gamma.items()})
-            for k in range(self._n)
-        ]
-        columns = self._active_columns.tolist()
-        right = []
-        for j in turning:
-            others = [rates[k][columns[j]] * change[k] for k in range(self._n) if k not in turning]
-            right.append([change[j] - sum_scalars(others)])
-        found, _ = solve_linear_system(
-            [[rates[k][columns[j]] for k in turning] for j in turning], right
-        )
-        out = list(change)
-        for k, (value,) in zip(turning, found, strict=True):
-            out[k] = value
-        return out
-
     def _largest_gamma_entry(self, rows: Sequence[Scalar], inverse_length: Scalar) -> Scalar:
         turns = self.geometry.is_revolute
         powers: dict[int, list[Scalar]] = {0: [], 1: [], -1: []}  # power of a length in an entry
@@ -444,59 +386,6 @@ class CompiledClosure:
         )
         return np.array([np.linalg.slogdet(block)[0] for block in blocks])
 
-    def _add_predictor(self, program: Program) -> None:
-        """Add `predict` and `distance`.
-
-        predict(constants, cursor, target) -> q, largest scaled step of a passive joint;
-        distance(constants, q, q') -> largest scaled difference of a passive joint.
-        """
-        is_translation = [
-            not self.geometry.is_revolute[column + 1] for column in self._passive_columns
-        ]
-        tape = Tape()
-        q, n = tape.load_vector(1, 0, self._nq), self._n
-        target = tape.load_vector(2, 0, n)
-        change = [target[k] - q[column] for k, column in enumerate(self._active_columns)]
-        gamma: dict[int, dict[int, Scalar]] = {}  # by column
-        for k, column in enumerate(self._active_columns):
-            gamma[int(column)] = {k: 1.0}
-        for i, (row, k) in enumerate(self._gamma_entry_pairs):
-            column = int(self._passive_columns[row])
-            gamma.setdefault(column, {})[k] = tape.load(1, self._nq + i)
-        change = self._active_motion(q, gamma, change)
-        motion: dict[int, Scalar] = {}
-        for column in range(self._nq):
-            motion[column] = 0.0
-            for k, entry in gamma.get(column, {}).items():
-                motion[column] = motion[column] + entry * change[k]
-        moves = [motion[int(column)] for column in self._passive_columns]
-        q = add_vectors(q, self._coordinate_steps(q, motion))
-        for column, value in zip(self._active_columns, target, strict=True):
-            q[column] = value
-        move = largest_scaled_value(
-            moves, is_translation, self.inverse_characteristic_length(tape)
-        )
-        program.add_formula("predict", 3, {"q": q, "move": [move]})
-        tape = Tape()
-        one, two = tape.load_vector(1, 0, self._nq), tape.load_vector(2, 0, self._nq)
-        differences = [one[i] - two[i] for i in self._passive_columns]
-        program.add_formula(
-            "distance",
-            3,
-            [
-                largest_scaled_value(
-                    differences, is_translation, self.inverse_characteristic_length(tape)
-                )
-            ],
-        )
-        if self.wraps_rotations:
-            q = Tape().load_vector(0, 0, self._nq)
-            for columns, active in self._active_rotations:
-                part = slice(columns.start, columns.stop)
-                if not active:
-                    q[part] = wrap_rotation_vector(q[part])
-            program.add_formula("wrap", 1, q)
-
     def inverse_characteristic_length(self, tape: Tape) -> Scalar:
         """One over the characteristic length, from the geometry constants as first argument."""
-        return FormulaConstants(tape, 0, self.geometry.constants)[len(self.geometry.constants) - 1]
+        return self._predictor.inverse_characteristic_length(tape)

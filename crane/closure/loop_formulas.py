@@ -213,11 +213,22 @@ class LoopFormulas:
         """Newton step of the coordinates of the passive joints, by joint.
 
         Args:
+            holds_coordinates: See `coordinate_changes`.
+        """
+        return self.coordinate_changes([row.phi for row in self.rows], holds_coordinates)
+
+    def coordinate_changes(
+        self, gaps: Sequence[Scalar], holds_coordinates: bool = True
+    ) -> dict[int, Scalar]:
+        """Changes of the coordinates of the passive joints that close gaps, to first order.
+
+        Args:
+            gaps: Residuals by row.
             holds_coordinates: Whether active coordinates that are parts of a rotation vector stay
                 constant; else the active joints do not move, but these coordinates may change.
         """
         x, _ = self.solve_passive(
-            {joint: [0.0] for joint in self.active_joints}, [[-row.phi] for row in self.rows]
+            {joint: [0.0] for joint in self.active_joints}, [[-gap] for gap in gaps]
         )
         motion = {joint: row[0] for joint, row in x.items()}
         steps = self.coordinate_steps(motion)

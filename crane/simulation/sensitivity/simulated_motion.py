@@ -148,10 +148,10 @@ class SimulatedMotion:
                 f"'{machine.name}' with its controller has no formulas to differentiate: lock "
                 "joints, or write the controller as a Law, and loads as ExternalForce"
             )
-        if machine.coordinates.rotation_columns:
+        if machine.coordinates.is_rotation_vector[machine.closure.active].any():
             raise InputError(
-                f"'{machine.name}' floats or has ball joints, whose rotation vectors have no "
-                "sensitivities: lock them"
+                f"'{machine.name}' floats or turns freely about a ball joint, sensitivities are "
+                "of machines without active rotation vectors: lock them"
             )
         if state_count(machine.external_forces):
             raise InputError(
