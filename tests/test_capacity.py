@@ -16,11 +16,6 @@ G = np.array([0.0, 0.0, -9.81])
 PUMP = 3.5e7  # of the excavator [Pa]
 
 
-@pytest.fixture(scope="module")
-def excavator():
-    return crane.load("excavator")
-
-
 def cells(chart, count, seed=0):
     """Some that are reached: slew, height, radius."""
     reached = np.argwhere(np.isfinite(chart.loads))

@@ -28,11 +28,6 @@ TANK = 3.0e5
 
 
 @pytest.fixture(scope="module")
-def excavator():
-    return crane.load("excavator")
-
-
-@pytest.fixture(scope="module")
 def chart(excavator):
     return crane.capacity(excavator, "bucket", rule="iso10567")
 

@@ -5,7 +5,6 @@ import pytest
 from executed_lines import passes
 from forwarder_motions import motion
 
-import crane
 from crane.dynamics import Dynamics
 from crane.identification.mechanics import force_comparison
 from crane.identification.mechanics.identify import identify
@@ -15,11 +14,6 @@ from crane.recordings.measured_recordings import read_run
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 ASIDE = 2000  # samples at random postures for the base parameters, and at home, about
-
-
-@pytest.fixture(scope="module")
-def mini():
-    return crane.load("mini_forwarder")
 
 
 @pytest.fixture(scope="module")

@@ -47,11 +47,6 @@ class Lone:
 
 
 @pytest.fixture(scope="module")
-def mini():
-    return crane.load("mini_forwarder")
-
-
-@pytest.fixture(scope="module")
 def bare(mini):
     return mini.replace(friction={}, forces=(), end_stops=())
 

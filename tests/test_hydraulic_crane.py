@@ -15,11 +15,6 @@ LIFT = 1  # column of X_lift
 
 
 @pytest.fixture(scope="module")
-def patu():
-    return crane.load("patu655")
-
-
-@pytest.fixture(scope="module")
 def loaded():
     return crane.load("patu655", changes=LOAD)
 

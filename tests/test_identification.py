@@ -28,11 +28,6 @@ pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 FINGERS = {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0}
 
 
-@pytest.fixture(scope="module")
-def mini():
-    return crane.load("mini_forwarder")
-
-
 def inertial(machine):
     return IdentificationModel(machine, [InertialTerm(machine)])
 

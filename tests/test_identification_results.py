@@ -38,11 +38,6 @@ pytestmark = [pytest.mark.filterwarnings("ignore::crane.CraneWarning"), pytest.m
 motion = partial(forwarder_motions.motion, duration=20.0, noise=1.0)
 
 
-@pytest.fixture(scope="module")
-def mini():
-    return crane.load("mini_forwarder")
-
-
 def as_recording(machine, given):
     units = {joint: machine.unit(joint) for joint in machine.active}
     return crane.Recording(

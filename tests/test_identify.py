@@ -26,11 +26,6 @@ pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 motion = partial(forwarder_motions.motion, step=2e-3)
 
 
-@pytest.fixture(scope="module")
-def mini():
-    return crane.load("mini_forwarder")
-
-
 def scales(model):
     """What counts as one of each parameter: masses and sizes of the bodies, friction."""
     out = np.maximum(np.abs(model.nominal), 0.1)

@@ -5,7 +5,6 @@ import re
 import signal
 import subprocess
 import sys
-import warnings
 
 import numpy as np
 import pinocchio as pin
@@ -17,22 +16,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import crane
-from crane.common.errors import CraneWarning, InputError, RecordingError
+from crane.common.errors import InputError, RecordingError
 from crane.recordings.recording import Recording
 from crane.view.live.live_page import readout_html, warning_html
 from crane.view.live.live_session import Playback, Session, round_up_to_nice
-
-
-@pytest.fixture(scope="module")
-def patu():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        return crane.load("patu655")
-
-
-@pytest.fixture(scope="module")
-def five_bar():
-    return crane.load(DATA / "five_bar.urdf")
 
 
 @pytest.fixture

@@ -121,11 +121,6 @@ def slope(function, *at):
 
 
 @pytest.fixture(scope="module")
-def patu():
-    return crane.load("patu655")
-
-
-@pytest.fixture(scope="module")
 def loaded():
     return crane.load("patu655", {"payload.mass": LOAD})
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-import crane
 from crane.identification.estimation import estimators, regressor
 from crane.identification.estimation.estimators import (
     huber,
@@ -32,11 +31,6 @@ from crane.identification.signals.signal_processing import Motion, filter_rows
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 motion = partial(forwarder_motions.motion, period=8.0, duration=16.0, step=2e-3, noise=1.0)
-
-
-@pytest.fixture(scope="module")
-def mini():
-    return crane.load("mini_forwarder")
 
 
 def rows(seed=0, count=3000):

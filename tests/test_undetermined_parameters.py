@@ -29,13 +29,6 @@ motion = partial(forwarder_motions.motion, period=8.0, duration=16.0)
 
 
 @pytest.fixture(scope="module")
-def mini():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        return crane.load("mini_forwarder")
-
-
-@pytest.fixture(scope="module")
 def plain(mini):
     with pytest.warns(CraneWarning, match="does not determine .* of 75 base parameters"):
         return identify(mini, noisy(motion(mini), 1))

@@ -202,16 +202,6 @@ def test_attitudes_go_on_beyond_half_a_turn():
 # --- inverse kinematics ----------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def excavator():
-    return crane.load("excavator")
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return crane.load("kr300")
-
-
 def drawn(machine, count, seed):
     draw = np.random.default_rng(seed)
     low, high = np.maximum(machine.lower, -1.5), np.minimum(machine.upper, 1.5)
@@ -259,7 +249,7 @@ def test_an_axis_along_y_counts_alike(tmp_path):
 
 
 def _boom(folder, axis):
-    text = '<robot name="boom"><link name="base"/>'
+    text = '<kr300 name="boom"><link name="base"/>'
     for i in range(3):
         parent = f"link{i - 1}" if i else "base"
         text += (
@@ -271,7 +261,7 @@ def _boom(folder, axis):
         )
     text += (
         '<link name="tool"/><joint name="tip" type="fixed"><origin xyz="1 0 0"/>'
-        '<parent link="link2"/><child link="tool"/></joint></robot>'
+        '<parent link="link2"/><child link="tool"/></joint></kr300>'
     )
     path = folder / "boom.urdf"
     path.write_text(text)
@@ -293,7 +283,7 @@ def test_three_drives_in_a_plane_have_position_and_inclination(tmp_path):
 )
 def test_jacobian_and_bias_with_an_attitude(name, attitude, request):
     """Against differences of forward kinematics along a curve q + v s + a s^2/2."""
-    machine = request.getfixturevalue({"kr300": "robot"}.get(name, name))
+    machine = request.getfixturevalue({"kr300": "kr300"}.get(name, name))
     kinematics, draw = crane.Kinematics(machine), np.random.default_rng(2)
     for q_a in drawn(machine, 6, 3):
         v_a, a_a = 0.3 * draw.normal(size=(2, len(q_a)))
@@ -326,8 +316,8 @@ def test_positions_and_inclinations_come_back(excavator):
             assert np.abs((off + np.pi) % (2 * np.pi) - np.pi) < 1e-10
 
 
-def test_positions_and_rotations_come_back(robot):
-    kinematics, drawn_at = crane.Kinematics(robot), drawn(robot, 8, 5)
+def test_positions_and_rotations_come_back(kr300):
+    kinematics, drawn_at = crane.Kinematics(kr300), drawn(kr300, 8, 5)
     positions, rotations = kinematics.position(drawn_at), kinematics.rotation(drawn_at)
     for k, (position, rotation) in enumerate(zip(positions, rotations, strict=True)):
         given = rotation if k % 2 else pin.rpy.matrixToRpy(rotation)
@@ -355,14 +345,14 @@ def test_a_line_with_constant_inclination(excavator):
     assert path.tip is tip and path.attitude is held
 
 
-def test_a_robot_turns_its_flange_on_the_way(robot):
-    kinematics = crane.Kinematics(robot)
+def test_a_robot_turns_its_flange_on_the_way(kr300):
+    kinematics = crane.Kinematics(kr300)
     ends = np.array([[0.2, -1.4, 1.5, 0.3, 0.9, 0.1], [-0.4, -1.2, 1.2, -0.5, 1.2, 0.8]])
-    ends += robot.home[robot.closure.active] - robot.home[robot.closure.active]
+    ends += kr300.home[kr300.closure.active] - kr300.home[kr300.closure.active]
     tip = crane.via_points([0.0, 2.0], kinematics.position(ends))
     angles = [pin.rpy.matrixToRpy(rotation) for rotation in kinematics.rotation(ends)]
     turning = crane.motion.via_attitudes([0.0, 2.0], angles)
-    path = crane.tip_trajectory(robot, tip, ends[0], turning)
+    path = crane.tip_trajectory(kr300, tip, ends[0], turning)
     time = np.random.default_rng(0).uniform(0, 2, 60)
     q_a, v_a, a_a = path(time)
     rotation, rate, second = turning(time)
