@@ -256,6 +256,43 @@ def test_the_folder_is_bounded(place, monkeypatch):
     assert not killed.exists() and ask(4.0)
 
 
+@pytest.fixture
+def objects(tmp_path, monkeypatch):
+    folder = tmp_path / "objects"
+    monkeypatch.setattr(file_cache, "cache_folder", lambda: folder)
+    return folder
+
+
+def test_what_was_used_least_lately_makes_room(objects, monkeypatch):
+    monkeypatch.setattr(file_cache, "MAX_CACHE_SIZE", 400)  # three of them
+    for number, name in enumerate("abc"):
+        file_cache.cached_object_code(name, lambda: b"x" * 100)
+        for file in objects.iterdir():
+            if file.stat().st_mtime > 1e9:
+                os.utime(file, (number, number))
+    first = file_cache.cached_object_code("a", lambda: b"never")  # used now
+    file_cache.cached_object_code("d", lambda: b"y" * 100)
+    left = {file.read_bytes()[-1:] for file in objects.iterdir()}
+    assert first == b"x" * 100 and left == {b"x", b"y"}
+    assert file_cache.cached_object_code("a", lambda: b"gone") == first
+    assert file_cache.cached_object_code("b", lambda: b"gone") == b"gone"
+
+
+def test_the_folder_is_not_looked_through_each_time(objects, monkeypatch):
+    looks, look = [], file_cache._cache_files
+
+    def counted(folder):
+        looks.append(folder)
+        return look(folder)
+
+    monkeypatch.setattr(file_cache, "_cache_files", counted)
+    monkeypatch.setattr(file_cache, "MAX_CACHE_SIZE", 64 * 132)  # with their digests
+    for number in range(100):
+        file_cache.cached_object_code(str(number), lambda: b"x" * 100)
+        assert len(list(objects.iterdir())) == min(number + 1, 64 - (63 - number) % 4)
+    assert len(looks) == 25
+
+
 def test_processes_that_compile_at_once(place):
     """Each process has a correct program, and the files are complete."""
     at_once = [child(place, "late") for _ in range(4)]

@@ -249,7 +249,7 @@ def test_an_axis_along_y_counts_alike(tmp_path):
 
 
 def _boom(folder, axis):
-    text = '<kr300 name="boom"><link name="base"/>'
+    text = '<robot name="boom"><link name="base"/>'
     for i in range(3):
         parent = f"link{i - 1}" if i else "base"
         text += (
@@ -261,7 +261,7 @@ def _boom(folder, axis):
         )
     text += (
         '<link name="tool"/><joint name="tip" type="fixed"><origin xyz="1 0 0"/>'
-        '<parent link="link2"/><child link="tool"/></joint></kr300>'
+        '<parent link="link2"/><child link="tool"/></joint></robot>'
     )
     path = folder / "boom.urdf"
     path.write_text(text)
