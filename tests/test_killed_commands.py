@@ -7,17 +7,13 @@ makes on files, and looked at. Buffers of the process are lost, as they would be
 import os
 import re
 import shutil
-import subprocess
 import sys
 from collections import Counter
-from pathlib import Path
 from unittest import mock
 
 import pytest
-from command_line import MAIN, typed
+from command_line import typed
 from writing_commands import COMMANDS, read, writing
-
-import crane
 
 _TEMPORARY = re.compile(r"\.[0-9a-f]{8}\.(part|old)(?=/|$)")
 _WRITES = os.O_WRONLY | os.O_RDWR
@@ -142,29 +138,3 @@ def kind(found, old, new):
         return "new"
     whole = found.keys() == new.keys() and all(x in (old[p], new[p]) for p, x in found.items())
     return "mixed" if whole else "half"
-
-
-@pytest.mark.slow
-def test_of_two_processes_at_once_into_one_new_folder_one_is_told(inputs, tmp_path):
-    gated = f"import sys, crane.simulation; sys.stdin.readline(); {MAIN}"
-    both = [
-        subprocess.Popen(
-            [sys.executable, "-c", gated, "simulate", inputs / "four_bar.yaml", "--duration",
-             duration, "--out", "run"],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
-        )
-        for duration in ("0.01", "0.02")
-    ]  # fmt: skip
-    for process in both:
-        process.stdin.write("\n")
-        process.stdin.flush()
-    told = [process.communicate()[1] for process in both]
-    assert sorted(process.returncode for process in both) == [0, 2], told
-    won = [process.returncode for process in both].index(0)
-    (line,) = told[1 - won].splitlines()
-    assert line.startswith("error: run: is ") and "choose another folder or add --force" in line
-    assert os.listdir(tmp_path) == ["run"]
-    assert sorted(os.listdir(tmp_path / "run")) == ["recording.csv", "summary.md"]
-    recording = crane.Recording.from_csv(tmp_path / "run" / "recording.csv")
-    assert recording.time[-1] == pytest.approx((0.01, 0.02)[won])
