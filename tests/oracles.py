@@ -174,20 +174,6 @@ def mini_forwarder_force(q_a, v_a, a_a):
     return inertia(q_a) @ a_a + rate @ v_a - gradient / 2 + weight
 
 
-def q4_of_the_paper(x1):
-    """q4 and dq4/dX1 by equations (22) to (28), letter by letter."""
-    a1a, a1b, d2, d3 = 0.015, 0.017, 0.017, 0.087
-    a2c = np.hypot(*D_IN_2)  # printed rounded, 0.0516
-    alpha1 = np.arctan((d3 - d2) / (a1a + a1b))
-    lr4 = np.sqrt((d3 - d2) ** 2 + (a1a + a1b) ** 2)
-    length = AP1 + x1
-    alpha2 = np.arccos((a2c**2 - length**2 - lr4**2) / (-2 * length * lr4))
-    part = length**2 - a2c**2 + lr4**2
-    double = (2 * AP1 + 2 * x1) ** 2
-    slope = (-1 / lr4 + 2 * part / (lr4 * double)) / np.sqrt(1 - part**2 / (lr4**2 * double))
-    return alpha2 + alpha1, slope
-
-
 # --- the slider-crank of data/slider_crank.yaml ----------------------------------------------
 
 

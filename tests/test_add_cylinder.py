@@ -173,15 +173,6 @@ def test_the_force_of_the_boom_cylinder_by_moments(closed):
         assert dynamics.gravity(sample)[0] == pytest.approx(push, rel=1e-12)
 
 
-def test_the_closed_digger_moves_as_it_should(closed):
-    q_a = closed.home[closed.closure.active]
-    free = crane.simulate(closed, lambda t, q, v: np.zeros(2), duration=0.4)
-    assert energy_of(free) < 1e-9
-    reference = crane.point_to_point(q_a, q_a + [0.2, 0.2], 1.0)
-    run = crane.simulate(closed, crane.ComputedTorque(closed, reference))
-    assert run.q == pytest.approx(reference.position(run.time), abs=1e-8)
-
-
 def test_without_weight_it_is_the_open_machine(tmp_path):
     """With very light cylinders the machine moves as the open one does."""
     first = crane.load(planar(tmp_path))

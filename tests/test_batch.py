@@ -1,7 +1,5 @@
 """Batches of simulations equal single simulations."""
 
-import threading
-
 import numpy as np
 import pytest
 
@@ -45,17 +43,6 @@ def test_a_variant_that_fails_loses_nothing_of_the_others(mini):
     assert np.isnan(batch.q[2]).all() and np.isfinite(np.delete(batch.q, 2, axis=0)).all()
 
 
-def test_a_step_too_long_is_told(mini):
-    hard = {**mini.friction, "X1": crane.description.Friction(coulomb=16, smoothing=5e-5)}
-    machines = [mini, mini.replace(friction=hard)]
-    target = crane.point_to_point([0, 0.015, 0.012], [0, 0.018, 0.012], 1.0)
-    batch = crane.simulation.simulate_batch(
-        machines, lambda m: crane.PI(m, target), step=1e-3, method="rk4"
-    )
-    assert batch.failures == {} and list(batch.warnings) == [1]
-    assert "the step of 0.001 s is too long" in batch.warnings[1]
-
-
 def test_wrong_batches(mini):
     arm = crane.load("ur5_robot")
     for call, text in (
@@ -75,38 +62,6 @@ def test_wrong_batches(mini):
     ):
         with pytest.raises(InputError, match=text):
             call()
-
-
-def test_threads_share_a_machine(mini):
-    """Each thread its own Dynamics on one machine: nothing mixes."""
-    rng = np.random.default_rng(5)
-    q_a = np.column_stack([rng.uniform(-3, 3, 400), *rng.uniform(0, 0.03, (2, 400))])
-    v_a = rng.normal(size=(400, 3)) * [1, 0.02, 0.02]
-    wanted = crane.Dynamics(mini, backend="pinocchio").bias(q_a, v_a)
-    worst = []
-
-    def work(backend, shift):
-        dynamics = crane.Dynamics(mini, backend=backend)
-        order = np.roll(np.arange(400), shift)
-        found = np.array([dynamics.bias(q_a[i], v_a[i]) for i in order])
-        worst.append(np.abs(found - wanted[order]).max())
-
-    threads = [
-        threading.Thread(target=work, args=(backend, 37 * i))
-        for i, backend in enumerate(["compiled", "pinocchio"] * 2)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(worst) == 4 and max(worst) < 1e-10
-
-
-def test_a_machine_cannot_be_changed(mini):
-    with pytest.raises(ValueError, match="read-only"):
-        mini.lower[1] = -1
-    with pytest.raises(TypeError):
-        mini.friction["X1"] = crane.description.Friction()
 
 
 @pytest.mark.parametrize("backend", ["compiled", "pinocchio"])

@@ -10,7 +10,6 @@ from crane.dynamics.statics import StaticsEvaluator
 from crane.formats.machine_loading import MachineVariants
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.lifting_capacity import torques
-from crane.ratings.limiting_factors import largest_feasible_magnitude
 
 G = np.array([0.0, 0.0, -9.81])
 PUMP = 3.5e7  # of the excavator [Pa]
@@ -176,28 +175,6 @@ def test_friction_and_pressure_count(excavator):
     half = crane.capacity(crane.load("excavator", changes={"supply.pressure": PUMP / 2}), **at)
     less = free.values_by_factor[0, 0, 0, k] - half.values_by_factor[0, 0, 0, k]
     assert less == pytest.approx(PUMP / 2 * 2.2619467e-2 / slope, rel=1e-9)
-
-
-def test_cones_end_where_they_say():
-    """A root of a + b x + |c + d x| that all before it stay below."""
-    random = np.random.default_rng(0)
-    a, b = -random.uniform(0.1, 3, 3000), random.normal(size=3000)
-    c, d = 0.4 * random.normal(size=(3000, 3)), random.normal(size=(3000, 3))
-    x = largest_feasible_magnitude(a, b, c, d)
-
-    def value(x):
-        return a + b * x + np.linalg.norm(c + d * x[:, None], axis=1)
-
-    ends = np.isfinite(x) & (x > 0)
-    x[x > 1e9] = np.inf
-    assert 0.3 < ends.mean() < 0.99
-    assert (np.abs(value(np.where(ends, x, 0.0)))[ends] < 1e-9 * (1 + np.abs(x[ends]))).all()
-    for share in np.linspace(0, 0.999, 50):
-        assert (value(share * np.where(ends, x, 0.0))[ends] < 1e-9).all()
-    never = ~np.isfinite(x)
-    for far in np.logspace(-3, 6, 60):
-        assert (value(np.full(3000, far))[never] < 1e-6 * far).all()
-    assert (value(np.zeros(3000))[x == 0] >= 0).all()
 
 
 @pytest.mark.parametrize(
@@ -389,12 +366,6 @@ def test_causes_that_end_a_load_together_are_all_told(excavator):
 def test_odd_arguments_are_said_in_one_line(excavator, given):
     with pytest.raises(crane.CraneError):
         crane.capacity(excavator, "bucket", **given)
-
-
-@pytest.mark.parametrize("share", [-1.0, 0.0, 1.5, np.nan])
-def test_rules_have_shares(share):
-    with pytest.raises(crane.CraneError, match="the tipping share of rule 'own'"):
-        crane.ratings.Rule("own", "", tipping=share)
 
 
 def test_a_column_behind_the_axis_has_a_table():

@@ -372,19 +372,6 @@ def test_results_are_headed_with_the_machine_s_own_name(tmp_path):
     assert figure.get_suptitle() == "Press No. 1: free motion"
 
 
-def test_check_tells_warnings_by_its_status(tmp_path):
-    path = copy_machine(MINI, tmp_path)
-    path.write_text(path.read_text().replace(", drives: true", ""))
-    result = typed("check", path)
-    assert result.returncode == 1
-    assert "3 degrees of freedom" in result.stdout
-    assert result.stdout.startswith("mini_forwarder.yaml:")
-    assert result.stdout.splitlines()[-2] == "no errors, 1 warning"
-    assert result.stderr == ""
-    assert typed("check", "mini_forwarder").returncode == 0
-    assert typed("check", "ur5_robot").returncode == 0
-
-
 def test_simulate_writes_recording_and_summary(free_run):
     folder, result = free_run
     assert sorted(path.name for path in folder.iterdir()) == ["recording.csv", "summary.md"]
@@ -403,38 +390,6 @@ def test_results_go_to_a_folder_called_as_the_command(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["simulate", "working_range"]
 
 
-def test_folders_are_made_where_files_are_written(tmp_path):
-    machine = Path(__file__).parent / "data" / "slider_crank.yaml"
-    for command in (
-        ("convert", machine, "a/b/x.urdf"), ("convert", machine, "c/x.xml"),
-        ("convert", machine, "d/e"), ("sketch", machine, "--out", "f/x.png"),
-    ):  # fmt: skip
-        done = typed(*command, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-    assert all((tmp_path / x).is_file() for x in ("a/b/x.urdf", "c/x.xml", "f/x.png"))
-    crane.load(tmp_path / "a" / "b" / "x.urdf")
-
-
-def test_simulate_a_task(tmp_path):
-    result = typed(
-        "simulate", "mini_forwarder", "--task", "lift", "--duration", "0.01",
-        "--controller", "computed-torque", "--out", tmp_path / "run",
-    )  # fmt: skip
-    assert result.returncode == 0, result.stderr
-    recording = crane.Recording.from_csv(tmp_path / "run" / "recording.csv")
-    assert recording.task == "lift" and "reference_X1" in recording.channels
-
-
-def test_nothing_is_overwritten_without_force(free_run):
-    folder, _ = free_run
-    before = (folder / "recording.csv").read_bytes()
-    again = ("simulate", "mini_forwarder", "--duration", "0.01", "--out", folder)
-    assert "is not empty, choose another folder or add --force" in one_error(typed(*again))
-    assert (folder / "recording.csv").read_bytes() == before
-    assert typed(*again, "--force").returncode == 0
-    assert (folder / "recording.csv").read_bytes() != before
-
-
 def test_plot_and_view_of_a_run(free_run, tmp_path):
     folder, _ = free_run
     assert typed("plot", folder, "--out", tmp_path / "a.svg").returncode == 0
@@ -446,11 +401,6 @@ def test_plot_and_view_of_a_run(free_run, tmp_path):
     assert "exists already, choose another name or add --force" in one_error(again)
     bad = typed("plot", folder, "--out", tmp_path / "a.xyz")
     assert "a.xyz" in one_error(bad)
-
-
-def test_view_of_a_machine_goes_to_the_working_folder(tmp_path):
-    assert typed("view", "mini_forwarder", "--no-open", cwd=tmp_path).returncode == 0
-    assert (tmp_path / "mini_forwarder.html").is_file()
 
 
 def test_view_of_a_run_whose_machine_has_moved(tmp_path):

@@ -1,7 +1,6 @@
 """Machine code of a machine against the Pinocchio backend and the closure in numpy."""
 
 import copy
-import threading
 import warnings
 from pathlib import Path
 
@@ -354,25 +353,6 @@ def test_guesses_with_opposed_axes_are_refused(tmp_path):
             with pytest.raises(WrongBranchError, match="loop 'clasp' is assembled the other way"):
                 closure.solve(guess[closure.active], initial_guess=guess)
     assert np.abs(closure.solve(machine.home[closure.active]) - machine.home).max() < 1e-12
-
-
-def test_threads_close_loops_at_once(mini):
-    q_a = draw(mini, 400, 11)["q"].reshape(4, 100, 3)
-    alone = np.array([mini.closure.solve(rows) for rows in q_a])
-    together = np.zeros_like(alone)
-    start = threading.Barrier(4)
-
-    def work(i):
-        start.wait()
-        for _ in range(5):
-            together[i] = mini.closure.solve(q_a[i])
-
-    threads = [threading.Thread(target=work, args=(i,)) for i in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert np.abs(together - alone).max() < 1e-12
 
 
 # --- arguments -------------------------------------------------------------------------------

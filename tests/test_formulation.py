@@ -9,8 +9,6 @@ import pytest
 import crane
 from crane.dynamics.compiled_dynamics import QUANTITIES
 
-FILES = Path(__file__).parents[1] / "models" / "urdf" / "mini_forwarder"
-
 
 class Lone:
     """One URDF by itself, on a floating base where the machine carries it."""

@@ -5,7 +5,7 @@ import pinocchio as pin
 import pytest
 from broken_machines import DATA
 from linkages import LARGE, MACHINES, dynamics_of, loaded, multipliers, postures
-from oracles import constraint_dynamics, derivative
+from oracles import derivative
 
 import crane
 
@@ -36,20 +36,6 @@ def test_accelerations_are_those_of_the_tree_with_multipliers(case):
         tau = np.zeros(machine.model.nv)
         tau[closure.active] = tau_a
         a = multipliers(machine, q, closure.gamma(q) @ v_a, tau)[closure.active]
-        ours = dynamics.forward(q_a, v_a, tau_a)
-        np.testing.assert_allclose(ours, a, rtol=0, atol=1e-10 * np.abs(a).max())
-
-
-def test_accelerations_are_those_of_constraint_dynamics(case):
-    name, machine = case
-    closure, dynamics = machine.closure, dynamics_of(name)
-    if closure.equations.couplings:
-        pytest.skip("Pinocchio has no couplings")
-    for q_a, v_a, tau_a in postures(machine, MACHINES[name][2], 5):
-        q = closure.solve(q_a)
-        tau = np.zeros(machine.model.nv)
-        tau[closure.active] = tau_a
-        a = constraint_dynamics(machine, q, closure.gamma(q) @ v_a, tau, mu=1e-6)[closure.active]
         ours = dynamics.forward(q_a, v_a, tau_a)
         np.testing.assert_allclose(ours, a, rtol=0, atol=1e-10 * np.abs(a).max())
 

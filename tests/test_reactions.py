@@ -92,11 +92,6 @@ MASSES, INERTIAS = (1.5 / 386, 7.7 / 386, 5.8 / 386), (0.4, 1.5, 0.8)
 CENTRES = [r * np.exp(1j * np.radians(x)) for r, x in ((3, 30), (9, 45), (5, 0))]
 
 
-def _bar(name, i):
-    inertia = (INERTIAS[i], 0, 0, INERTIAS[i], 0, INERTIAS[i])
-    return link(name, MASSES[i], f"{CENTRES[i].real} {CENTRES[i].imag} 0", inertia)
-
-
 FOUR_BAR = (
     '<robot name="four_bar">\n<link name="ground"/>\n'
     + _bar("crank", 0) + _bar("coupler", 1) + _bar("rocker", 2)
@@ -112,52 +107,6 @@ FOUR_BAR = (
     '<group_state name="home"><joint name="O2" value="1.047"/><joint name="A" value="-0.682"/>'
     '<joint name="O4" value="1.822"/></group_state></robot>'
 )  # fmt: skip
-
-
-def test_four_bar_by_newton_and_euler_of_each_link(tmp_path):
-    """The nine equations of three links for four forces in pins and the crank's torque."""
-    machine = load(tmp_path, FOUR_BAR, active=["O2"])
-    reactions = Reactions(machine)
-    q = machine.closure.solve([np.radians(60)])
-    v = machine.closure.gamma(q)[:, 0] * 25
-    a = machine.closure.gamma(q)[:, 0] * -40 + machine.closure.drift(q, v)
-    at = {name: machine.column(name) for name in ("O2", "A", "O4")}
-    turns, speeds, rises = (
-        np.array([x[at["O2"]], x[at["O2"]] + x[at["A"]], x[at["O4"]]]) for x in (q, v, a)
-    )
-    # as the book has the linkage's motion, to its digits
-    assert np.allclose(np.degrees(turns), [60, 20.92, 104.41], atol=6e-3)
-    assert np.allclose(speeds, [25, -5.87, 7.93], atol=6e-3)
-    push, torque = 80 * np.exp(1j * np.radians(330)), 120.0
-    ends = np.array([CRANK, COUPLER, ROCKER]) * np.exp(1j * turns)
-    centres = np.array(CENTRES) * np.exp(1j * turns)
-    gains = (1j * rises - speeds**2)[:, None] * np.array([ends, centres]).T
-    gained = np.array([gains[0, 1], gains[0, 0] + gains[1, 1], gains[2, 1]])
-    # unknown: forces on crank at O2, on coupler at A, on rocker at B, on rocker at O4, torque
-    acting = [
-        [(0, -centres[0], 1), (1, ends[0] - centres[0], -1)],
-        [(1, -centres[1], 1), (2, ends[1] - centres[1], -1)],
-        [(2, ends[2] - centres[2], 1), (3, -centres[2], 1)],
-    ]
-    matrix, right = np.zeros((9, 9)), np.zeros(9)
-    for i, forces in enumerate(acting):
-        for k, arm, sign in forces:
-            matrix[3 * i, 2 * k] += sign
-            matrix[3 * i + 1, 2 * k + 1] += sign
-            matrix[3 * i + 2, 2 * k : 2 * k + 2] += sign * np.array([-arm.imag, arm.real])
-        inertial = MASSES[i] * gained[i]
-        right[3 * i : 3 * i + 3] = inertial.real, inertial.imag, INERTIAS[i] * rises[i]
-    matrix[2, 8] = 1
-    arm = 3 * np.exp(1j * (turns[1] + 1.74533))
-    right[3:6] -= push.real, push.imag, (np.conj(arm) * push).imag
-    right[8] -= torque
-    wanted = np.linalg.solve(matrix, right)
-    loads = {"P": [push.real, push.imag, 0, 0, 0, 0], "rocker": [0, 0, 0, 0, 0, torque]}
-    found = dict(zip(reactions.names, reactions.joint_wrenches(q, v, a, loads), strict=True))
-    pins = np.concatenate([found[name][:2] for name in ("O2", "A", "B", "O4")])
-    assert np.allclose(pins, wanted[:8], rtol=1e-9, atol=1e-9)
-    assert np.isclose(found["O2"][5], wanted[8], rtol=1e-9)
-    assert np.allclose([found[x][5] for x in ("A", "B", "O4")], 0, atol=1e-9)
 
 
 def _asked(model, data, body):

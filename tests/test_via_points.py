@@ -15,13 +15,6 @@ PLACES = [[0.0, 1.0], [0.5, np.nan], [0.2, 3.0], [1.0, 2.0]]
 TIMES = [0.0, 0.4, 1.5, 2.0]
 
 
-def jerk(path, start, end, count=4000):
-    """The integral of the squared jerk, by differences of the accelerations."""
-    time = np.linspace(start, end, count)
-    rate = np.diff(path(time)[2], axis=0) / np.diff(time)[:, None]
-    return (rate**2).sum(axis=0) * (time[1] - time[0])
-
-
 # --- the spline ------------------------------------------------------------------------------
 
 
@@ -82,40 +75,6 @@ def test_it_is_the_spline_of_scipy():
     size = np.abs(spline(time, 2)).max()
     assert np.abs(found[:, 1] - spline(time, 1)).max() < 1e-10 * size
     assert np.abs(found[:, 2] - spline(time, 2)).max() < 1e-10 * size
-
-
-def test_it_has_the_least_jerk():
-    """Any change that keeps points, ends and rates has more, in second order."""
-    rates = np.full((4, 2), np.nan)
-    rates[2, 0] = -0.7
-    path = crane.via_points(TIMES, PLACES, rates)
-    assert path(1.5)[1][0] == pytest.approx(-0.7, abs=1e-13)
-    least = jerk(path, 0, 2)
-    draw = np.random.default_rng(1)
-    for _ in range(5):
-        knots = np.linspace(0, 2, 12)
-        extra = make_interp_spline(
-            knots, draw.normal(size=12), k=5, bc_type=([(1, 0), (2, 0)], [(1, 0), (2, 0)])
-        )
-        time = np.linspace(0, 2, 4001)
-
-        def bump(order, extra=extra, time=time):
-            """Zero with its rate at all points and ends: times prod (t - t_i)^2."""
-            factor = np.polynomial.polynomial.polyfromroots([*TIMES, *TIMES])
-            factor = np.polynomial.polynomial.polymul(factor, [0, 4, -4, 1])
-            parts = [
-                np.polynomial.polynomial.polyval(time, np.polynomial.polynomial.polyder(factor, k))
-                for k in range(order + 1)
-            ]
-            binomial = {3: [1, 3, 3, 1]}[order]
-            return sum(b * parts[k] * extra(time, order - k) for k, b in enumerate(binomial))
-
-        more = bump(3)
-        third = np.column_stack([np.gradient(path(time)[2][:, i], time) for i in (0, 1)])
-        cross = 2 * np.trapezoid(third * more[:, None], time, axis=0)
-        square = np.trapezoid(more**2, time)
-        # the first variation vanishes, so what is left is the square alone
-        assert np.abs(cross).max() < 2e-2 * np.sqrt(square * least.max())
 
 
 def test_rates_are_those_of_the_positions():
@@ -413,15 +372,6 @@ def test_bad_attitudes(excavator):
 
 
 # --- tasks of a machine file -----------------------------------------------------------------
-
-VIA = """tasks:
-  reach:
-    description: up and back
-    via:
-      - {time: 0, crank: 1.2}
-      - {time: 0.5, crank: 1.4, rates: {crank: 0.1}}
-      - {time: 2, crank: 1.2}
-"""
 
 
 @pytest.fixture
