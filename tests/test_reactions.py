@@ -92,6 +92,11 @@ MASSES, INERTIAS = (1.5 / 386, 7.7 / 386, 5.8 / 386), (0.4, 1.5, 0.8)
 CENTRES = [r * np.exp(1j * np.radians(x)) for r, x in ((3, 30), (9, 45), (5, 0))]
 
 
+def _bar(name, i):
+    inertia = (INERTIAS[i], 0, 0, INERTIAS[i], 0, INERTIAS[i])
+    return link(name, MASSES[i], f"{CENTRES[i].real} {CENTRES[i].imag} 0", inertia)
+
+
 FOUR_BAR = (
     '<robot name="four_bar">\n<link name="ground"/>\n'
     + _bar("crank", 0) + _bar("coupler", 1) + _bar("rocker", 2)

@@ -5,8 +5,6 @@ import os
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from crane.common.errors import RecordingError
 from crane.recordings import table_reader
@@ -135,31 +133,6 @@ def test_binary_file(tmp_path, rows):
         read_table(path)
 
 
-@settings(deadline=None)
-@given(
-    st.lists(
-        st.floats(-1e30, 1e30),
-        min_size=1,
-        max_size=30,
-    )
-)
-def test_numbers_survive_bit_by_bit(tmp_path_factory, numbers):
-    path = tmp_path_factory.mktemp("table") / "table.csv"
-    values = np.column_stack([np.arange(len(numbers), dtype=float), numbers])
-    write_table(path, Table({"time": "s", "a": ""}, values, {}))
-    back = read_table(path).values
-    assert [math.copysign(1.0, x) for x in back[:, 1]] == [math.copysign(1.0, x) for x in numbers]
-    np.testing.assert_array_equal(back, values)
-
-
-def test_long_tables_are_written_whole(tmp_path):
-    values = np.column_stack([np.arange(10_001.0), np.sqrt(np.arange(10_001.0))])
-    write_table(tmp_path / "table.csv", Table({"time": "s", "a": "m"}, values, {"task": "count"}))
-    table = read_table(tmp_path / "table.csv")
-    np.testing.assert_array_equal(table.values, values)
-    assert table.notes == {"task": "count"}
-
-
 # what a file may declare, the SI unit, and a number with what it is in SI units
 CONVERTED = [
     ("bar", "Pa", 123.4, 123.4e5), ("kPa", "Pa", 101.325, 101325.0), ("MPa", "Pa", 0.7, 0.7e6),
@@ -185,12 +158,6 @@ def test_other_units_stay(tmp_path):
     table = read_text(tmp_path, "time [s],a [degC],b [Pa],c [Bar],d [1/s]\n0,20,1,2,3\n")
     assert table.units == {"time": "s", "a": "degC", "b": "Pa", "c": "Bar", "d": "1/s"}
     np.testing.assert_array_equal(table.values, [[0, 20, 1, 2, 3]])
-
-
-def test_time_in_milliseconds(tmp_path):
-    table = read_text(tmp_path, "a,time [ms]\n1,10\n2,30\n")
-    assert table.units == {"a": "", "time": "s"}
-    np.testing.assert_array_equal(table.values[:, 1], [0.01, 0.03])
 
 
 LONG = {  # bytes, and what is told
