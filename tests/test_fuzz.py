@@ -21,12 +21,6 @@ def run(kind, first, count, program="fuzz.py"):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", FORMATS)
-def test_some_changed_files(kind):
-    run(kind, 0, 12)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("count", [25, pytest.param(200, marks=pytest.mark.long)])
 @pytest.mark.parametrize("kind", GRAPHS)
 def test_odd_graphs(kind, count):
@@ -42,3 +36,18 @@ def test_odd_graphs(kind, count):
 def test_more_changed_files(kind, first, count):
     """Still more by hand: python tests/fuzz.py KIND FIRST COUNT."""
     run(kind, first, count)
+
+
+# --- options ------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_calls_that_were_reported():
+    assert judge("fuzz_options.py", "reported") > 30
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", (0, 1, 2, 3))
+@pytest.mark.long
+def test_options_at_the_edge(part):
+    assert judge("fuzz_options.py", 1000 + 250 * part, 20) == 20

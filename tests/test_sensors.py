@@ -17,7 +17,7 @@ from crane.recordings import table_reader, timeseries
 from crane.recordings.measured_recordings import dead_length
 from crane.recordings.recording import Recording
 from crane.recordings.recording_reader import correct_readings, read_quantities, select_time_span
-from crane.recordings.sensor_kinematics import ideal_readings, pin_derivatives
+from crane.recordings.sensor_kinematics import ideal_readings
 from crane.recordings.timeseries import Table
 
 LIFTING = Path(__file__).parents[2] / "shared" / "data" / "patu655" / "lifting_first_half.csv"
@@ -328,23 +328,6 @@ def test_a_pin_elsewhere_is_named(machine, motion, tmp_path, name, at):
     assert "a pin elsewhere alone" in line
     drawn = MachineVariants(machine).values[name]  # found to first order of how far it is off
     assert number(line, name) == pytest.approx(at, abs=0.06 * abs(at - drawn))
-
-
-def test_postures_change_with_pins_as_other_machines_have_them(machine):
-    """Central differences over machines that are loaded with pins elsewhere."""
-    random = np.random.default_rng(3)
-    q_a = random.uniform(0.2, 0.8, (4, 2)) * (machine.upper - machine.lower)
-    slopes = pin_derivatives(machine, machine.closure.solve(q_a))
-    variants = MachineVariants(machine)
-    assert {name.rpartition(".")[0] for name in slopes} == {
-        "lift_boom_rod", "lift_eye", "tilt_eye", "tilt_boom_bracket", "bracket2_eye"
-    }  # fmt: skip
-    for name in ("lift_boom_rod.y", "lift_eye.x", "tilt_boom_bracket.x", "bracket2_eye.z"):
-        place = variants.values[name]
-        one, two = (
-            variants.machine({name: place + step}).closure.solve(q_a) for step in (1e-5, -1e-5)
-        )
-        np.testing.assert_allclose(slopes[name], (one - two) / 2e-5, atol=1e-7)
 
 
 def test_an_absolute_angle_in_the_place_of_a_joint_s_is_suspected(machine, motion, tmp_path):
