@@ -8,7 +8,7 @@ import numpy as np
 import oracles
 import pinocchio as pin
 import pytest
-from broken_machines import MACHINE, MINI, assert_refused, case, copy_machine, swap
+from broken_machines import MACHINE, assert_refused, case, copy_machine, swap
 from command_line import typed
 from test_compiled import off
 
@@ -22,13 +22,11 @@ from crane.description import ForceElement, Rope
 from crane.dynamics.compiled_dynamics import QUANTITIES, STICK_SLIP_QUANTITIES
 from crane.dynamics.dynamics_formulas import DynamicsFormulas
 from crane.identification.mechanics.base_parameters import random_samples
-from crane.identification.mechanics.identification_model import IdentificationModel, default_terms
-from crane.identification.mechanics.identify import identify
+from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.model_terms import (
     GasSpringTerm,
     InertialTerm,
 )
-from crane.identification.signals.signal_processing import Motion
 
 BOOM, STRUT = ("base", "link7"), ("link3_H", "A1_rod")  # of the mini forwarder
 
@@ -540,20 +538,6 @@ def test_wrong_elements_are_told_in_a_line(mini, call, line):
         call(mini)
 
 
-def test_the_command_line_tells_them(tmp_path):
-    path = given(tmp_path)
-    told = typed("info", path).stdout.splitlines()
-    found = [line.split(",")[0] for line in told if line.startswith("  between")]
-    assert found == [
-        "  between     ground and coupler_arm: force element",
-        "  between     pin_B and crank_arm: gas spring",
-        "  between     coupler_pin and pin_B: rope",
-    ]
-    assert "3 elements between frames" in typed("check", path).stdout
-    path.write_text(path.read_text().replace("force: -1", "force: -1, joint: rocker"))
-    assert typed("info", path).stderr.count("\n") == 1
-
-
 def test_meeting_frames_of_a_file_are_told_with_the_section(tmp_path):
     path = given(tmp_path)
     path.write_text(path.read_text().replace("[ground, coupler_arm]", "[rocker_pin, coupler_pin]"))
@@ -578,35 +562,6 @@ def test_columns_of_identification(mini):
         found = model.regressor(samples) @ model.nominal + model.known_forces(samples)
         assert np.abs(found - expected).max() < 1e-11 * np.abs(tau).max()
     assert scaled.names[-1] == "strut.gas_scale"
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::crane.CraneWarning")
-def test_identified_machines_keep_them(tmp_path):
-    """Elements of locked joints, whose frames belong to one body, are kept as well."""
-    path = copy_machine(MINI, tmp_path)
-    path.write_text(
-        path.read_text()
-        + "\nropes:\n  - {between: [A2_barrel, A2_rod], length: 0.05, stiffness: 300}\n"
-        "forces:\n  - {between: [base, link7], stiffness: 30, rest: 0.2, damping: 2}\n"
-        "gas_springs:\n  strut: {between: [link3_H, A1_rod], area: 2e-5, pressure: 3e5, "
-        "volume: 2e-5, rest: 0.1}\n"
-    )
-    machine, locked = crane.load(path), crane.load(path, lock={"X2": 0.012})
-    assert machine.ropes and not locked.ropes and len(locked.force_elements) == 2
-    time = np.arange(0, 8, 4e-3)[:, None]
-    place, turn = np.array([0.3, 0.015]), np.array([1.0, 0.012])
-    q, v, a = place + turn * np.sin(time), turn * np.cos(time), -turn * np.sin(time)
-    tau = crane.Dynamics(locked).inverse(q, v, a, friction=True)
-    tau += np.random.default_rng(0).normal(size=tau.shape) * np.ptp(tau, axis=0) * 1e-3
-    terms = [*default_terms(locked), GasSpringTerm(locked, "strut")]
-    result = identify(locked, Motion(time[:, 0], q, v, a, tau), terms=terms, feasible=True)
-    scale = result.parameters[result.model.names.index("strut.gas_scale")]
-    written = crane.load(crane.identification.write_identified(result, tmp_path / "out"))
-    assert written.ropes == machine.ropes and written.forces == machine.forces
-    (gas,) = written.gas_springs
-    assert gas.pressure == pytest.approx(3e5 * scale) and gas.between == STRUT
-    assert 0.1 < scale < 10 and scale != 1.0
 
 
 def test_what_mjcf_has_no_place_for_is_told(tmp_path, mini):
@@ -634,22 +589,3 @@ def test_what_mjcf_has_no_place_for_is_told(tmp_path, mini):
     assert again.ropes == (Rope(STRUT, 0.1, 90.0),)
     with pytest.warns(CraneWarning, match=r"springs and forces, ropes"):
         crane.formats.write_urdf_plus(machine, tmp_path / "mini.urdf")
-
-
-def test_operations_of_machines_without_elements_read_none():
-    """Behind those of joints, 10, 22 and 1 each: gravity, whether it moves, what stands, tip."""
-    machine = crane.load("mini_forwarder")
-    dynamics = crane.Dynamics(machine)
-    assert (
-        len(dynamics.formula_constants) == 33 * machine.model.nv + 4 + 7
-        and dynamics.formula_structure.distance_bodies == ()
-    )
-    sizes = [
-        len(crane.Dynamics(machine.replace(ropes=ropes)).formula_constants)
-        for ropes in (
-            (),
-            (Rope(BOOM, 1, 1),),
-            (Rope(BOOM, 1, 1),) * 2,
-        )
-    ]
-    assert [two - one for one, two in pairwise(sizes)] == [28, 28]

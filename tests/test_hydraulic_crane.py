@@ -1,7 +1,5 @@
 """The full-size crane on its hydraulics: balances, convergence, control and output."""
 
-import warnings
-
 import numpy as np
 import pytest
 
@@ -345,15 +343,6 @@ def test_pressures_at_the_start_are_checked(patu):
         ValveDrive(patu, lifting(patu), {"X_lift": (np.nan, 1e5)})
     with pytest.raises(crane.CraneError, match="no cylinder at 'X_lfit'.*X_lift"):
         ValveDrive(patu, lifting(patu), {"X_lfit": (1e5, 1e5)})
-
-
-def test_locked_slewing_has_no_valve():
-    machine = crane.load("patu655", lock={"slew": 0.3})
-    assert machine.hydraulics.joints == ("X_lift", "X_tilt", "X_ext")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        recording = crane.simulate(machine, lifting(machine), duration=2.0)
-    check_balances(machine, recording)
 
 
 def test_numbers_too_small_to_divide_by_are_refused():

@@ -136,9 +136,6 @@ def forwarder(tmp_path, off_line):
     return crane.load(path), {**numbers, "Gr": (80.0, 0.0, 2.0)}
 
 
-SEVEN = ("FL.Izz", "SL.mx", "SL.m", "TL.mx", "TL.m", "SL.Izz", "FL.mx")
-
-
 def seven(machine):
     """Columns of the parameters of theta1 to theta7, equation (3) of the hydraulic paper.
 

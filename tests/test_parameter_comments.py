@@ -19,12 +19,6 @@ WORDS = "fitted ±3e-9, 95 % (was -- 1: 2)\n# no"
 SAID = "fitted ±3e-9, 95 % (was -- 1: 2) # no"
 
 
-def line_of(file, words):
-    """The only line of a file with some words."""
-    (line,) = [line for line in file.read_text().splitlines() if words in line]
-    return line
-
-
 def numbers(machine):
     """All that a machine says in numbers, its tree's by links and joints that a file has."""
     return parameters(MachineVariants(machine).spec)

@@ -322,15 +322,6 @@ def test_mass_matrix_is_kinetic_energy(patu):
 # --- what it does ----------------------------------------------------------------------------
 
 
-def test_slewing_can_be_locked(patu):
-    locked = crane.load("patu655", lock={"slew": 0.0})
-    assert locked.active == ("X_lift", "X_tilt", "X_ext")
-    q_a = draw(5, 8)
-    q_a[:, 0] = 0
-    whole = crane.Dynamics(patu).gravity(q_a)[:, 1:]
-    assert np.abs(crane.Dynamics(locked).gravity(q_a[:, 1:]) - whole).max() < 1e-7
-
-
 @pytest.mark.parametrize("task", ["reach", "swing"])
 def test_tasks_start_and_stop_smoothly_within_limits(patu, task):
     motion = patu.tasks[task]
