@@ -236,17 +236,6 @@ def test_slopes_are_those_of_charts_beside(name, frame, numbers, given):
         assert np.median(gap) < 1e-7 and gap.max() < 1e-3
 
 
-def test_slopes_do_not_turn_with_the_crane():
-    """Loads limited by drives alone do not depend on the slew angle."""
-    machine, slews = crane.load("patu655"), [0.0, 1.0, np.pi / 2, -np.pi / 2, 3.0]
-    chart = crane.capacity(machine, slews=slews, step=1.0)
-    slopes = chart.derivatives(["lift_boom.mass", "lift_eye.x", "supply.pressure"])
-    there = np.isfinite(slopes[0]).all(axis=-1)
-    assert there.sum() > 10 and (np.abs(slopes[0, there]) > 0).any(axis=0).all()
-    size = np.abs(slopes[0, there]).max(axis=0)
-    assert slopes[:, there] / size == pytest.approx(slopes[[0] * 5][:, there] / size, abs=1e-9)
-
-
 def test_slopes_refuse_what_moves_the_supports(excavator):
     chart = crane.capacity(excavator, "bucket", radii=[6.0], heights=[1.0])
     with pytest.raises(crane.CraneError, match="moves the supports"):

@@ -139,17 +139,6 @@ def test_linear_model_of_two_pumps_at_rest_and_moving(tmp_path):
         assert np.abs(values - wanted).min() < 1e-9 * abs(wanted)
 
 
-def test_linear_model_moves_on_a_load_sensing_pump(tmp_path):
-    machine = rig(
-        tmp_path, supply=PUMP | {"response": 0.1, "drag": 300.0}, axis="1 0 0",
-        friction={"viscous": 1e5},
-        engine={"speed": 190.0, "torque": 100.0, "inertia": 1.0, "speed_droop": 10.0},
-    )  # fmt: skip
-    model = crane.linearize(machine, [0.2], velocity=[0.05])
-    assert {"share_supply", "engine"} <= set(model.states)
-    assert np.isfinite(model.A).all()
-
-
 def test_what_knows_cylinders_alone_says_so(tmp_path):
     machine = everything(tmp_path)
     told = typed(

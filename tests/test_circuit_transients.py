@@ -100,36 +100,6 @@ def compare(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sensing", [0.0, 0.5])
-def test_load_sensing_with_response(tmp_path, sensing):
-    supply = {
-        "control": "load-sensing", "pressure": 25e6, "flow": 1e-3, "margin": 2e6, "droop": 5e5,
-        "standby": 2.5e6, "response": 0.08, "slip": 2e-12, "sensing": sensing,
-    }  # fmt: skip
-    machine = rig(tmp_path, VALVE, supply=supply)
-    times, u = [0.0, 0.2, 0.4, 1.2, 1.4, 2.5], [0.0, 0.0, 0.5, 0.5, -0.3, -0.3]
-
-    def rates(t, y):
-        x, v, a, b, p, e, *told = y
-        s = np.interp(t, times, u)
-        q_a, q_b = orifices(s, p, a, b)
-        load = TANK + max(clip(100 * s) * (a - TANK), clip(-100 * s) * (b - TANK))
-        sensed = told[0] if told else load
-        asked = clip((min(max(sensed + 2e6, 2.5e6), 25e6) - p) / 5e5)
-        drawn = q_a if s >= 0 else q_b
-        return [
-            *cylinder(x, v, a, b, q_a, q_b, weight=2000 * G),
-            (1e-3 * e - 2e-12 * (p - TANK) - drawn) / LINE,
-            (asked - e) / 0.08,
-            *((load - one) / (sensing * 0.08) for one in told),
-        ]
-
-    names = ["x", "x.v", "pressure_x_a", "pressure_x_b", "pressure_supply", "share_supply"]
-    names += ["sensed"] * (sensing > 0)
-    compare(machine, {"x": u}, rates, names, 1.8, times, start=[("sensed", TANK)])
-
-
-@pytest.mark.slow
 def test_accumulator_with_heat_under_a_load(tmp_path):
     """A load that swings on gas: closed valve, chamber A throttled into an accumulator."""
     v0, p0, n, tau, port = 8e-4, 1.5e6, 1.3, 0.7, 1e-4

@@ -24,7 +24,7 @@ NEEDS = {
     "live_view.py": "viser", "optimal_control.py": "casadi",
     "study_on_a_cluster.py": "distributed",
 }  # fmt: skip
-SHORT = "close_a_loop.py", "first_machine.py", "load_urdf.py", "path_from_csv.py"
+SHORT = "close_a_loop.py", "first_machine.py", "load_urdf.py"
 
 
 def test_the_index_has_every_program_with_its_question():

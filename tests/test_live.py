@@ -15,7 +15,6 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from queue import SimpleQueue
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from command_line import MAIN, typed
 from conftest import DATA
@@ -149,15 +148,6 @@ def test_slider_ends(mini, five_bar):
     assert session.max_payload == 1.0  # half of 1.287 kg, rounded up
     np.testing.assert_allclose(Session(five_bar).upper, np.pi)
     assert [round_up_to_nice(x) for x in (0.9, 1.0, 1.1, 23, 0.051)] == [1, 1, 2, 50, 0.1]
-
-
-def test_poses_are_those_of_forward_kinematics(mini):
-    session = Session(mini)
-    posture = session.move("X2", 0.021)
-    data = mini.model.createData()
-    pin.framesForwardKinematics(mini.model, data, posture.configuration)
-    for link, pose in zip(["link3", "base"], session.link_poses(["link3", "base"]), strict=True):
-        np.testing.assert_array_equal(pose, data.oMf[mini.frame(link)].homogeneous)
 
 
 def test_playback_runs_straight_between_samples(mini, recording):

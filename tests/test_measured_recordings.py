@@ -164,14 +164,6 @@ def test_what_was_read_is_a_full_recording(machine, path, columns, tmp_path):
         assert again.channel_units == recording.channel_units
 
 
-def test_npz_gives_the_same(machine, columns, tmp_path):
-    np.savez(tmp_path / "measured.npz", **columns)
-    one = read_measured(machine, tmp_path / "measured.npz")
-    two = read_measured(machine, write(tmp_path, columns))
-    for name in ("q", "v", "tau"):
-        assert np.array_equal(getattr(one, name), getattr(two, name))
-
-
 def test_rates_of_angles_are_mapped_to_the_strokes(machine, columns, truth, tmp_path):
     for joint in ("q2", "q3"):
         columns[f"{joint}_velocity [deg/s]"] = np.rad2deg(truth["rates"][joint])
@@ -252,16 +244,6 @@ def test_other_joints_with_forces_are_joints_too(path, columns, truth, tmp_path)
     recording = read_measured(planar, write(tmp_path, columns))
     assert recording.joints == ("X1", "X2", "q1")
     assert close(recording.tau[:, 2], truth["tau"][:, 0])
-
-
-def test_power_of_pressures_is_that_of_the_torques(machine, columns, truth, tmp_path):
-    """F x' summed over the cylinders is tau q' summed over the booms, tau by (18), (19)."""
-    recording = read_measured(machine, write(tmp_path, columns))
-    driven = machine.with_active_joints(["q1", "q2", "q3"])
-    lever = driven.closure.gamma(machine.closure.solve(recording.q))[:, machine.closure.active]
-    torque = np.einsum("nij,ni->nj", lever, recording.tau)
-    rates = np.column_stack([truth["v"][:, 0], truth["rates"]["q2"], truth["rates"]["q3"]])
-    assert close((torque * rates).sum(axis=1), (truth["tau"] * truth["v"]).sum(axis=1))
 
 
 def test_machines_without_a_circuit_take_forces(mini, columns, truth, tmp_path):

@@ -1,10 +1,6 @@
 """Recordings processed in blocks: same results, and bounded memory."""
 
-import os
-import subprocess
-import sys
 from functools import partial
-from pathlib import Path
 
 import forwarder_motions
 import numpy as np
@@ -27,7 +23,7 @@ from crane.identification.mechanics.regression_equations import (
     RegressionEquations,
 )
 from crane.identification.signals import kalman_smoother
-from crane.identification.signals.signal_processing import Motion, filter_rows
+from crane.identification.signals.signal_processing import Motion
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 motion = partial(forwarder_motions.motion, period=8.0, duration=16.0, step=2e-3, noise=1.0)
@@ -107,20 +103,6 @@ def test_a_recording_in_blocks_is_that_as_a_whole(mini, monkeypatch, bandwidth):
     np.testing.assert_allclose(found.std, whole.std, rtol=1e-6)
 
 
-def test_the_equations_are_those_of_one_filter(mini, monkeypatch):
-    """Against the whole regressor through the filter at once."""
-    monkeypatch.setattr(regression_equations, "_BLOCK_BYTES", 1 << 19)
-    given, model = motion(mini, duration=8.0), IdentificationModel(mini)
-    found, _ = build_equations(model, [given], bandwidth=10.0)
-    assert len(list(found.blocks())) > 2
-    at = model.samples(given.q, given.v, given.a)
-    W = model.regressor(at)[:, :, found.base.independent]
-    W, tau = filter_rows(W, given.tau, 2e-3, 10.0, 12)
-    blocks = np.concatenate([W for _, W in found.blocks()])
-    assert (np.abs(blocks - W).max(axis=(0, 1)) < 1e-10 * np.abs(W).max(axis=(0, 1))).all()
-    assert np.abs(found.forces - tau).max() < 1e-10 * np.abs(tau).max()
-
-
 def test_what_is_held_does_not_grow_with_the_recording(mini, monkeypatch):
     monkeypatch.setattr(regression_equations, "_BLOCK_BYTES", 1 << 21)
     monkeypatch.setattr(regression_equations, "_CACHE_BYTES", 1 << 20)
@@ -144,31 +126,6 @@ def test_what_is_held_does_not_grow_with_the_recording(mini, monkeypatch):
         assert max(sizes) < 1.5 * (1 << 21)  # with what the filter needs around
         assert sum(W.nbytes for W in rows._block_cache.values()) <= 1 << 20
     assert len(sizes) > 10
-
-
-LONG = """
-import resource, sys, numpy as np, crane
-from test_recording_blocks import motion
-from crane.identification.mechanics.identify import identify
-from crane.identification.signals.signal_processing import Motion
-machine = crane.load("mini_forwarder")
-one = motion(machine, duration=10.0, step=1e-3)
-parts = [np.tile(x, (30, 1)) for x in (one.q, one.v, one.a, one.tau)]
-given = Motion(1e-3 * np.arange(len(parts[0])), *parts)
-identify(machine, given, bandwidth=200.0)
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.long
-def test_five_minutes_at_a_kilohertz_unthinned():
-    """The regressor would take 0.5 GB as a whole."""
-    command = [sys.executable, "-W", "ignore", "-c", LONG]
-    here = Path(__file__).parent
-    paths = os.environ | {"PYTHONPATH": f"{here}{os.pathsep}{here.parent}"}
-    done = subprocess.run(command, env=paths, capture_output=True, text=True, check=True)
-    assert int(done.stdout.split()[-1]) < 1.0e6  # kB
 
 
 def test_smoothing_does_not_depend_on_the_blocks(monkeypatch):

@@ -33,14 +33,6 @@ def test_it_passes_the_points_from_rest_to_rest():
         assert np.abs(one[:, 1] - other[:, 0]).max() < 1e-9
 
 
-def test_two_points_are_a_point_to_point_motion():
-    one = crane.via_points([0.0, 1.7], [[0.1, -2.0], [0.4, 1.0]])
-    other = crane.point_to_point([0.1, -2.0], [0.4, 1.0], 1.7)
-    time = np.linspace(0, 1.7, 50)
-    for x, y in zip(one(time), other(time), strict=True):
-        assert np.abs(x - y).max() < 1e-12
-
-
 def test_one_via_point_is_the_closed_form_of_flash_and_hogan():
     """Their equations (A4) to (A7): the part before the point, of u = t/t_f and u_1."""
     x_0, x_1, x_f, u_1, t_f = 0.3, 1.1, -0.4, 0.37, 2.5
@@ -75,20 +67,6 @@ def test_it_is_the_spline_of_scipy():
     size = np.abs(spline(time, 2)).max()
     assert np.abs(found[:, 1] - spline(time, 1)).max() < 1e-10 * size
     assert np.abs(found[:, 2] - spline(time, 2)).max() < 1e-10 * size
-
-
-def test_rates_are_those_of_the_positions():
-    path = crane.via_points(TIMES, PLACES)
-    time, step = np.linspace(0.01, 1.99, 50), 1e-4
-    q, v, a = path(time)
-    ahead, back = path(time + step), path(time - step)
-    assert np.abs((ahead[0] - back[0]) / (2 * step) - v).max() < 1e-5
-    assert np.abs((ahead[1] - back[1]) / (2 * step) - a).max() < 1e-3
-    # C4: the fourth derivative does not jump at a point
-    curve = path._polynomials[2]
-    for order in (1, 2):
-        jump = curve(0.4 + 1e-12, order) - curve(0.4 - 1e-12, order)
-        assert np.abs(jump).max() < 1e-6 * np.abs(curve(0.4, order)).max()
 
 
 @pytest.mark.parametrize(
