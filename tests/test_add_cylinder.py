@@ -94,13 +94,6 @@ def test_masses_are_those_of_the_shapes(retracted):
     assert steel.max_force == pytest.approx(RELIEF_PRESSURE * np.pi / 4 * bore**2)
 
 
-def test_a_cylinder_is_as_long_as_it_is_said():
-    assert SteelCylinder.from_dimensions(0.12, 0.085, 1.26).retracted_length == pytest.approx(
-        1.26 + 4 * 0.12
-    )
-    assert SteelCylinder.from_dimensions(0.12, 0.085, 1.26, 1.6).retracted_length == 1.6
-
-
 # --- machines ----------------------------------------------------------------------------------
 
 

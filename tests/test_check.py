@@ -21,7 +21,7 @@ from broken_machines import (
     with_line,
 )
 from command_line import typed
-from executed_lines import TooMuchWorkError, at_most
+from executed_lines import at_most
 
 import crane
 from crane.common.errors import SimulationError
@@ -694,18 +694,6 @@ def test_the_next_command_closes_the_same_open_machine(tmp_path):
     assert crane.load(tmp_path / "bars_closed.yaml").closure.degrees_of_freedom == 1
 
 
-def test_status_and_counts_with_warnings(tmp_path):
-    path = copy_machine(MACHINE, tmp_path)
-    swap("coulomb: 0.3", "coulomb: 0.3, coulomb_offset: 0.4").apply(tmp_path)
-    result = run(path)
-    assert (result.returncode, result.stderr) == (1, "")
-    first, summary, counts, then = result.stdout.splitlines()
-    assert then.startswith("next: crane simulate ")
-    assert first.startswith("four_bar.yaml:20: warning: friction of 'crank' drives the joint")
-    assert summary.startswith("four_bar: 3 joints")
-    assert counts == "no errors, 1 warning"
-
-
 def test_status_and_counts_with_errors(tmp_path):
     path = copy_machine(MACHINE, tmp_path)
     swap("coulomb: 0.3", "coulomb: -0.3, coulomb_offset: 0.4").apply(tmp_path)
@@ -797,17 +785,6 @@ def test_odd_files_are_findings_soon(name, tmp_path):
     assert report.status == 2
     assert all(finding.file in (name, "") for finding in report.findings)
     assert all(str(finding).isprintable() for finding in report.findings)
-
-
-def test_a_bound_on_work_ends_what_exceeds_it(tmp_path):
-    path = tmp_path / "wide.urdf"
-    path.write_bytes(ODD["wide.urdf"])
-    with at_most(10**9) as work:
-        check(path)
-    with pytest.raises(TooMuchWorkError, match="more than"), at_most(work.lines - 1):
-        check(path)
-    with at_most(work.lines):  # the same each time
-        check(path)
 
 
 def test_many_findings_end_somewhere(tmp_path):

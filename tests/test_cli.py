@@ -256,12 +256,6 @@ def test_version_and_units_in_help():
     assert re.search("--step SECONDS Step of the recorded samples", text)
 
 
-def test_a_hydraulic_machine_without_signals_stands_on_its_valves(tmp_path):
-    """Without signals the valves stay closed; the machine is not free."""
-    run = typed("simulate", "patu655", "--duration", "0.02", "--out", tmp_path / "run")
-    assert run.stdout.startswith("# patu655: valves at rest\n")
-
-
 def test_without_a_task_a_controller_holds_and_none_lets_go(free_run, tmp_path):
     assert free_run[1].stdout.startswith("# mini_forwarder: free motion\n")
     time = "--duration", "0.02"
@@ -373,14 +367,6 @@ def test_results_are_headed_with_the_machine_s_own_name(tmp_path):
     assert figure.get_suptitle() == "Press No. 1: free motion"
 
 
-def test_simulate_writes_recording_and_summary(free_run):
-    folder, result = free_run
-    assert sorted(path.name for path in folder.iterdir()) == ["recording.csv", "summary.md"]
-    recording = crane.Recording.from_csv(folder / "recording.csv")
-    assert len(recording.time) == 21 and recording.machine == "mini_forwarder"
-    assert "| X1 |" in result.stdout
-
-
 def test_results_go_to_a_folder_called_as_the_command(tmp_path):
     machine = Path(__file__).parent / "data" / "slider_crank.yaml"
     command = "simulate", machine, "--duration", "0.01"
@@ -419,17 +405,6 @@ def test_view_of_a_run_whose_machine_has_moved(tmp_path):
     result = typed(*view, "--machine", data / "slider_crank.yaml")
     assert result.returncode == 0, result.stderr
     assert page.is_file()
-
-
-def test_page_of_a_machine_whose_name_is_no_file_name(tmp_path):
-    data = Path(__file__).parent / "data"
-    text = (data / "slider_crank.yaml").read_text().replace("urdf: ", f"urdf: {data}/")
-    assert "name: slider_crank" in text
-    text = text.replace("name: slider_crank", "name: 'a/b: <c>'")
-    (tmp_path / "named.yaml").write_text(text)
-    result = typed("view", "named.yaml", "--no-open", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
-    assert (tmp_path / "a_b_c.html").is_file()
 
 
 @pytest.mark.parametrize(

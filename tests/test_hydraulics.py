@@ -319,22 +319,6 @@ def test_a_machine_too_large_to_compile_is_integrated_by_scipy(tmp_path, monkeyp
     assert np.ptp(whole.q) > 5e-4
 
 
-def test_pump_shares_its_flow(tmp_path):
-    """Two cylinders that ask for 80 l/min of a pump of 50: all of it is used, none is made."""
-    machine = rig(
-        tmp_path, COMPENSATED, supply={"flow": 50 / 6e4}, joints=("x", "y"), axis="1 0 0"
-    )
-    signals = ValveSignals(machine, [0.0, 0.1, 0.2], {"x": [5.8, 5.8, 2.8], "y": [5.8, 5.8, 2.8]})
-    recording = crane.simulate(machine, signals, initial=[0.05, 0.05], duration=2.0)
-    channels = recording.channels
-    drawn = channels["flow_x_a"] + channels["flow_y_a"]
-    assert drawn[-500:].mean() == pytest.approx(50 / 6e4, rel=1e-3)
-    assert channels["pressure_supply"][-1] < 9.25e6 - 2e5
-    alone = ValveSignals(machine, [0.0, 0.1, 0.2], {"x": [5.8, 5.8, 2.8]})
-    recording = crane.simulate(machine, alone, initial=[0.05, 0.05], duration=2.0)
-    assert recording.channels["flow_x_a"][-500:].mean() == pytest.approx(40 / 6e4, rel=1e-3)
-
-
 def test_against_an_independent_simulation(tmp_path):
     """The equations written out again and integrated by scipy to 1e-10."""
     machine = rig(tmp_path, ORIFICE, friction={"viscous": 800.0})

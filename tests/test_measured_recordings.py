@@ -397,15 +397,6 @@ def test_sensors_that_disagree_are_told(machine, columns, truth, tmp_path, full)
     assert float(told["sensor.q3.delay"]) == pytest.approx(0.1, abs=0.01)
 
 
-def test_sensors_that_agree_within_their_noise_are_not(machine, columns, truth, tmp_path):
-    rng = np.random.default_rng(0)
-    columns["q3 [deg]"] = columns["q3 [deg]"] + 0.1 * rng.normal(size=401)
-    columns |= {"X1 [mm]": 1e3 * truth["q"][:, 1], "X2 [mm]": 1e3 * truth["q"][:, 2]}
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", CraneWarning)
-        read_measured(machine, write(tmp_path, columns))
-
-
 def test_strokes_do_not_depend_on_the_blocks(machine, columns, truth, tmp_path, monkeypatch):
     """Sample numbers in errors count from the first sample of the recording."""
     file = write(tmp_path, columns)

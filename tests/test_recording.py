@@ -366,22 +366,6 @@ def test_velocities_may_be_missing(tmp_path):
     np.testing.assert_allclose(read.v[1:-1, 0], np.cos(time[1:-1]), atol=1e-5)
 
 
-def test_npz_holds_the_same_as_csv(tmp_path):
-    time = np.linspace(0, 1, 11)
-    columns = {
-        "time [s]": time, "X1 [m]": time**2, "X1_velocity [m/s]": 2 * time,
-        "X1_force [N]": 1 + time, "pressure [Pa]": 1e5 * time,
-    }  # fmt: skip
-    np.savez(tmp_path / "run.npz", **columns)
-    read = Recording.read(tmp_path / "run.npz")
-    read.to_csv(tmp_path / "run.csv")
-    again = Recording.read(tmp_path / "run.csv")
-    for one in (read, again):
-        assert one.joints == ("X1",) and one.channel_units == {"pressure": "Pa"}
-        np.testing.assert_array_equal(one.q[:, 0], time**2)
-        np.testing.assert_array_equal(one.tau[:, 0], 1 + time)
-
-
 @pytest.mark.parametrize(
     ("columns", "message"),
     [

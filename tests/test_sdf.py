@@ -328,21 +328,6 @@ def test_a_closed_mesh_is_the_solid_that_it_bounds(tmp_path):
         )
 
 
-def test_any_closed_mesh_as_trimesh_has_it(tmp_path):
-    """Non-convex and askew: an L in one surface, by trimesh's own integrals."""
-    outline = np.array([[0, 0], [2, 0], [2, 0.5], [0.5, 0.5], [0.5, 1], [0, 1]]) * 0.1
-    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
-    mesh = trimesh.creation.extrude_triangulation(outline, faces, 0.3)
-    mesh.apply_transform(trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.6, 0.3])))
-    mesh.density = 800
-    found = body_of(tmp_path, '<inertial auto="true"/>', mesh_of(tmp_path, mesh, "l.ply"))
-    assert mesh.is_watertight
-    assert found.mass == pytest.approx(mesh.mass, rel=1e-6)
-    assert np.allclose(found.com, mesh.center_mass, atol=1e-7)
-    tensor = mesh.moment_inertia[np.triu_indices(3)]
-    assert np.allclose(found.tensor, tensor, rtol=1e-5, atol=1e-7)
-
-
 def test_density_and_mass_of_the_whole(tmp_path):
     """Density by collision, then by link, then water; a mass keeps the shape of the tensor."""
     boxes = [

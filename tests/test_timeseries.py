@@ -23,13 +23,6 @@ def read_text(tmp_path, text, **kwargs):
     return read_table(path)
 
 
-def test_reads_names_units_and_numbers(tmp_path):
-    table = read_text(tmp_path, GOOD)
-    assert table.units == {"time": "s", "a": "m", "b": ""}
-    np.testing.assert_array_equal(table.values, [[0, 1, 2], [0.5, 3, 4]])
-    assert table.notes == {}
-
-
 @pytest.mark.parametrize(
     "text",
     [

@@ -3,7 +3,7 @@
 import os
 
 import pytest
-from broken_machines import GROUND, LOOPED, Broken, assert_refused, case, swap, whole
+from broken_machines import GROUND, LOOPED, assert_refused, case, swap, whole
 
 import crane
 from crane.formats.xml_file import XmlFile
@@ -282,14 +282,6 @@ LAUGHS = '<!DOCTYPE robot [<!ENTITY a "ha">{}]>'.format(
 )
 
 
-@pytest.mark.parametrize("place", ['<robot name="four_bar_ground">&j;', '<robot name="&j;">'])
-def test_entities_are_not_expanded(place, tmp_path):
-    """Nine entities, each ten times the one before, would be two gigabytes."""
-    edit = swap('<robot name="four_bar_ground">', LAUGHS + place, GROUND)
-    message = "ground.urdf:1: <!DOCTYPE> is not supported, remove it"
-    assert_refused(Broken(message, (edit,)), tmp_path)
-
-
 @pytest.mark.parametrize(
     ("encoding", "written"),
     [
@@ -321,13 +313,3 @@ def test_files_without_end_are_refused(tmp_path):
         XmlFile(tmp_path / "large.urdf")
     with pytest.raises(crane.CraneError, match="it is no plain file, copy it into one"):
         XmlFile(tmp_path / "zero.urdf")
-
-
-def test_files_are_not_fetched(tmp_path):
-    (tmp_path / "secret").write_text("secret")
-    entity = f'<!DOCTYPE robot [<!ENTITY x SYSTEM "file://{tmp_path}/secret">]>'.encode("utf-16")
-    path = tmp_path / "robot.urdf"
-    path.write_bytes(entity + '<robot name="r">&x;<link name="&x;"/></robot>'.encode("utf-16")[2:])
-    with pytest.raises(crane.CraneError) as caught:
-        crane.load(path)
-    assert "secret" not in str(caught.value)

@@ -4,7 +4,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.interpolate import PPoly, make_interp_spline
-from scipy.spatial.transform import Rotation, Slerp
 
 import crane
 from crane.common.errors import DescriptionError, InputError, UnreachableTipError
@@ -16,21 +15,6 @@ TIMES = [0.0, 0.4, 1.5, 2.0]
 
 
 # --- the spline ------------------------------------------------------------------------------
-
-
-def test_it_passes_the_points_from_rest_to_rest():
-    path = crane.via_points(TIMES, PLACES)
-    q, v, a = path(np.array(TIMES))
-    given = np.isfinite(PLACES)
-    rounding = 20 * np.finfo(float).eps  # of sums of six terms, after a solution by LAPACK
-    np.testing.assert_allclose(q[given], np.array(PLACES)[given], rounding, rounding)
-    assert np.abs(v[[0, -1]]).max() < 1e-13 and np.abs(a[[0, -1]]).max() < 1e-12
-    assert path.duration == 2.0
-    # what is left open follows its own points alone
-    alone = crane.via_points([0.0, 1.5, 2.0], [[1.0], [3.0], [2.0]])
-    time = np.linspace(0, 2, 101)
-    for one, other in zip(path(time), alone(time), strict=True):
-        assert np.abs(one[:, 1] - other[:, 0]).max() < 1e-9
 
 
 def test_one_via_point_is_the_closed_form_of_flash_and_hogan():
@@ -90,16 +74,6 @@ def test_bad_points(time, points, rates, line):
 
 
 # --- attitudes -------------------------------------------------------------------------------
-
-
-def test_two_attitudes_are_joined_by_the_shortest_turn():
-    first, last = [0.4, -0.2, 1.0], [2.0, 0.7, -2.5]
-    path = crane.motion.via_attitudes([0.0, 2.0], [first, last])
-    pace = crane.point_to_point([0.0], [1.0], 2.0)
-    ends = Rotation.from_euler("xyz", [first, last])
-    time = np.linspace(0, 2, 41)
-    wanted = Slerp([0, 1], ends)(pace.position(time)[:, 0]).as_matrix()
-    assert np.abs(path(time)[0] - wanted).max() < 1e-13
 
 
 def test_attitudes_turn_as_they_say():
