@@ -9,7 +9,6 @@ from broken_machines import MINI, copy_machine, swap
 from oracles import (
     by_stroke,
     mini_forwarder,
-    mini_forwarder_gamma,
     mini_forwarder_potential,
 )
 
@@ -157,15 +156,6 @@ class TestDrivenBy:
         assert np.abs(q[:, columns] - strokes).max() < 1e-13
         assert np.array_equal(driven.lower, [-np.pi, -np.inf, -np.inf])
         assert not driven.upper.flags.writeable
-
-    def test_rows_of_the_strokes_are_dx_dq(self, mini, strokes):
-        driven = mini.with_active_joints(["q1", "q2", "q3"])
-        gamma = driven.closure.gamma(mini.closure.solve(strokes))
-        slopes = mini_forwarder_gamma(*strokes.T[1:])  # dq/dx
-        expected = np.linalg.inv(np.stack([slopes["q2"], slopes["q3"]], axis=1))
-        rows = gamma[:, [mini.column("X1"), mini.column("X2")]]
-        assert np.abs(rows[:, :, 1:] - expected).max() < 1e-12 * np.abs(expected).max()
-        assert np.abs(rows[:, :, 0]).max() < 1e-14  # slewing moves no cylinder
 
     def test_torques_are_the_forces_times_dx_dq(self, mini, strokes):
         """Equations (18), (19), in any motion; at rest also the slope of the potential."""

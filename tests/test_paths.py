@@ -17,8 +17,6 @@ from crane.common.errors import (
     UnreachableTipError,
 )
 
-MM = 1e-3
-
 
 @pytest.fixture(scope="module")
 def tasks(mini):

@@ -10,10 +10,6 @@ from crane.common.errors import DescriptionError, InputError, UnreachableTipErro
 from crane.motion.attitude import InclinationCoordinate, roll_pitch_yaw
 from crane.motion.quintic_splines import PiecewisePolynomial, least_jerk
 
-PLACES = [[0.0, 1.0], [0.5, np.nan], [0.2, 3.0], [1.0, 2.0]]
-TIMES = [0.0, 0.4, 1.5, 2.0]
-
-
 # --- the spline ------------------------------------------------------------------------------
 
 
