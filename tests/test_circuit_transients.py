@@ -100,39 +100,6 @@ def compare(
 
 
 @pytest.mark.slow
-def test_accumulator_with_heat_under_a_load(tmp_path):
-    """A load that swings on gas: closed valve, chamber A throttled into an accumulator."""
-    v0, p0, n, tau, port = 8e-4, 1.5e6, 1.3, 0.7, 1e-4
-    machine = rig(
-        tmp_path, VALVE,
-        accumulators={"gas": {
-            "volume": v0, "precharge": p0, "exponent": n, "time_constant": tau, "line": port,
-            "pressure": 3.2e6,
-        }},
-        elements={
-            "throttle": {"type": "orifice", "from": "x.a", "to": "gas", "coefficient": 8e-7},
-        },
-    )  # fmt: skip
-
-    def rates(t, y):
-        x, v, a, b, p, oil = y
-        q = 8e-7 * root(a - p)
-        left = v0 - oil
-        cooling = (p - p0 * v0 / left) / tau
-        # port / B p' + V' = q, V = volume of the oil behind the diaphragm, p' = n p V' / left - ..
-        slope = (n * p * q / left - cooling) / (1 + port / BULK * n * p / left)
-        return [
-            *cylinder(x, v, a, b, -q, 0.0, weight=2000 * G), slope, q - port / BULK * slope,
-        ]  # fmt: skip
-
-    names = ["x", "x.v", "pressure_x_a", "pressure_x_b", "pressure_gas", "oil"]
-    compare(
-        machine, {"x": [0.0, 0.0]}, rates, names, 3.0, [0.0, 3.0],
-        start={"oil": v0 * (1 - p0 / 3.2e6)}.items(),
-    )  # fmt: skip
-
-
-@pytest.mark.slow
 def test_engine_with_two_pumps_of_summed_power(tmp_path):
     engine = {"speed": 190.0, "torque": 40.0, "inertia": 0.5, "speed_droop": 12.0}
     pump = {

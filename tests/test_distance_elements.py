@@ -15,8 +15,6 @@ from test_compiled import off
 import crane
 from crane.closure.kinematics_formulas import FormulaConstants, PositionKinematics
 from crane.closure.loop_formulas import LoopFormulas
-from crane.codegen import Program, Tape
-from crane.codegen.differentiation import differentiate
 from crane.common.errors import CraneWarning, InputError
 from crane.description import ForceElement, Rope
 from crane.dynamics.compiled_dynamics import QUANTITIES, STICK_SLIP_QUANTITIES
@@ -258,37 +256,6 @@ def test_the_balance_of_energies(mini):
     batch = crane.simulation.simulate_batch(machine, initial=[start[0]], duration=0.05)
     alone = crane.simulate(machine, initial=start[0], duration=0.05)
     np.testing.assert_array_equal(batch.q[0], alone.q)
-
-
-def test_the_jacobian_over_velocities_is_that_of_differences(mini):
-    """As the Rosenbrock method takes it: of gamma^T f by v_A, by formulas."""
-    dynamics = crane.Dynamics(clad(bare(mini), 3))
-    closure, n = mini.closure, 3
-    tape = Tape()
-    q, posture, loops = closure.compiled_closure.trace_kinematics(tape, 0, 2)
-    constants, v_a = (
-        FormulaConstants(tape, 1, dynamics.formula_constants),
-        tape.load_vector(3, 0, n),
-    )
-    sweep = DynamicsFormulas(posture, loops, constants, q, v_a, dynamics.formula_structure)
-    rows = differentiate(sweep.passive_force, v_a)
-    program = Program()
-    program.add_formula("f", 4, [entry for row in rows for entry in row])
-    program.compile()
-    at, v = closure.solve(np.array([0.3, 0.012, 0.02])), np.array([0.4, 0.1, -0.2])
-    found = np.zeros(n * n)
-    program.call(
-        "f", closure.compiled_closure.geometry.constants, dynamics.formula_constants, at, v, found
-    )
-    wanted = [
-        oracles.derivative(
-            lambda t, e=e: dynamics.evaluate_closed("passive", at, v + t * e, v), 1e-2
-        )
-        for e in np.eye(n)
-    ]
-    size = np.abs(wanted).max()
-    assert size > 1e-3
-    np.testing.assert_allclose(found.reshape(n, n), np.transpose(wanted), atol=1e-10 * size)
 
 
 # --- closed forms ----------------------------------------------------------------------------

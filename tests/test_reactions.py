@@ -228,41 +228,6 @@ def test_what_floats_is_held_by_nothing(tmp_path):
     assert np.abs(found[0]).max() < 1e-9 * np.abs(found).max()
 
 
-def test_multipliers_are_those_of_pinocchio(stewart):
-    """Spherical loops of a Stewart platform in motion, all determined."""
-    reactions = Reactions(stewart)
-    model, equations = pin.Model(stewart.model), stewart.closure.equations
-    assert all(loop.type == "spherical" for loop in equations.loops)
-    contacts = pin.StdVec_RigidConstraintModel()
-    for loop in equations.loops:
-        ends = [model.frames[stewart.frame(x)] for x in (loop.predecessor, loop.successor)]
-        place = [x for end in ends for x in (end.parentJoint, end.placement)]
-        contacts.append(
-            pin.RigidConstraintModel(pin.ContactType.CONTACT_3D, model, *place, pin.LOCAL)
-        )
-    datas = pin.StdVec_RigidConstraintData()
-    for contact in contacts:
-        datas.append(contact.createData())
-    data = model.createData()
-    pin.initConstraintDynamics(model, data, contacts, datas)
-    settings = pin.ProximalSettings(1e-12, 1e-14, 100)
-    _, (q, v, _) = moving(stewart, 4, share=0.05)
-    rng = np.random.default_rng(3)
-    for i in range(len(q)):
-        tau = np.zeros(model.nv)
-        tau[stewart.closure.active] = 300 * rng.normal(size=len(stewart.active))
-        a = pin.constraintDynamics(model, data, q[i], v[i], tau, contacts, datas, settings)
-        drives = reactions.drive_forces(q[i], v[i], a)
-        assert np.allclose(drives, tau[stewart.closure.active], atol=1e-6)
-        found = reactions.joint_wrenches(q[i], v[i], a)[model.njoints - 1 :, :3]
-        lambdas = np.reshape(data.lambda_c, (-1, 3))
-        pin.updateFramePlacements(model, data)
-        for force, wanted, loop in zip(found, lambdas, equations.loops, strict=True):
-            turn = data.oMf[stewart.frame(loop.predecessor)].rotation
-            assert np.allclose(turn @ wanted, -force, atol=1e-6 * np.abs(found).max())
-    assert reactions.statically_determined(q).all()
-
-
 def test_determined_is_what_no_stress_changes(mini):
     """Random stresses of the loops in themselves, gathered body by body."""
     reactions = Reactions(mini)
