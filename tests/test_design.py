@@ -274,15 +274,6 @@ def test_loads_before_and_after_are_drawn(tmp_path):
         assert (tmp_path / "out" / name).read_bytes()[:4] == b"\x89PNG"
 
 
-def test_slopes_of_a_chart_are_written(tmp_path):
-    chart = crane.capacity(crane.load("excavator"), "bucket", radii=[5.0, 6.0], heights=[1.0])
-    chart.derivatives_to_csv(tmp_path / "slopes.csv", ["arm.mass"])
-    lines = [x for x in (tmp_path / "slopes.csv").read_text().splitlines() if x[0] != "#"]
-    assert lines[0].endswith("load [kg],load_by_arm.mass [kg/SI]") and len(lines) == 5
-    wanted = chart.derivatives(["arm.mass"])[0, 0, :, 0]
-    assert [float(x.split(",")[-1]) for x in lines[1:3]] == pytest.approx(wanted)
-
-
 @pytest.fixture
 def pendulum(tmp_path):
     """Two links that hang on each other: without loops a variant is made in little time."""

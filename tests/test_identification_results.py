@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 import re
-import sys
 import warnings
 from functools import partial
 from pathlib import Path
@@ -12,12 +11,12 @@ import forwarder_motions
 import numpy as np
 import pytest
 from broken_machines import DATA
+from command_line import typed
 from forwarder_motions import NOISE
 from lxml import etree
 from scipy.interpolate import CubicSpline
 
 import crane
-from crane import cli
 from crane.common.errors import CraneWarning, InputError, OutputError, RecordingError
 from crane.identification.mechanics.identification_model import default_terms
 from crane.identification.mechanics.identified_description import divide_locked_bodies
@@ -533,17 +532,13 @@ def test_a_machine_identified_as_described_is_divided_as_described():
 
 
 @pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
+def run(tmp_path):
     """The command line in this process: exit status, stdout, stderr without warnings."""
-    monkeypatch.chdir(tmp_path)
 
     def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["crane", *map(str, arguments)])
-        with warnings.catch_warnings(), pytest.raises(SystemExit) as ended:
-            cli.main()
-        out, err = capsys.readouterr()
-        lines = [line for line in err.splitlines() if not line.startswith("warning: ")]
-        return ended.value.code, out, lines
+        done = typed(*arguments, cwd=tmp_path)
+        lines = [x for x in done.stderr.splitlines() if not x.startswith("warning: ")]
+        return done.returncode, done.stdout, lines
 
     return call
 
@@ -603,7 +598,6 @@ def test_wrong_recordings_and_arguments_are_one_line(run, mini, tmp_path):
     good = as_recording(mini, motion(mini, duration=8.0))
     good.to_csv(tmp_path / "good.csv")
     text = (tmp_path / "good.csv").read_text()
-    n, scale = len(good.time), np.array([180 / np.pi, 1.0, 1.0])
 
     def other(**changes):
         return dataclasses.replace(good, **changes)
@@ -611,14 +605,12 @@ def test_wrong_recordings_and_arguments_are_one_line(run, mini, tmp_path):
     def few():
         return other(**{k: getattr(good, k)[:20] for k in ("time", "q", "v", "tau")})
 
-    trembling = 1e-6 * np.random.default_rng(0).normal(size=(n, 3))
+    trembling = 1e-6 * np.random.default_rng(0).normal(size=good.q.shape)
     still = other(q=good.q[0] + trembling, v=0 * good.v)
     broken = text.replace(",".join(text.splitlines()[40].split(",")[:2]), "nan,0", 1)
     cases = [
         (without("X1_force", text), "column 'X1_force' is missing"),
         (broken, "column 'time': 'nan' is not a finite number"),
-        (other(q=good.q * scale), "'q1' goes from"),
-        (other(tau=1e3 * good.tau), "it looks 1000-fold, give SI units"),
         (still, "no joint moves, record a motion"),
         (few(), "20 samples are too few, record at least 50"),
     ]
@@ -632,9 +624,7 @@ def test_wrong_recordings_and_arguments_are_one_line(run, mini, tmp_path):
         assert errors[0].startswith("error: ") and message in errors[0]
         assert not (tmp_path / "out").exists()
     for arguments, message in (
-        (["--method", "lsq"], "method 'lsq' is unknown"),
         (["--prior", "-1"], "--prior is '-1', write NAME=STD, as in bodies=10%"),
-        (["--bandwidth", "0"], "the bandwidth is 0.0 Hz"),
         (["--bandwidth", "1e-6"], "the bandwidth is 1e-06 Hz"),
         (["--validation", "none.csv"], "none.csv: no such file"),
     ):
