@@ -2,7 +2,6 @@
 
 import os
 import re
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -11,22 +10,15 @@ import pytest
 from command_line import typed
 from excavators import FOLD, LIFT, planar, spatial
 from oracles import SliderCrank
+from warned import told as told_by
 
 import crane
-from crane.common.errors import CraneError, CraneWarning
+from crane.common.errors import CraneError
 from crane.formats.additions.steel_cylinder import RELIEF_PRESSURE, SteelCylinder
 
 ZX200 = Path(__file__).parents[2] / "shared/data/third_party/zx200/zx200.xacro"
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
-
-
-def told_by(call, *arguments, **given):
-    """What a call gives, and what it warned of."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", CraneWarning)
-        found = call(*arguments, **given)
-    return found, [str(one.message) for one in caught]
 
 
 def eyes_apart(machine, name, q):

@@ -5,6 +5,7 @@ import warnings
 import benchmark_mechanisms
 import numpy as np
 import pytest
+from warned import quiet
 
 import crane
 
@@ -63,9 +64,7 @@ def test_bricard_s_mechanism_moves_alike_by_any_joint(tmp_path, active):
 
 def test_a_stiff_governor_by_all_methods(tmp_path):
     """Flyballs against 8e5 N/m and 4e4 N s/m: errors are what the tolerance says."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", crane.CraneWarning)
-        machine = benchmark_mechanisms.governor(tmp_path)
+    machine = quiet(benchmark_mechanisms.governor, tmp_path)
     start = machine.home[machine.closure.active], np.array([2 * np.pi, 0.0])
 
     def run(**how):

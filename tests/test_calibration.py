@@ -9,6 +9,7 @@ import pytest
 from command_line import typed
 from hydraulic_rig import COMPENSATED, rig
 from test_sensors import COLUMNS, LIFTING
+from warned import quiet
 
 import crane
 from crane.common.errors import CraneError, CraneWarning, InputError
@@ -66,12 +67,6 @@ def recorded(machine, path, seed, truth=None, offset=0.0, extra=()):
     table = timeseries.Table(units, np.column_stack([run.time, voltage, *values]), {})
     timeseries.write_table(path, table)
     return path
-
-
-def quiet(call, *args, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        return call(*args, **options)
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 import re
 import textwrap
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 from command_line import typed
 from full_circuit import ALL, SIGNALS, TIMES, everything, gaps
 from hydraulic_rig import rig
+from warned import without_a_word
 
 import crane
 from crane.common.errors import CraneError, DescriptionError, InputError
@@ -33,9 +33,7 @@ def test_everything_is_written_and_read_to_the_last_bit(tmp_path):
 
 
 def test_all_numbers_are_named_and_can_be_changed(tmp_path):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        machine = everything(tmp_path)
+    machine = without_a_word(everything, tmp_path)
     told = typed("info", tmp_path / "rig.yaml", "--names")
     assert told.returncode == 0, told.stderr
     for name in (
@@ -130,9 +128,7 @@ def test_linear_model_of_two_pumps_at_rest_and_moving(tmp_path):
         tmp_path, supply=PUMP | {"response": 0.1, "least": 0.01}, axis="1 0 0",
         elements={"leak": LEAK | {"gain": 2e-12}},
     )  # fmt: skip
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        model = crane.linearize(tmp_path / "rig.yaml")
+    model = without_a_word(crane.linearize, tmp_path / "rig.yaml")
     # V / B p' = Q e - (gain) p with its own time constant, e' = -e / T beside its least
     values = np.linalg.eigvals(model.A)
     for wanted in (-2e-12 * 1.2e9 / 2e-3, -10.0):

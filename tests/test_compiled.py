@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import oracles
 import pytest
+from warned import quiet
 
 import crane
 import crane.codegen.program
@@ -498,9 +499,7 @@ def test_answers_do_not_depend_on_history(mini, machines):
 
 def test_long_formulas_are_left_to_pinocchio(mini, monkeypatch):
     samples = draw(mini, 5, 10)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        again = crane.load("mini_forwarder")  # with nothing compiled yet
+    again = quiet(crane.load, "mini_forwarder")  # with nothing compiled yet
     quick = crane.Dynamics(mini)
     wanted = {quantity: ask(quick, quantity, samples) for quantity in QUANTITIES}
     monkeypatch.setattr(crane.codegen.program, "MAX_OPERATIONS", 10)

@@ -8,6 +8,7 @@ import oracles
 import pinocchio as pin
 import pytest
 from broken_machines import DATA
+from warned import quiet
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
@@ -94,9 +95,7 @@ def test_pinocchio_s_multipliers_agree(rotors):
 
 
 def test_a_run_keeps_its_energy(rotors):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        run = crane.simulate(rotors, lambda t, q, v: np.array([0.2, 20.0, 10.0]), duration=0.05)
+    run = quiet(crane.simulate, rotors, lambda t, q, v: np.array([0.2, 20.0, 10.0]), duration=0.05)
     energy = run.channels["kinetic"] + run.channels["potential"]
     assert np.ptp(run.channels["kinetic"]) > 1e-4
     np.testing.assert_allclose(run.channels["work"], energy - energy[0], rtol=0, atol=1e-9)

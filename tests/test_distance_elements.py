@@ -11,6 +11,7 @@ import pytest
 from broken_machines import MACHINE, assert_refused, case, copy_machine, swap
 from command_line import typed
 from test_compiled import off
+from warned import quiet
 
 import crane
 from crane.closure.kinematics_formulas import FormulaConstants, PositionKinematics
@@ -547,9 +548,7 @@ def test_what_mjcf_has_no_place_for_is_told(tmp_path, mini):
     names = "between 'link3_H' and 'A1_rod'"
     assert line.count(f"the constant force of the force element {names}") == 2
     assert f"the damping of the rope {names}" in line
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        again = crane.load(tmp_path / "mini.xml")
+    again = quiet(crane.load, tmp_path / "mini.xml")
     first, second = (x for x in again.forces if x.between)
     assert first.between == BOOM and first.rest == pytest.approx(0.3)  # 30 (l - 0.3)
     assert (second.stiffness, second.rest) == (30.0, 0.0)

@@ -1,7 +1,6 @@
 """Equations of motion against Lagrange's on paper, Pinocchio's constraint solver, and balances."""
 
 import dataclasses
-import warnings
 
 import numpy as np
 import oracles
@@ -9,9 +8,10 @@ import pinocchio as pin
 import pytest
 import scipy.integrate
 from lxml import etree
+from warned import quiet
 
 import crane
-from crane.common.errors import CraneWarning, InputError
+from crane.common.errors import InputError
 
 CRANK = oracles.SliderCrank()
 STROKE = 0.030  # [m]
@@ -527,9 +527,7 @@ def test_payload_equals_a_link_with_that_mass(mini, tmp_path):
     text = mini.path.read_text().replace("urdf: urdf", f"urdf: {folder}/urdf")
     text = text.replace(f"{folder}/urdf/mini_forwarder/chain_a.urdf", "chain_a.urdf")
     (tmp_path / "heavy.yaml").write_text(text)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        written = crane.load(tmp_path / "heavy.yaml")
+    written = quiet(crane.load, tmp_path / "heavy.yaml")
     carried = mini.with_payload(PAYLOAD)
     q_a, v_a, a_a, _ = states(50, seed=18)
     for machine in (mini, carried):

@@ -13,6 +13,7 @@ from rig import Rig, Tolerances
 from rig.sensors import default_sensors
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
+from warned import quiet
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
@@ -404,9 +405,7 @@ def arm(folder, effort, section=""):
         "name: swinging\nchains:\n  - {name: arm, urdf: arm.urdf}\nactive: [lift, swing]\n"
         + section
     )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        return crane.load(folder / "arm.yaml")
+    return quiet(crane.load, folder / "arm.yaml")
 
 
 def hold(machine):

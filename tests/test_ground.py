@@ -1,9 +1,8 @@
 """Ground contact: statics, falls, wheels, energy, and the equilibrium at the start."""
 
-import warnings
-
 import numpy as np
 import pytest
+from warned import quiet
 
 import crane
 from crane.common.errors import CraneError
@@ -46,9 +45,7 @@ def start(machine, slope, above=0.0):
 
 
 def run(machine, loads, initial, duration, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return crane.simulate(machine, None, initial, duration, loads=loads, **options)
+    return quiet(crane.simulate, machine, None, initial, duration, loads=loads, **options)
 
 
 def balance(found, loads):

@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import pytest
 from hydraulic_rig import COMPENSATED, ORIFICE, rig
+from warned import without_a_word
 
 import crane
 from crane.common.errors import CraneWarning, DescriptionError, InputError
@@ -115,9 +116,7 @@ def test_another_unit_is_told(tmp_path, numbers, line):
     ],
 )  # fmt: skip
 def test_what_is_usual_is_not_doubted(tmp_path, numbers):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", CraneWarning)
-        rig(tmp_path, **numbers)
+    without_a_word(rig, tmp_path, **numbers)
     assert check(tmp_path / "rig.yaml").status == 0
 
 

@@ -1,27 +1,22 @@
 """Incomplete files: completed by documented assumptions, with a warning."""
 
-import warnings
+from functools import partial
 
 import numpy as np
 import pytest
 from broken_machines import GROUND, LOOPED, MACHINE, MINI, ROCKER, Edit, copy_machine, swap
 from command_line import typed
 from test_mechanism import WHEEL
+from warned import told
 
 import crane
-from crane.common.errors import CraneWarning
 
 
 def completed(text: str, *edits: Edit, machine: str = MACHINE):
     return text, edits, machine
 
 
-def loaded(path, **given):
-    """A machine, and what loading it warned of."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", CraneWarning)
-        machine = crane.load(path, **given)
-    return machine, [str(one.message) for one in caught]
+loaded = partial(told, crane.load)
 
 
 def edited(folder, edits, machine=MACHINE):

@@ -1,21 +1,14 @@
 """Linear models against closed forms, short simulations and formats of other programs."""
 
-import warnings
-
 import numpy as np
 import pytest
 from command_line import typed
 from hydraulic_rig import AREA_A, AREA_B, COMPENSATED, HOSE, STROKE, rig
+from warned import quiet
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
 from crane.simulation.linear.linearization import LinearizedExternalForces
-
-
-def quiet(call, *args, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        return call(*args, **options)
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 import csv
 import re
-import warnings
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import oracles
 import pytest
 from broken_machines import MINI, copy_machine, swap
 from command_line import typed
+from warned import quiet
 
 import crane
 from crane.common.errors import CraneError, CraneWarning, RecordingError
@@ -44,9 +44,7 @@ def path(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def machine(path):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        return crane.load(path)
+    return quiet(crane.load, path)
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 import re
 import sys
-import warnings
 from xml.etree import ElementTree
 
 import numpy as np
@@ -10,6 +9,7 @@ import pinocchio as pin
 import pytest
 from broken_machines import DATA
 from linkages import WRITERS, assert_same, postures, rewritten
+from warned import told, without_a_word
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
@@ -246,15 +246,11 @@ def test_a_motor_alone_and_shapes_that_do_not_touch_are_no_news(tmp_path):
     pytest.importorskip("mujoco")
     text = LOOPED.replace("<worldbody>", '<default><geom contype="0"/></default><worldbody>')
     (tmp_path / "plain.xml").write_text(text)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", CraneWarning)
-        crane.load(tmp_path / "plain.xml")
+    without_a_word(crane.load, tmp_path / "plain.xml")
     (tmp_path / "off.xml").write_text(
         LOOPED.replace("<mujoco>", "<mujoco>" + OFF.format("contact"))
     )
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", CraneWarning)
-        crane.load(tmp_path / "off.xml")
+    without_a_word(crane.load, tmp_path / "off.xml")
 
 
 @pytest.mark.parametrize("seed", range(30))
@@ -387,10 +383,7 @@ def test_an_xml_may_be_a_urdf(tmp_path):
 def machine_of(text, folder):
     """A machine of a file, and the lines that loading it says."""
     (folder / "some.xml").write_text(text)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", CraneWarning)
-        machine = crane.load(folder / "some.xml")
-    return machine, [str(one.message) for one in caught]
+    return told(crane.load, folder / "some.xml")
 
 
 def test_a_key_far_from_closed_is_refused_and_taken_where_that_is_asked_for(tmp_path):

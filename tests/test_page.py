@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from executed_lines import at_most
+from warned import quiet
 
 import crane
 from crane.common.errors import CraneWarning, RecordingError
@@ -28,9 +29,7 @@ CORNERS = [[0.0, 0.0221, 0.0108], [0.4, 0.03, 0.0], [1.1, 0.0, 0.03], [-0.7, 0.0
 
 @pytest.fixture(scope="module")
 def machine():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        return crane.load("mini_forwarder")
+    return quiet(crane.load, "mini_forwarder")
 
 
 @pytest.fixture(scope="module")
@@ -637,9 +636,7 @@ def test_a_cylinder_that_is_not_drawn_has_a_rod_that_stays_in_its_barrel(tmp_pat
 
 
 def test_arrows_are_in_proportion_to_what_joints_can():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        machine = crane.load("mini_forwarder")
+    machine = quiet(crane.load, "mini_forwarder")
     limits = {"q1": 1.765, "X1": 80.0, "X2": 80.0}
     peaks = {"q1": 0.011, "X1": 40.0, "X2": 10.0}
     full = full_arrow_forces(machine, peaks)

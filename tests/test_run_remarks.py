@@ -1,21 +1,16 @@
 """Remarks on a run: chatter, end stops that gain energy, pistons beyond their cylinders."""
 
 import re
-import warnings
+from functools import partial
 
 import numpy as np
 import pytest
+import warned
 
 import crane
-from crane.common.errors import CraneWarning, SimulationError
+from crane.common.errors import SimulationError
 
-
-def told(*args, **options):
-    """A run and its warnings."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", CraneWarning)
-        found = crane.simulate(*args, **options)
-    return found, [str(one.message) for one in caught]
+told = partial(warned.told, crane.simulate)
 
 
 def returning(machine):

@@ -1,6 +1,6 @@
 """SDF: what it says, in whatever way and version, is the machine that a plain URDF describes."""
 
-import warnings
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -9,16 +9,15 @@ import trimesh
 from command_line import typed
 from scipy.integrate import quad
 from sdf_models import SdfWriter, draw, planar, stewart, urdf
+from warned import quiet, told
 
 import crane
-from crane.common.errors import CraneError, CraneWarning
+from crane.common.errors import CraneError
 from crane.formats.robot_files import open_robots
 
 
 def load(path, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        return crane.load(path, **options)
+    return quiet(crane.load, path, **options)
 
 
 def assert_same(one, two, rng):
@@ -129,11 +128,7 @@ def written(folder, text, name="arm.sdf"):
     return folder / name
 
 
-def warnings_of(path, **options):
-    with warnings.catch_warnings(record=True) as heard:
-        warnings.simplefilter("always")
-        machine = crane.load(path, **options)
-    return machine, [str(one.message) for one in heard]
+warnings_of = partial(told, crane.load)
 
 
 def test_limits_friction_springs_and_home(tmp_path):

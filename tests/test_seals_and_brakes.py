@@ -7,6 +7,7 @@ import pytest
 import singular_linkages
 import yaml
 from hydraulic_rig import AREA_A, AREA_B, ORIFICE, rig
+from warned import quiet, without_a_word
 
 import crane
 from crane.common.errors import CraneError
@@ -29,9 +30,7 @@ METHODS = ("rosenbrock", "DOP853", pytest.param("Radau", marks=pytest.mark.long)
 
 
 def run(*args, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        return crane.simulate(*args, **options)
+    return without_a_word(crane.simulate, *args, **options)
 
 
 def gaps(recording):
@@ -486,9 +485,7 @@ def test_linear_models_have_seals_that_slide(tmp_path):
     """At a constant speed the trimmed force bears them."""
     machine = rig(tmp_path, axis="1 0 0", cylinder={"seal_friction": SEAL},
                   friction={"viscous": 500.0})  # fmt: skip
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        model = crane.linearize(machine, velocity={"x": 0.05})
+    model = quiet(crane.linearize, machine, velocity={"x": 0.05})
     a, b = (model.x[model.states.index(f"pressure_x_{side}")] for side in "ab")
     force = AREA_A * a - AREA_B * b
     assert force == pytest.approx(

@@ -1,6 +1,5 @@
 """Derivatives of the dynamics against differences of order 8 and Pinocchio's."""
 
-import warnings
 from functools import cache
 
 import numpy as np
@@ -8,6 +7,7 @@ import pinocchio as pin
 import pytest
 from linkages import MACHINES, loaded
 from test_floating import ARM, states, walker
+from warned import quiet
 
 import crane
 from crane.common.errors import CraneError
@@ -28,9 +28,7 @@ STATES = {"inverse": 3, "forward": 3, "regressor": 3, "mass_matrix": 1, "gravity
 def machine_of(name):
     if name in MACHINES:
         return loaded(name)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return crane.load(name)
+    return quiet(crane.load, name)
 
 
 dynamics_of = cache(crane.Dynamics)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warned
 from command_line import typed
 
 import crane
@@ -80,10 +81,8 @@ def written(folder, motion, names=None, notes=None, **off):
 
 def told(machine, path, **options):
     """What is said of sensors while a recording is read."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", CraneWarning)
-        crane.recordings.read_measured(machine, path, **options)
-    return [str(one.message) for one in caught if "sensors disagree" in str(one.message)]
+    _, lines = warned.told(crane.recordings.read_measured, machine, path, **options)
+    return [line for line in lines if "sensors disagree" in line]
 
 
 def number(line, name):
@@ -127,12 +126,9 @@ def test_what_a_machine_knows_of_its_sensors_corrects_a_recording(machine, motio
         X_lift=lambda x: 1.02 * x + 0.005,
     )  # fmt: skip
     for one in (machine, crane.load("patu655", changes={"sensor.X_lift.zero": 1.0}, lock=LOCKED)):
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", CraneWarning)
-            again = crane.recordings.read_measured(one, noted)
+        again, lines = warned.told(crane.recordings.read_measured, one, noted)
         assert np.array_equal(again.q, found.q)
-        said = [str(x.message) for x in caught if "notes of the recording count" in str(x.message)]
-        assert bool(said) == bool(one.sensors)
+        assert any("notes of the recording count" in x for x in lines) == bool(one.sensors)
 
 
 LOCKED = {"slew": 0.0, "X_ext": 0.0}

@@ -1,10 +1,10 @@
 """Soil cutting: force balance of wedges, tables of earth pressure, dissipation, energy."""
 
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
+from warned import quiet
 
 import crane
 from crane.common.errors import CraneError
@@ -222,9 +222,7 @@ def sled(tmp_path):
 
 
 def run(machine, loads, initial, duration, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return crane.simulate(machine, None, initial, duration, loads=loads, **options)
+    return quiet(crane.simulate, machine, None, initial, duration, loads=loads, **options)
 
 
 def test_pulled_as_the_equation_says_it_goes_on_at_its_speed(sled, tmp_path):

@@ -4,15 +4,15 @@ import base64
 import dataclasses
 import json
 import re
-import warnings
 from html.parser import HTMLParser
 
 import numpy as np
 import pinocchio as pin
 import pytest
+from warned import quiet
 
 import crane
-from crane.common.errors import CraneError, CraneWarning, InputError, OutputError, RecordingError
+from crane.common.errors import CraneError, InputError, OutputError, RecordingError
 from crane.formats.visuals.urdf_shapes import CylinderShape, MeshShape
 from crane.recordings.recording import Recording
 from crane.view.page import build_scene, report
@@ -47,9 +47,7 @@ ARM = """<robot name="arm">
 
 @pytest.fixture(scope="module")
 def machine():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        return crane.load("mini_forwarder")
+    return quiet(crane.load, "mini_forwarder")
 
 
 @pytest.fixture
@@ -124,9 +122,7 @@ def page_poses(tree, q):
 
 @pytest.mark.parametrize("name", ["mini_forwarder", "patu655", "kr300", "tx40", "ur5_robot"])
 def test_a_page_s_tree_gives_the_poses_of_forward_kinematics(name):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        machine = crane.load(name)
+    machine = quiet(crane.load, name)
     description = joint_tree(machine)
     links = [f.name for f in machine.model.frames if f.type == pin.FrameType.BODY]
     assert list(description["links"]) == links
