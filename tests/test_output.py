@@ -1,12 +1,17 @@
-"""Files and folders are written completely or not at all."""
+"""Files and folders are written completely or not at all, also by killed commands."""
 
 import os
 import re
 import shutil
+import sys
+from collections import Counter
+from unittest import mock
 
 import numpy as np
 import pytest
+from command_line import typed
 from killed_processes import killed_at
+from writing_commands import COMMANDS, read, writing
 
 import crane.cli.simulate
 import crane.common.temporary_files
@@ -348,3 +353,131 @@ def test_views_of_an_earlier_run_do_not_stay_beside_a_new_one(tmp_path, recordin
 )
 def test_names_of_files(text, name):
     assert portable_file_name(text) == name
+
+
+# --- killed commands ----------------------------------------------------------------------------
+
+
+_TEMPORARY = re.compile(r"\.[0-9a-f]{8}\.(part|old)(?=/|$)")
+_WRITES = os.O_WRONLY | os.O_RDWR
+# These write their folders as the others do, and compute for longer.
+EXPENSIVE = ("breakout", "calibrate", "capacity", "circuit", "design", "excite", "identify",
+             "power", "working-range")  # fmt: skip
+_before_call = None  # a hook stays until its process ends
+
+
+def _hook(event, arguments):
+    if _before_call is not None and event.startswith(("open", "os.", "shutil.", "ctypes.dl")):
+        _before_call(event, arguments)
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    sys.addaudithook(_hook)
+    folder = tmp_path_factory.mktemp("inputs")
+    read(folder)
+    return folder
+
+
+def contents(folder):
+    """Contents by path, None of folders; of what is temporary without its random part."""
+    return {
+        _TEMPORARY.sub(r".\1", str(path.relative_to(folder))): path.read_bytes()
+        if path.is_file()
+        else None
+        for path in sorted(folder.rglob("*"))
+    }
+
+
+def watched(place, run):
+    """Run a command; a copy of the place, by what is in it, of each instant it may be killed at.
+
+    Returns:
+        (copies, instants): Of each state the first copy, and in how many instants it was seen.
+    """
+    copies, instants = {}, {}
+
+    def look(event, arguments):
+        global _before_call
+        _before_call = None
+        try:
+            if event == "open" and (arguments[2] or 0) & _WRITES:
+                path = os.path.abspath(os.fsdecode(arguments[0]))
+                assert not path.startswith(f"{place}/") or _TEMPORARY.search(path), path
+            state = frozenset(contents(place).items())
+            if state not in copies:
+                copies[state] = place.parent / f"killed{len(copies)}" / place.name
+                shutil.copytree(place, copies[state], symlinks=True)
+            instants[state] = instants.get(state, 0) + 1
+        finally:
+            _before_call = look
+
+    global _before_call
+    _before_call = look
+    try:
+        run()
+    finally:
+        _before_call = None
+    return copies, instants
+
+
+def temporary(found):
+    return {name for name in found if re.search(r"\.(part|old)(/|$)", name)}
+
+
+def test_every_command_that_writes_is_here():
+    assert writing() == set(COMMANDS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(x, marks=pytest.mark.long) if x in EXPENSIVE else x for x in COMMANDS],
+)
+def test_old_or_new_wherever_it_is_killed(name, inputs, tmp_path):
+    words, target = COMMANDS[name]
+    place = tmp_path / "place"
+    shutil.copytree(inputs, place)
+
+    def run(folder=place):
+        force = ["--force"] if name != "check" else []
+        with mock.patch("crane.cli.simulate.DEMO_MACHINES", (str(inputs / "swing.yaml"),)):
+            done = typed(*name.split(), *words, *force, cwd=folder)
+        assert done.returncode == 0, done.stderr
+
+    if name != "check":  # it writes into what it reads
+        run()
+        for path in place.rglob("*"):  # so that no new file is like its old one
+            if path.is_file() and not (inputs / path.relative_to(place)).exists():
+                path.write_text("old")
+    if (place / target).is_dir():
+        (place / target / "notes").write_text("the user's own")
+    old = contents(place)
+    copies, instants = watched(place, run)
+    new = contents(place)
+    assert old.keys() == new.keys() and not temporary(new)
+    seen, again = Counter(), {}
+    for state, copy in copies.items():
+        left = temporary(dict(state))
+        which = kind({path: x for path, x in state if path not in left}, old, new)
+        assert which != "half", copy
+        seen[which] += instants[state]
+        if len(left) > len(again.get(which, (set(),))[0]):
+            again[which] = left, copy  # where most is left behind
+    print(name, dict(seen))
+    assert again
+    # of `crane add` several files stand in the user's own folder, see docs/security.md
+    assert set(seen) - ({"mixed"} if name.startswith("add ") else set()) == {"old", "new"}
+    for _, copy in again.values():
+        run(copy)
+        assert contents(copy).keys() == new.keys(), copy
+
+
+def kind(found, old, new):
+    """Whether files are those of before, those of after, some of both, or parts of files."""
+    if found == old:
+        return "old"
+    if found == new:
+        return "new"
+    whole = found.keys() == new.keys() and all(x in (old[p], new[p]) for p, x in found.items())
+    return "mixed" if whole else "half"
