@@ -12,7 +12,6 @@ from crane.common.errors import CraneWarning, InputError, RecordingError
 from crane.identification.mechanics.force_comparison import check_forces
 from crane.identification.mechanics.smoothed_motion import (
     check_recording,
-    signal_delay,
 )
 from crane.identification.signals import kalman_smoother
 from crane.identification.signals import signal_processing as signals
@@ -230,13 +229,6 @@ def test_filtered_rows_keep_the_parameters():
         signals.filter_rows(regressor, regressor @ truth, 1e-3, 20.0, 10)
 
 
-def test_thinning_lets_nothing_fold_back():
-    time = np.arange(20_000) * 1e-3
-    high = np.sin(2 * np.pi * 75.1 * time)[:, None]  # seen as 24.9 Hz at 100 Hz
-    _, y = signals.filter_rows(high[:, None], high, 1e-3, 25.0, 10)
-    assert np.abs(y[100:-100]).max() < 1.6e-4
-
-
 @pytest.mark.parametrize(("cutoff", "decimation"), [(5.0, 50), (5.0, 7), (60.0, 4)])
 def test_a_filtered_row_sees_its_neighbourhood_and_nothing_else(cutoff, decimation):
     """Gain 1/2 at the cutoff, 3e-5 from three times that on, and an end to every answer."""
@@ -420,9 +412,3 @@ def test_forces_come_late():
     )
     with pytest.raises(RecordingError, match="'q1_force' is 200 ms behind its model"):
         check_forces(late, modelled[50:], JOINTS)
-
-
-def test_delay_between_samples():
-    time = np.arange(5000) * 4e-3
-    found = signal_delay(time, movement(time)[1][:, 0], movement(time - 0.0615)[1][:, 0])
-    assert abs(found - 0.0615) < 1e-3
