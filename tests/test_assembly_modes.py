@@ -123,7 +123,7 @@ def test_limits_decide(tmp_path):
     for which, wide in ((0, 2), (2, 0)):
         low, high = rockers[which] - 0.5, rockers[which] + 0.5
         assert not low <= rockers[wide] <= high
-        limits = f'<limit lower="{low:.3f}" upper="{high:.3f}" effort="1e9" velocity="1e9"/>'
+        limits = round(low, 3), round(high, 3), 1e9, 1e9
         path = bucket_linkage.write(tmp_path, 0.25, limits=limits)
         told = [finding.message for finding in check(path).findings]
         eye = [what for what in told if what.startswith("loop 'eye'")]

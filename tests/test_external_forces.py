@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from command_line import typed
+from urdf_text import body, joint, write
 
 import crane
 from crane.codegen.symbolic import scale_vector
@@ -269,18 +270,12 @@ MASS = 2.0
 @pytest.fixture
 def pushed(tmp_path):
     """A block that slides along x and, without weight on it, z."""
-    joints = "".join(
-        f'''<joint name="{axis}" type="prismatic"><parent link="{parent}"/><child link="{child}"/>
-        <axis xyz="{way}"/><limit lower="-100" upper="100" effort="1" velocity="1"/></joint>'''
-        for axis, parent, child, way in (
-            ("x", "base", "slide", "1 0 0"), ("z", "slide", "block", "0 0 1"))
+    slide = {"kind": "prismatic", "limits": (-100, 100)}
+    write(
+        tmp_path, "block", "base", '<link name="slide"/>', body("block", MASS),
+        joint("x", "base", "slide", axis=(1, 0, 0), **slide),
+        joint("z", "slide", "block", **slide),
     )  # fmt: skip
-    (tmp_path / "block.urdf").write_text(
-        f'''<robot name="block"><link name="base"/><link name="slide"/>
-        <link name="block"><inertial><mass value="{MASS}"/>
-        <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
-        </link>{joints}</robot>'''
-    )
     path = tmp_path / "pushed.yaml"
     path.write_text(FILE)
     return path

@@ -6,6 +6,7 @@ import singular_linkages
 from scipy.integrate import solve_ivp
 from scipy.linalg import qr
 from scipy.optimize import lsq_linear
+from urdf_text import sliding_block
 from warned import without_a_word
 
 import crane
@@ -22,15 +23,8 @@ G = 9.81
 
 def block(folder, slope=0.0, mass=2.0, spring=0.0, **friction):
     """A block that slides along x down a slope."""
-    axis = f"{np.cos(slope)} 0 {-np.sin(slope)}"
-    (folder / "block.urdf").write_text(
-        f"""<robot name="block"><link name="base"/><link name="block"><inertial>
-        <mass value="{mass}"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
-        </link><joint name="x" type="prismatic"><parent link="base"/><child link="block"/>
-        <axis xyz="{axis}"/><limit lower="-100" upper="100" effort="1" velocity="1"/></joint>
-        </robot>"""
-    )
-    machine = crane.load(folder / "block.urdf")
+    path = sliding_block(folder, mass, (np.cos(slope), 0, -np.sin(slope)))
+    machine = crane.load(path)
     return machine.replace(
         friction={"x": crane.description.Friction(**friction)},
         forces=(crane.description.ForceElement("x", stiffness=spring),) if spring else (),
