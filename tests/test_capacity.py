@@ -6,6 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
+import urdf_text
 from broken_machines import MODELS
 from free_bodies import balance, moment, places
 from scipy.optimize import brentq, root
@@ -288,21 +289,12 @@ def test_the_rule_for_timber_cranes_leans_the_ground(excavator):
 
 def test_what_moves_straight_up_ends_on_a_slope_too(tmp_path):
     """A mast: its lift holds effort / (g cos slope) less what it carries, whatever rounds."""
-    inertia = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
-    joint = (
-        '<joint name="{}" type="prismatic"><parent link="{}"/><child link="{}"/>'
-        '<axis xyz="{}"/><limit lower="0" upper="2" effort="{}" velocity="1"/></joint>'
-    )
-    (tmp_path / "mast.urdf").write_text(
-        '<robot name="mast"><link name="ground"/>'
-        + "".join(
-            f'<link name="{name}"><inertial><mass value="{mass}"/>{inertia}</inertial></link>'
-            for name, mass in (("car", 37.0), ("fork", 11.0))
-        )
-        + joint.format("lift", "ground", "car", "0 0 1", 3333.3)
-        + joint.format("out", "car", "fork", "1 0 0", 1e6)
-        + "</robot>"
-    )
+    slides = {"kind": "prismatic"}
+    urdf_text.write(
+        tmp_path, "mast", "ground", urdf_text.body("car", 37.0), urdf_text.body("fork", 11.0),
+        urdf_text.joint("lift", "ground", "car", limits=(0, 2, 3333.3), **slides),
+        urdf_text.joint("out", "car", "fork", axis=(1, 0, 0), limits=(0, 2, 1e6), **slides),
+    )  # fmt: skip
     machine = crane.load(tmp_path / "mast.urdf")
     for slope in np.linspace(0.01, 0.4, 40):
         chart = crane.capacity(machine, "fork", radii=[1.0], heights=[0.5], slope=slope)

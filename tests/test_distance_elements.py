@@ -11,6 +11,7 @@ import pytest
 from broken_machines import MACHINE, assert_refused, case, copy_machine, swap
 from command_line import typed
 from test_compiled import off
+from urdf_text import body, joint
 from warned import quiet
 
 import crane
@@ -422,12 +423,9 @@ def test_machine_files_hold_them(tmp_path):
 
 def test_locks_take_what_they_put_on_one_body(tmp_path):
     path = tmp_path / "arm.yaml"
-    (tmp_path / "lift.urdf").write_text(LIFT.replace("</robot>", "") + (
-        '<joint name="x" type="prismatic"><parent link="ball"/><child link="tool"/>'
-        '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint><link name="tool"><inertial>'
-        '<mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
-        "</link></robot>"
-    ))  # fmt: skip
+    slide = joint("x", "ball", "tool", kind="prismatic", axis=(1, 0, 0), limits=(-1, 1))
+    more = f"{slide}{body('tool', 1)}</robot>"
+    (tmp_path / "lift.urdf").write_text(LIFT.replace("</robot>", more))
     path.write_text(
         "name: arm\nchains: [{name: arm, urdf: lift.urdf}]\nactive: [z, x]\nropes:\n"
         "  - {between: [eye, ball], length: 1, stiffness: 9}\n"

@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import pytest
 import singular_linkages
+import urdf_text
 import yaml
 from hydraulic_rig import AREA_A, AREA_B, ORIFICE, rig
 from warned import quiet, without_a_word
@@ -58,11 +59,9 @@ def closed(machine, pressures=None):
 
 def slewing(folder, brake=BRAKE, friction=None, valve=None, inertia=15.0, **cylinder):
     """A pillar that a rotary drive of 1e-3 m3/rad turns about z."""
-    (folder / "slew.urdf").write_text(
-        f"""<robot name="slew"><link name="base"/><link name="pillar"><inertial><mass value="10"/>
-        <inertia ixx="9" ixy="0" ixz="0" iyy="9" iyz="0" izz="{inertia}"/></inertial></link>
-        <joint name="turn" type="revolute"><parent link="base"/><child link="pillar"/>
-        <axis xyz="0 0 1"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint></robot>"""
+    turn = urdf_text.joint("turn", "base", "pillar", kind="revolute", limits=(-2, 2))
+    urdf_text.write(
+        folder, "slew", "base", urdf_text.body("pillar", 10, moments=(9, 9, inertia)), turn
     )
     hoses = dict.fromkeys(("hose_a", "hose_b"), 2e-4)
     parts = dict.fromkeys(("area_a", "area_b"), 1e-3) | hoses | {"brake": brake} | cylinder
