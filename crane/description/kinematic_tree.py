@@ -1,9 +1,8 @@
 """The kinematic tree of a machine: links and joints with their values and source locations.
 
 A composite joint J is a series of joints J_x, J_y, ... with one degree of freedom each, and with
-massless links J_1, J_2, ... between them, so that all code for revolute and prismatic joints
-applies. The disadvantage is the singularity of Cardan angles: if the second of three rotations is
-at 90 degrees, the first and third have the same axis, and a closure through the joint is singular.
+massless links J_1, J_2, ... between them. Three rotations become one joint again where the machine
+is assembled, see `crane.description.rotation_vectors`.
 """
 
 import math
