@@ -7,7 +7,7 @@ import pytest
 from broken_machines import DATA
 from command_line import typed
 from linkages import multipliers
-from test_rotor_inertia import BARE
+from test_couplings import BARE
 
 import crane
 from crane.common.errors import CraneError, CraneWarning

@@ -109,12 +109,18 @@ def read_joint_effects(
                 rest=float(model.qpos_spring[model.jnt_qposadr[joint]]),
             )
             continue
-        if damping.any() or friction.any() or stiffness:
+        translation_friction = friction[:-3].any()
+        if translation_friction or stiffness:
             mjcf.note_unsupported_elements(
-                "damping, friction and stiffness of ball and free joints", "JOINT", [joint]
+                "friction of free joints, stiffness of ball and free joints", "JOINT", [joint]
             )
-        for name in names[:-3]:  # translations; see also `isotropic_rotor_inertia`
-            effects.add_along(name, armature=armature)
+        for i, name in enumerate(names):
+            effects.add_along(
+                name,
+                damping=float(damping[i]),
+                friction=0.0 if translation_friction else float(friction[i]),
+                armature=armature,
+            )
     for tendon in range(model.ntendon):
         _add_tendon_effects(mjcf, tendon, series_joints, sites, cylinders, effects)
     for actuator in range(len(model.actuator_trntype)):
@@ -159,24 +165,6 @@ def straight_tendon_sites(mjcf: MujocoFile, tendon: int) -> tuple[int, int] | No
         return None
     first_body, second_body = (int(model.body_weldid[model.site_bodyid[site]]) for site in sites)
     return None if first_body == second_body else (sites[0], sites[1])
-
-
-def isotropic_rotor_inertia(mjcf: MujocoFile, joint: int) -> float:
-    """Return the rotor inertia [kg m2] that a ball or free joint adds to its body, else 0.
-
-    Rotors turn with the body against its parent, so they belong to the body if the parent is
-    fixed.
-    """
-    model, dof = mjcf.model, int(mjcf.model.jnt_dofadr[joint])
-    if (kind := mjcf.joint_type(joint)) not in ("BALL", "FREE"):
-        return 0.0
-    rotor = float(model.dof_armature[dof + 3 * (kind == "FREE")])
-    if rotor and model.body_weldid[model.body_parentid[model.jnt_bodyid[joint]]]:
-        mjcf.note_unsupported_elements(
-            "armature of ball joints on moving bodies", "JOINT", [joint]
-        )
-        return 0.0
-    return rotor
 
 
 def _add_tendon_effects(
@@ -277,7 +265,7 @@ def read_drives(
     """Read what the actuators act along: joints, tendons, sliders, a part of a joint.
 
     The translations of a free joint are along axes of the world, as the forces of its actuators
-    are. A torque about an axis of a ball or free joint drives the Cardan angle about that axis.
+    are; torques of ball and free joints are about axes of the child in both.
 
     Args:
         mjcf: The file.
@@ -293,8 +281,7 @@ def read_drives(
         factors = _actuator_factors(mjcf, actuator, series_joints, cylinders)
         name = mjcf.name(*(("TENDON", target) if kind == "TENDON" else ("ACTUATOR", actuator)))
         if kind == "JOINT" and len(series_joints[target]) > 1:
-            used_joints = {joint for drive in found.values() for joint in drive.factors}
-            factors = _multi_freedom_factors(mjcf, actuator, series_joints[target], used_joints)
+            factors = _multi_freedom_factors(mjcf, actuator, series_joints[target])
         if kind == "JOINT" and len(factors) == 1:
             (name,) = factors
         if factors:
@@ -309,19 +296,8 @@ def read_drives(
 
 
 def _multi_freedom_factors(
-    mjcf: MujocoFile, actuator: int, joint_names: Sequence[str], used_joints: set[str]
+    mjcf: MujocoFile, actuator: int, joint_names: Sequence[str]
 ) -> dict[str, float]:
     """Return the factors of the parts of a ball or free joint."""
-    gear, translations = np.array(mjcf.model.actuator_gear[actuator]), joint_names[:-3]
-    force_direction, axis = (gear[:3], gear[3:6]) if translations else (np.zeros(3), gear[:3])
-    if axis.any():
-        mjcf.note_difference(
-            "actuators about axes of ball and free joints drive their angles",
-            mjcf.name("ACTUATOR", actuator),
-        )
-    if force_direction.any():
-        return {x: float(f) for x, f in zip(translations, force_direction, strict=True) if f}
-    components = dict(zip(joint_names[-3:], axis.tolist(), strict=True))
-    nearest = sorted(filter(components.get, components), key=lambda x: -abs(components[x]))
-    unused = [part for part in nearest if part not in used_joints]
-    return {part: components[part] for part in (unused or nearest)[:1]}
+    gear = np.array(mjcf.model.actuator_gear[actuator])[: len(joint_names)]
+    return {x: float(f) for x, f in zip(joint_names, gear, strict=True) if f}
