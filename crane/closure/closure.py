@@ -151,6 +151,7 @@ class Closure(BranchSolver, OneLineRepr):
             return None
         other = copy.copy(self)
         other.__dict__.pop("_cursors", None)
+        other.__dict__.pop("_beyond", None)
         return other
 
     def with_perturbed_model(

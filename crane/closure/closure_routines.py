@@ -5,6 +5,7 @@ They call the formulas of `CompiledClosure`: "newton", "predict", "distance" and
 
 import numpy as np
 
+from crane.closure.newton_continuation import MIN_REGULARITY
 from crane.codegen import Layout, Program
 
 _MAX_NEWTON_ITERATIONS = 8  # Newton's method converges quadratically
@@ -82,6 +83,8 @@ def _add_follow(program: Program, nq: int, n: int) -> None:
                 r.return_value(i)
             r.call("distance", r.constants, predicted, guess, correction)
             with r.if_then(~(correction["all"] <= move * 0.5 + 0.02)):
+                r.return_value(i)
+            with r.if_then(~(correction["all"] * MIN_REGULARITY < result["determinant"])):
                 r.return_value(i)
             r.copy(r.cursor, guess, nq)
             r.copy(r.cursor.element_pointer("gamma"), result.element_pointer("gamma"), entries)

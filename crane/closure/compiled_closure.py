@@ -9,6 +9,7 @@ import numpy as np
 
 from crane.closure.closure_routines import add_closure_routines
 from crane.closure.constraint_structure import ConstraintStructure
+from crane.closure.continuation_errors import ClosedConfiguration
 from crane.closure.coordinates import Indices
 from crane.closure.kinematics_formulas import (
     FormulaConstants,
@@ -19,13 +20,13 @@ from crane.closure.kinematics_formulas import (
 )
 from crane.closure.loop_equations import Cluster, LoopEquations, find_clusters
 from crane.closure.loop_formulas import LoopFormulas
-from crane.closure.newton_continuation import ClosedConfiguration
 from crane.codegen import Layout, LayoutView, Program, Scalar, Tape, max_abs, maximum
 from crane.codegen.symbolic import minimum
 from crane.common.samples import Array
 
 # Scaled values: rad and characteristic length, as in `NewtonContinuation`.
 _LARGE_GAMMA = 1e3  # above this entry of gamma, `NewtonContinuation` checks singularity
+_MIN_DETERMINANT = 1e-9  # share of that at home below which gamma is left to it as well
 _NEARLY_CLOSED_TOLERANCE = 1e-6  # residual of a guess that counts as closed
 
 
@@ -76,12 +77,14 @@ class CompiledClosure:
         passive: Columns of the other joints.
         home: The home configuration, whose branch is followed.
         rounding_scale: See `NewtonContinuation.rounding_scale`.
+        signs: See the attribute; those at home if not given.
 
     Attributes:
         geometry: Geometry that the formulas were traced from.
         programs: Further programs of this machine, by what they depend on.
         tolerances: (3,) scaled residual that counts as rounding; that counts as closed if it no
             longer decreases; scaled step whose square is rounding.
+        signs: Signs of the block determinants on the branch, over their order of magnitude.
         follow_address: Address of the function `follow_targets`, for other machine code.
         close_address: Address of the function `close`.
     """
@@ -94,6 +97,7 @@ class CompiledClosure:
         passive: Indices,
         home: ClosedConfiguration,
         rounding_scale: float,
+        signs: Array | None = None,
     ):
         self.geometry = tree_geometry(equations)
         self._equations, self._structure = equations, structure
@@ -102,7 +106,7 @@ class CompiledClosure:
         self._gamma_entries = self._find_gamma_entries()
         rows, columns = self._gamma_entries
         self._gamma_entry_pairs = list(zip(rows.tolist(), columns.tolist(), strict=True))
-        signs = self._determinant_signs(home)
+        signs = self.signs = self._determinant_signs(home) if signs is None else signs
         key = self._cache_key(signs)
         shared = _SHARED_CODE.get(key)
         if shared is None:
@@ -295,8 +299,8 @@ class CompiledClosure:
 
         "regular" is positive on the branch of home away from singular configurations, with
         redundant equations closed; "largest_gamma" is the largest entry of gamma (rows of passive
-        joints); "determinant" is the least determinant of a block, with its sign on the branch of
-        home.
+        joints); "determinant" is the least determinant of a block, about 1 at home, with its sign
+        on the branch of home.
         """
         q, kinematics, loops = self.trace_kinematics(Tape(), 0, 1)
         steps = loops.newton_step
@@ -311,7 +315,7 @@ class CompiledClosure:
         least_determinant: Scalar = 1.0
         for sign, determinant in zip(signs, loops.gamma_and_determinants[1], strict=True):
             least_determinant = minimum(least_determinant, float(sign) * determinant)
-        worst = maximum(worst, -1.0 * least_determinant)
+        worst = maximum(worst, _MIN_DETERMINANT - least_determinant)
         for alignment in loops.alignments:
             worst = maximum(worst, -1.0 * alignment)
         program.add_formula(
@@ -361,12 +365,13 @@ class CompiledClosure:
         program.add_formula("gamma", 1, [entry for row in rows for entry in row])
 
     def _determinant_signs(self, home: ClosedConfiguration) -> Array:
-        """Signs of the block determinants on the branch of home."""
+        """Signs of the block determinants on the branch of home, over their order of magnitude."""
         blocks = (
             home.jacobian[np.ix_(rows, self._passive_columns[columns])]
             for rows, columns in self._structure.blocks
         )
-        return np.array([np.linalg.slogdet(block)[0] for block in blocks])
+        signs_and_logarithms = [np.linalg.slogdet(block) for block in blocks]
+        return np.array([sign * 2.0 ** -round(x / np.log(2)) for sign, x in signs_and_logarithms])
 
     def _add_predictor(self, program: Program) -> None:
         """Add `predict` and `distance`.

@@ -6,12 +6,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crane.closure.change_points import interpolate_limit
 from crane.closure.kinematics_formulas import tree_geometry
 from crane.codegen import FormulaTooLongError, run_with_fallback
 from crane.common.errors import (
     CraneError,
     InputError,
     MechanismError,
+    SingularConfigurationError,
     SingularMassMatrixError,
     suggest_names,
 )
@@ -226,6 +228,24 @@ class QuantityEvaluator(OneLineRepr):
             if error is not None:
                 raise error
 
+    def _evaluate_beside_change_point(
+        self, formula: CompiledQuantity, q: Array, row: Array, sample: str
+    ) -> Array:
+        """A quantity at a closed configuration (nq,), in a change point as its limit."""
+        neighbours = self.machine.closure.neighbours(q)
+        if not neighbours:
+            return formula.evaluate_closed(q, row)
+        limit = interpolate_limit(
+            np.array([formula.evaluate_closed(one, row) for one in neighbours])
+        )
+        if limit is None:
+            active = self.machine.closure.active
+            place = self.machine.coordinates.format_values(active, q[active])
+            raise SingularConfigurationError(
+                f"forces have no bounds in the change point at {place}{sample}: stay away from it"
+            )
+        return limit
+
     def set_stick_slip_modes(
         self, slip_sign: Array, is_held: Array, inverse_velocity: Array, is_moving: bool
     ) -> None:
@@ -367,7 +387,7 @@ class QuantityEvaluator(OneLineRepr):
         def reach(i: int) -> None:
             sample = f" (sample {i})" if is_stack else ""
             q = closure.continue_from_home(formula.cursor, targets[i], sample)
-            out[i] = formula.evaluate_closed(q, rows[i])
+            out[i] = self._evaluate_beside_change_point(formula, q, rows[i], sample)
             error = None if np.isfinite(out[i]).all() else self.singular_mass_error(q, sample)
             if error is not None and formula.solves_mass_matrix:
                 raise error
