@@ -397,9 +397,10 @@ def circuit(
             raise InputError(f"--model {model} takes one recording, {len(recording)} are given")
     loaded = options.load(machine)
     check_name(joint, loaded.active, f"'{joint}' is not an active joint")
-    needs = required_channels(joint) if model == "orifices" else []
-    if model == "valve":
-        needs.append((f"voltage_{joint}",))
+    needs_by_model: dict[str, list[tuple[str, ...]]] = {
+        "orifices": required_channels(joint), "valve": [(f"voltage_{joint}",)], "friction": [],
+    }  # fmt: skip
+    needs = needs_by_model[model]
     runs = _read(recording, loaded, reading, needs)
     held_out = _read(validation or [], loaded, RecordingOptions(columns=reading.columns), needs)
     result: Result
@@ -407,9 +408,9 @@ def circuit(
     with status("identifying"):
         if model == "valve":
             result = crane.identification.identify_valve(loaded, runs[0], joint)
-        elif model == "friction":
+        if model == "friction":
             result = crane.identification.identify_cylinder_friction(loaded, runs[0], joint)
-        else:
+        if model == "orifices":
             result = crane.identification.identify_orifices(
                 loaded, runs, joint, method or "weak", period=period
             )

@@ -99,17 +99,16 @@ def breakout(
     if direction is not None and arm is not None:
         raise InputError("--arm is for break-out forces, leave it out with --direction")
     loaded = options.load(machine)
+    vector: str | list[float] | None = direction
+    if direction is not None and "," in direction:
+        vector = parse_numbers(
+            direction.split(","), f"--direction {direction} is no X,Y,Z, give three numbers"
+        )
     result: Result
     with status("computing forces"):
-        if direction is None:
+        if vector is None:
             result = crane.ratings.breakout(loaded, frame, bucket=bucket, arm=arm, weights=weights)
         else:
-            vector: str | list[float] = direction
-            if "," in direction:
-                vector = parse_numbers(
-                    direction.split(","),
-                    f"--direction {direction} is no X,Y,Z, give three numbers",
-                )
             result = crane.ratings.tool_force(
                 loaded, vector, frame, joint=bucket, weights=weights, step=step
             )

@@ -74,19 +74,19 @@ def read_machine_spec(name: str | Path) -> MachineSpec:
     Raises:
         DescriptionError: With file, line, what is wrong, and the names that exist.
     """
-    path = find_machine_file(name)
-    if is_robot_file(path):
-        spec = _read_robot(path)
-    elif path.suffix.lower() in (".xml", ".mjcf"):
-        from crane.formats.mjcf.mjcf_reader import read_mjcf  # few files are MJCF
-
-        spec = read_mjcf(path)
-    elif is_parallel_robot(path):
-        spec = read_parallel_robot(path)
-    else:
-        spec = _read_machine(path)
+    spec = _read_by_format(find_machine_file(name))
     warn_about_open_loops(spec)
     return spec
+
+
+def _read_by_format(path: Path) -> MachineSpec:
+    if is_robot_file(path):
+        return _read_robot(path)
+    if path.suffix.lower() in (".xml", ".mjcf"):
+        from crane.formats.mjcf.mjcf_reader import read_mjcf  # few files are MJCF
+
+        return read_mjcf(path)
+    return read_parallel_robot(path) if is_parallel_robot(path) else _read_machine(path)
 
 
 def _read_robot(path: Path) -> MachineSpec:

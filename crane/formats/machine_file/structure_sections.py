@@ -253,7 +253,7 @@ def _read_chain(
         report_error(
             item.error_at(None, f"chain '{name}' has no 'parent', name the frame it hangs from")
         )
-    elif not earlier_chains and are_all_read and parent is not None:
+    if not earlier_chains and are_all_read and parent is not None:
         report_error(
             item.error_at(
                 "parent", f"chain '{name}' is first and stands on the world, remove its 'parent'"
