@@ -33,6 +33,7 @@ _MIN_STEP = 2.0**-24  # smallest step of the continuation, as a fraction of the 
 MIN_REGULARITY = 2.0
 _CHANGE_POINT_ZONE = 1e-5  # least singular value, as a share of that at home, to which steps lead
 _CHANGE_POINT_TOLERANCE = 1e-11  # relative least singular value below which gamma has no digits
+_MIN_PASSAGE = 1e-4  # scaled distance of the two sides of a change point
 _INTERPOLATION_STEP = 4e-3  # scaled distance of the neighbours of a change point
 
 
@@ -283,9 +284,12 @@ class NewtonContinuation(ContinuationErrors):
         if correction > 0.02 + 0.5 * predicted_step:
             return None
         before, determinants = self.determinants(current), self.determinants(corrected)
-        regularity = self._most_singular_block(corrected.jacobian)[0] / self._home_regularity
+        least = self._most_singular_block(corrected.jacobian)[0]
+        regularity = least / self._home_regularity
         if regularity < _CHANGE_POINT_ZONE and self._is_bounded(current):
             return None
+        if least < SINGULAR_TOLERANCE:  # the end of the branch itself
+            return corrected
         if (before * determinants < 0).any():
             return corrected if self._passes_change_point(current, corrected) else None
         return corrected if regularity > MIN_REGULARITY * correction else None
@@ -308,8 +312,10 @@ class NewtonContinuation(ContinuationErrors):
     def _passes_change_point(self, one: ClosedConfiguration, other: ClosedConfiguration) -> bool:
         """Whether a smooth motion joins two sides of a change point; warns of the first one."""
         step = other.q_a - one.q_a
+        distance = np.abs((other.q - one.q) / self._coordinate_units).max()
         sides = ((x.q, self._slope(x, step)) for x in (one, other))
-        if not is_smooth_passage(*sides, self._residual):
+        # sides of a dead centre are on one smooth motion, too, if they are near enough
+        if distance < _MIN_PASSAGE or not is_smooth_passage(*sides, self._residual):
             return False
         if not self._has_warned:
             self._has_warned = True
