@@ -231,16 +231,21 @@ class PythonStepper:
         return after
 
     def close_loops(self, time: float, state: Array) -> None:
-        """Close the loops of a state.
+        """Close the loops of a state on the branch of the chart.
 
         Raises:
-            IntegrationHaltError: They do not close.
+            IntegrationHaltError: They do not close, or pass a change point.
         """
         machine, q = self._dynamics.machine, self.state_layout.view(state).q
+        closure = machine.closure
         try:
-            closed = machine.closure.solve(q[machine.closure.active], initial_guess=q)
+            closed = closure.solve(q[closure.active], initial_guess=q)
         except (ClosureError, SingularMassMatrixError) as error:
             raise self._closure_halt(time, state, error) from None
+        if closure.is_compiled and closure.compiled_closure.least_determinant(closed) <= 0:
+            raise IntegrationHaltError(
+                time, self.user_coordinates(state), ": the loops come to a change point"
+            )
         q[:] = machine.coordinates.wrap_rotations(closed)
 
     def halt_error(self, time: float, state: Array) -> IntegrationHaltError:
