@@ -37,8 +37,8 @@ _MAX_EXTRAPOLATION_ERROR = 0.5
 _MIN_SAMPLES_TO_SORT, _FAR_SAMPLE_DISTANCE = 100, 0.1
 
 
-class _BeyondChangePoint:
-    """The last configuration that machine code for the branch of home did not reach.
+class _DistantBranchPart:
+    """A branch beyond change points: the last configuration there, and machine code to go on.
 
     Args:
         home: (nq,) home configuration.
@@ -130,8 +130,8 @@ class BranchSolver:
         return ThreadLocal(self.compiled_closure.new_cursor)
 
     @cached_property
-    def _beyond(self) -> ThreadLocal["_BeyondChangePoint"]:
-        return ThreadLocal(lambda: _BeyondChangePoint(self.home))
+    def _beyond(self) -> ThreadLocal["_DistantBranchPart"]:
+        return ThreadLocal(lambda: _DistantBranchPart(self.home))
 
     @cached_property
     def _codes_beyond(self) -> dict[bytes, CompiledClosure]:

@@ -312,9 +312,11 @@ class CompiledClosure:
             largest_gamma - _LARGE_GAMMA,
             loops.largest_residual(redundant=True) - self._structure.redundancy.tolerance,
         )
-        least_determinant: Scalar = 1.0
-        for sign, determinant in zip(signs, loops.gamma_and_determinants[1], strict=True):
-            least_determinant = minimum(least_determinant, float(sign) * determinant)
+        shares = [
+            float(sign) * determinant
+            for sign, determinant in zip(signs, loops.gamma_and_determinants[1], strict=True)
+        ]
+        least_determinant = minimum(*shares) if shares else 1.0
         worst = maximum(worst, _MIN_DETERMINANT - least_determinant)
         for alignment in loops.alignments:
             worst = maximum(worst, -1.0 * alignment)

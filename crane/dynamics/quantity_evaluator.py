@@ -215,6 +215,8 @@ class QuantityEvaluator(OneLineRepr):
         try:
             pivots = np.diagonal(np.linalg.cholesky(free_block), axis1=-2, axis2=-1) ** 2
             least = MIN_INERTIA_SHARE * np.diagonal(free_block, axis1=-2, axis2=-1)
+            machine = self.machine
+            least = least + machine.least_inertias[machine.closure.active][~machine.is_driven]
             is_singular = bool((pivots <= least).any())
         except np.linalg.LinAlgError:
             is_singular = True
