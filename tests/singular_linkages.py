@@ -1,4 +1,4 @@
-"""Linkages with dead centres and bifurcations as URDF texts.
+"""Linkages with dead centres and change points as URDF texts.
 
 They lie in the plane of x and z and turn about y; rods are slender, of 1 kg per rod.
 """

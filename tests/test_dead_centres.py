@@ -1,4 +1,4 @@
-"""Runs through dead centres and bifurcations with any active joint."""
+"""Runs through dead centres and change points with any active joint."""
 
 import warnings
 
@@ -192,7 +192,7 @@ def needed_torque(machine, closed_form, a, v, acceleration):
 
 @pytest.mark.parametrize("name", CHANGE_POINTS)
 def test_loops_are_followed_through_change_points(tmp_path, name):
-    """J (N,) of motion, with its masses, and potential energy (N,) along the closed form."""
+    """Ten turns by `solve` and `follow_motion`, to change points themselves, and forces there."""
     make, closed_form, change_point = CHANGE_POINTS[name]
     machine = make(tmp_path)
     home = machine.home[machine.closure.active][0]
