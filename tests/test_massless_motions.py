@@ -10,6 +10,7 @@ import pytest
 
 import crane
 from crane.common.errors import (
+    CraneWarning,
     DescriptionError,
     InputError,
     SimulationError,
@@ -266,6 +267,15 @@ def test_what_is_idle_is_said_once(tmp_path):
         "machine.urdf:1: link 'rod' has no inertia against joint 'b_rz': this motion is idle and "
         "is left out of the equations, give it an inertia if its speed counts"
     ]
+
+
+def test_a_home_where_axes_line_up_is_told(tmp_path):
+    lines = [
+        body("load", 5.0, (0.5, 0, 0), (0.03, 0.03, 0.03)),
+        joint("b", "spherical", "base", "load"),
+    ]
+    with pytest.warns(CraneWarning, match="singular at home, the axes of 'b_rx' and 'b_rz' line"):
+        load(tmp_path, lines, {"b_ry": np.pi / 2})
 
 
 def test_a_force_on_an_idle_motion_is_refused(tmp_path):

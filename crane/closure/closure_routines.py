@@ -5,10 +5,12 @@ They call the formulas of `CompiledClosure`: "newton", "predict", "distance" and
 
 import numpy as np
 
-from crane.closure.newton_continuation import MIN_REGULARITY
 from crane.codegen import Layout, Program
 
 _MAX_NEWTON_ITERATIONS = 8  # Newton's method converges quadratically
+# least determinant, as a share of that at home, over the correction of a prediction, below which
+# another branch may be as near
+_MIN_REGULARITY = 0.02
 
 
 def add_closure_routines(program: Program, nq: int, n: int) -> None:
@@ -84,7 +86,7 @@ def _add_follow(program: Program, nq: int, n: int) -> None:
             r.call("distance", r.constants, predicted, guess, correction)
             with r.if_then(~(correction["all"] <= move * 0.5 + 0.02)):
                 r.return_value(i)
-            with r.if_then(~(correction["all"] * MIN_REGULARITY < result["determinant"])):
+            with r.if_then(~(correction["all"] * _MIN_REGULARITY < result["determinant"])):
                 r.return_value(i)
             r.copy(r.cursor, guess, nq)
             r.copy(r.cursor.element_pointer("gamma"), result.element_pointer("gamma"), entries)

@@ -28,9 +28,8 @@ from crane.common.samples import Array, solve_linear
 
 # Scaled values (rad, characteristic length): the same for machines of any size.
 _MIN_STEP = 2.0**-24  # smallest step of the continuation, as a fraction of the line
-# least singular value or determinant, as a share of that at home, over the correction of a
-# prediction
-MIN_REGULARITY = 2.0
+# least singular value, as a share of that at home, over the correction of a prediction
+_MIN_REGULARITY = 2.0
 _CHANGE_POINT_ZONE = 1e-5  # least singular value, as a share of that at home, to which steps lead
 _CHANGE_POINT_TOLERANCE = 1e-11  # relative least singular value below which gamma has no digits
 _MIN_PASSAGE = 1e-4  # scaled distance of the two sides of a change point
@@ -292,7 +291,7 @@ class NewtonContinuation(ContinuationErrors):
             return corrected
         if (before * determinants < 0).any():
             return corrected if self._passes_change_point(current, corrected) else None
-        return corrected if regularity > MIN_REGULARITY * correction else None
+        return corrected if regularity > _MIN_REGULARITY * correction else None
 
     def _is_bounded(self, solution: ClosedConfiguration) -> bool:
         """Whether gamma is that of a motion through a change point, not towards a dead centre."""

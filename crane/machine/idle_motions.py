@@ -31,8 +31,8 @@ def judge_massless_motions(
 ) -> tuple[bool, tuple[int, ...]]:
     """Warn of idle motions, refuse other motions that move no inertia.
 
-    A motion is idle if it moves no inertia in any configuration, only links that have a mass, no
-    drive, and nothing that exerts a force: nothing depends on it then, see `Machine.held`.
+    A motion is idle if it moves no inertia in any configuration, a link that has a mass, no drive,
+    and nothing that exerts a force: nothing depends on it then, see `Machine.held`.
 
     Args:
         spec: The machine.

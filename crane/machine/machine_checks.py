@@ -137,7 +137,9 @@ def check_masses(spec: MachineSpec, model: pin.Model, closure: Closure) -> tuple
         return float(joint.axis @ inertia.inertia @ joint.axis) + arm <= least
 
     joints_without_inertia = [joint for joint in spec.tree.moving_joints if lacks_inertia(joint)]
-    if not joints_without_inertia:
+    # the axes of a series may line up
+    has_series = any(link.composite_joint is not None for link in spec.tree.links.values())
+    if not joints_without_inertia and not has_series:
         return ()
     if not has_mass(model):
         text = (
