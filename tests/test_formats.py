@@ -276,15 +276,6 @@ ROTOR = """<robot name="rotor">
 """
 
 
-def test_a_geared_rotor(tmp_path):
-    """I_arm + m c^2 + 6^2 I_rotor; the joint without a mark is independent."""
-    (tmp_path / "rotor.urdf").write_text(ROTOR)
-    machine = crane.load(tmp_path / "rotor.urdf")
-    assert machine.active == ("q",)
-    inertia = 0.02 + 0.2**2 + 36 * 2e-4
-    assert crane.Dynamics(machine).mass_matrix([0.3])[0, 0] == pytest.approx(inertia, rel=1e-12)
-
-
 def test_elements_of_the_time_before_urdf_plus_are_not_overlooked(tmp_path):
     (tmp_path / "rotor.urdf").write_text(ROTOR.replace("coupling", "joint_constraint"))
     with pytest.raises(

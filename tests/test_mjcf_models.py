@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from warned import quiet
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
@@ -24,9 +25,7 @@ TOLERANCE = 1e-9
 
 @cache
 def loaded(name):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        return crane.load(FILES / f"{name}.xml")
+    return quiet(crane.load, FILES / f"{name}.xml")
 
 
 def states(machine, reach, count=6):
