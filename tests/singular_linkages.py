@@ -67,7 +67,8 @@ def kite(folder, active):
         _joint("b", "one", "two", 1.0), _joint("c", "base", "three", 1.0), _end("two", 1.5),
         _end("three", 1.5), _pin("pin", "two_end", "three_end"),
     ]  # fmt: skip
-    return _load(folder, parts, dict(zip("abc", kite_angles(-1.0), strict=True)), active)
+    home = dict(zip("abc", kite_angles(-1.0), strict=True))
+    return load(folder, "linkage", parts, home, active)
 
 
 def windows(folder, active, count):

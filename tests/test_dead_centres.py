@@ -7,9 +7,10 @@ import pinocchio as pin
 import pytest
 import singular_linkages
 from scipy.integrate import solve_ivp
+from warned import told
 
 import crane
-from crane.closure import home_search
+from crane.closure import change_points, home_search
 from crane.common.errors import CraneWarning, SimulationError
 from crane.motion.trajectory import point_to_point
 
@@ -197,12 +198,8 @@ def test_loops_are_followed_through_change_points(tmp_path, name):
     machine = make(tmp_path)
     home = machine.home[machine.closure.active][0]
     a = np.append(home + np.linspace(0, 20 * np.pi, 1001), change_point + 2 * np.pi)
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        q = machine.closure.solve(a[:, None])
-    assert [str(x.message).split(" at ")[0].split("' ")[1] for x in told] == [
-        "passes a change point"
-    ]
+    q, lines = told(machine.closure.solve, a[:, None])
+    assert len(lines) == 1 and "passes a change point" in lines[0]
     np.testing.assert_allclose(q.T, closed_form(a), rtol=0, atol=1e-12)
     assert machine.closure.residual(q).max() < 1e-13
     order = np.random.default_rng(1).permutation(len(a))[:40]
@@ -217,6 +214,15 @@ def test_loops_are_followed_through_change_points(tmp_path, name):
     np.testing.assert_allclose(tau, wanted, rtol=0, atol=1e-6 * np.abs(wanted).max())
     with pytest.raises(crane.CraneError, match="is at the edge of its branch"):
         machine.closure.gamma(machine.closure.solve([change_point]))
+
+
+def test_a_limit_of_neighbours_or_none():
+    x = 4e-3 * change_points.NEIGHBOUR_PLACES
+    values = np.column_stack([np.cos(x), np.exp(3 * x), np.zeros(8)])
+    found = change_points.interpolate_limit(values)
+    np.testing.assert_allclose(found, [1.0, 1.0, 0.0], rtol=0, atol=1e-14)
+    for unbounded in (1 / x, 1 / x**2, np.sign(x), np.abs(x) + 0.01):
+        assert change_points.interpolate_limit(unbounded[:, None]) is None
 
 
 @pytest.mark.parametrize("name", CHANGE_POINTS)

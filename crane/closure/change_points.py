@@ -19,8 +19,8 @@ _SHARES = (0.25, 0.5, 0.75)  # places between two sides where the loops must clo
 NEIGHBOUR_PLACES = np.array([-4.0, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 4.0])
 # of the polynomial of degree 7 through values at these places, at 0
 NEIGHBOUR_WEIGHTS = np.linalg.solve(np.vander(NEIGHBOUR_PLACES, increasing=True).T, np.eye(8)[0])
-_INNER_WEIGHTS = np.array([0.0, 0.0, -1.0, 4.0, 4.0, -1.0, 0.0, 0.0]) / 6  # of degree 3
-_MAX_DISAGREEMENT = 1e-5  # of both, as a share of the values, of a function with a limit
+_EXTRAPOLATION = np.array([-1.0, 4.0, -6.0, 4.0])  # of degree 3 from one side, to 0
+_MAX_DISAGREEMENT = 1e-5  # of these, as a share of the values, of a function with a limit
 
 
 def interpolate_limit(values: Array) -> Array | None:
@@ -30,9 +30,10 @@ def interpolate_limit(values: Array) -> Array | None:
         values: (8, m) values at equidistant neighbours, at `NEIGHBOUR_PLACES`.
     """
     limit = NEIGHBOUR_WEIGHTS @ values
-    error = np.abs(limit - _INNER_WEIGHTS @ values).max(initial=0.0)
-    is_regular = error <= _MAX_DISAGREEMENT * np.abs(values).max(initial=0.0)  # False for NaN
-    return limit if is_regular else None
+    sides = np.array([_EXTRAPOLATION @ values[:4], _EXTRAPOLATION @ values[:3:-1]])
+    error = np.abs(sides - limit).max(initial=0.0)
+    has_limit = error <= _MAX_DISAGREEMENT * np.abs(values).max(initial=0.0)  # False for NaN
+    return limit if has_limit else None
 
 
 def is_smooth_passage(
