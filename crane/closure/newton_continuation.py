@@ -312,15 +312,15 @@ class NewtonContinuation(ContinuationErrors):
         """Whether a smooth motion joins two sides of a change point; warns of the first one."""
         step = other.q_a - one.q_a
         distance = np.abs((other.q - one.q) / self._coordinate_units).max()
-        sides = ((x.q, self._slope(x, step)) for x in (one, other))
+        before, behind = ((x.q, self._slope(x, step)) for x in (one, other))
         # sides of a dead centre are on one smooth motion, too, if they are near enough
-        if distance < _MIN_PASSAGE or not is_smooth_passage(*sides, self._residual):
+        if distance < _MIN_PASSAGE or not is_smooth_passage(before, behind, self._residual):
             return False
         if not self._has_warned:
             self._has_warned = True
-            before, behind = self.determinants(one), self.determinants(other)
-            block = int((before * behind).argmin())
-            place = one.q_a + step * before[block] / (before[block] - behind[block])
+            first, last = self.determinants(one), self.determinants(other)
+            block = int((first * last).argmin())
+            place = one.q_a + step * first[block] / (first[block] - last[block])
             warnings.warn(
                 f"{self._format_loop_names(self._block_rows(block))} passes a change point at "
                 f"{self._format_values(place)}, from which it could go on in several ways: here "

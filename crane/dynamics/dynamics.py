@@ -170,7 +170,7 @@ class Dynamics(QuantityEvaluator):
         held = list(self.machine.held)
         needed = self.inverse(q_a, v_a, a_a) + (self.friction(q_a, v_a) if friction else 0.0)
         scale = np.maximum(np.abs(tau_a), np.abs(self.bias(q_a, v_a))).max(axis=-1, initial=0.0)
-        excess = np.abs(tau_a - needed)[..., held]
+        excess = np.abs(np.subtract(tau_a, needed))[..., held]
         if not (excess <= _IDLE_FORCE_SHARE * scale[..., None]).all():
             name = self.machine.active[held[int(excess.reshape(-1, len(held)).max(0).argmax())]]
             raise InputError(

@@ -11,7 +11,7 @@ from crane.closure.loop_equations import frame_id
 from crane.common.errors import CraneWarning, DescriptionError
 from crane.common.samples import Array
 from crane.description.findings import report_error
-from crane.description.force_elements import element_name
+from crane.description.force_elements import AnyForceElement, element_name
 from crane.description.kinematic_tree import Joint, Link
 from crane.description.specification import MachineSpec
 from crane.machine.massless_motions import (
@@ -120,7 +120,8 @@ def _obstacle(
     for name, friction in spec.friction.items():
         if name in moving and (friction.coulomb or friction.viscous or friction.stiction):
             return f", and friction of '{name}' acts on it"
-    for element in (*spec.forces, *spec.gas_springs, *spec.ropes):
+    elements: tuple[AnyForceElement, ...] = (*spec.forces, *spec.gas_springs, *spec.ropes)
+    for element in elements:
         ends = [
             pin.getFrameVelocity(model, data, frame_id(model, link), pin.LOCAL_WORLD_ALIGNED)
             for link in element.between or ()
