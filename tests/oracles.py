@@ -381,7 +381,8 @@ def constraint_dynamics(machine, q, v, tau, mu=1e-4, iterations=100):
     data = model.createData()
     pin.initConstraintDynamics(model, data, constraints, memory)
     settings = pin.ProximalSettings(1e-12, mu, iterations)
-    return pin.constraintDynamics(model, data, q, v, tau, constraints, memory, settings).copy()
+    at = machine.coordinates.configuration(q)
+    return pin.constraintDynamics(model, data, at, v, tau, constraints, memory, settings).copy()
 
 
 # --- differences -----------------------------------------------------------------------------

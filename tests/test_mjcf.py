@@ -117,11 +117,8 @@ def test_equality_constraints(tmp_path):
         wheel, rocker = (q[machine.column(joint)] for joint in ("wheel", "rocker"))
         rest = np.deg2rad(0.5)
         assert wheel - rest == pytest.approx(0.1 - 2 * rocker, abs=1e-12)
-        angles = [q[machine.column(f"ball_r{x}")] for x in "xyz"]
-        ball = pin.rpy.rpyToMatrix(0, 0, 0)
-        for axis, angle in zip(np.eye(3), angles, strict=True):
-            ball = ball @ pin.AngleAxis(angle, axis).toRotationMatrix()
-        pin.framesForwardKinematics(machine.model, tree, q)
+        ball = pin.exp3(np.array([q[machine.column(f"ball_r{x}")] for x in "xyz"]))
+        pin.framesForwardKinematics(machine.model, tree, machine.coordinates.configuration(q))
         plate = tree.oMf[machine.frame("plate")]
         x, y, z, w = pin.Quaternion(ball).coeffs()
         data.qpos[:5] = q_a, w, x, y, z
@@ -218,8 +215,8 @@ TENDON = (
         ),
         (
             'name="ball" type',
-            'name="ball" armature="0.1" type',
-            "armature of ball joints on moving bodies (ball)",
+            'name="ball" stiffness="1" type',
+            "stiffness of ball and free joints (ball)",
         ),
         *(
             ('<motor name="drive"', f'<{kind} name="drive"', "limits of the actuators (drive)")
@@ -410,11 +407,13 @@ def test_what_is_left_out_is_told_in_three_lines(tmp_path):
         '<visual/><sensor><jointpos joint="wheel"/><gyro site="top"/></sensor>'
     )
     text = LOOPED.replace("<mujoco>", more).replace("<motor", '<motor gear="3" ctrlrange="0 1"')
-    text = text.replace('name="ball" type', 'name="ball" damping="1" type')
+    text = text.replace('name="ball" type', 'name="ball" stiffness="1" type')
     text = text.replace("<actuator>", f"{TENDON}<actuator>").replace("<worldbody>", FLOOR, 1)
     _, lines = machine_of(text, tmp_path)
     assert len(lines) == 3 and lines[0].startswith("some.xml: MuJoCo says")
-    assert lines[1].startswith("some.xml: left out of what MuJoCo has: damping, friction and stif")
+    assert lines[1].startswith(
+        "some.xml: left out of what MuJoCo has: friction of free joints, stif"
+    )
     for what in ("limits of tendons (rope)", "contacts of 6 geoms (floor", "the air", "2 sensors"):
         assert what in lines[1]
     assert lines[2] == (
@@ -444,10 +443,8 @@ def test_home_is_the_key_of_that_name_or_the_first(keys, hinge, tmp_path):
     pytest.importorskip("mujoco")
     turned = keys.replace(" 1 0 0 0", " 0.9 0.1 -0.3 0.2")
     machine, lines = machine_of(KEYS.format(turned), tmp_path)
-    angles = [machine.home[machine.column(f"ball_r{x}")] for x in "xyz"]
-    found = np.eye(3)
-    for axis, angle in zip(np.eye(3), angles, strict=True):
-        found = found @ pin.AngleAxis(angle, axis).toRotationMatrix()
+    vector = np.array([machine.home[machine.column(f"ball_r{x}")] for x in "xyz"])
+    found = pin.exp3(vector)
     wanted = pin.Quaternion(0.9, 0.1, -0.3, 0.2).normalize().toRotationMatrix()
     np.testing.assert_allclose(found, wanted if keys else np.eye(3), atol=1e-12)
     assert machine.home[machine.column("hinge")] == pytest.approx(hinge, abs=1e-12)

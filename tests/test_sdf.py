@@ -30,12 +30,14 @@ def assert_same(one, two, rng):
         other_q[order], other_v[order] = q, v
         here, there = one.model.createData(), two.model.createData()
         mass, other = (np.triu(pin.crba(*x)) for x in (
-            (one.model, here, q), (two.model, there, other_q)))  # fmt: skip
+            (one.model, here, one.coordinates.configuration(q)),
+            (two.model, there, two.coordinates.configuration(other_q))))  # fmt: skip
         mass, other = (x + np.triu(x, 1).T for x in (mass, other))
         scale = np.abs(mass).max()
         assert np.abs(mass - other[np.ix_(order, order)]).max() < 1e-12 * scale
-        bias = pin.nonLinearEffects(one.model, here, q, v)
-        apart = bias - pin.nonLinearEffects(two.model, there, other_q, other_v)[order]
+        bias = pin.nonLinearEffects(one.model, here, one.coordinates.configuration(q), v)
+        place = two.coordinates.configuration(other_q)
+        apart = bias - pin.nonLinearEffects(two.model, there, place, other_v)[order]
         assert np.abs(apart).max() < 1e-11 * max(1, np.abs(bias).max())
 
 

@@ -90,12 +90,12 @@ class ContinuationErrors:
     ) -> OutOfReachError:
         from scipy.optimize import least_squares  # slow to import
 
-        q, units = last_reached.q.copy(), self._coordinate_units[self._passive_columns]
+        q = last_reached.q.copy()
         q[self._active_columns] = target
 
         def evaluate(passive: Array) -> tuple[Array, Array]:
-            q[self._passive_columns] = passive * units
-            phi, jacobian = self._equations.evaluate_scaled(q)
+            moved = self._equations.displace(q, self._passive_columns, passive)
+            phi, jacobian = self._equations.evaluate_scaled(moved)
             return phi, jacobian[:, self._passive_columns]
 
         def residual(passive: Array) -> Array:
@@ -104,7 +104,7 @@ class ContinuationErrors:
         def jacobian(passive: Array) -> Array:
             return evaluate(passive)[1]
 
-        start = q[self._passive_columns] / units
+        start = np.zeros(len(self._passive_columns))
         phi = evaluate(least_squares(residual, start, jacobian, xtol=1e-12).x)[0]
         worst = int(np.abs(phi).argmax())
         place, last = self._format_values(target), self._format_values(last_reached.q_a)

@@ -1,6 +1,7 @@
 """Newton's method and continuation along one branch."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 
@@ -62,6 +63,8 @@ class NewtonContinuation(ContinuationErrors):
         self._active_columns, self._passive_columns, self._active_ranges = active, passive, ranges
         self._blocks = structure.blocks_by_size()
         units = self._coordinate_units = equations.coordinate_units
+        self._all_columns = np.arange(equations.model.nv)
+        self._has_partly_active_rotations = equations.coordinates.has_partial_rotations(active)
         self._gamma_units = units[passive, None] / units[active]
         model = equations.model
         places = [*model.jointPlacements, *(frame.placement for frame in model.frames)]
@@ -75,11 +78,16 @@ class NewtonContinuation(ContinuationErrors):
         self._has_warned = False
 
     def solve_newton(
-        self, q: Array, q_a: Array, max_iterations: int
+        self, q: Array, q_a: Array | None, max_iterations: int
     ) -> ClosedConfiguration | None:
-        """Close the loops at q_A by Newton's method from a nearby q; None if it diverges."""
+        """Close the loops at q_A by Newton's method from a nearby q; None if it diverges.
+
+        Without q_A the active joints do not move, which differs from constant coordinates where
+        they are parts of rotation vectors.
+        """
         q = q.copy()
-        q[self._active_columns] = q_a
+        if q_a is not None:
+            q[self._active_columns] = q_a
         rounding_scale, previous_residual = self.rounding_scale(q), np.inf
         for _ in range(max_iterations):
             phi, jacobian = self._equations.evaluate_scaled(q)
@@ -95,18 +103,45 @@ class NewtonContinuation(ContinuationErrors):
             )
             try:
                 if at_rounding or stalled:
-                    gamma = solve_linear(
-                        jacobian[:, self._passive_columns], -jacobian[:, self._active_columns]
-                    )
+                    gamma = self._scaled_passive_gamma(jacobian)
+                    q_a = q[self._active_columns].copy()
                     return ClosedConfiguration(q, q_a, jacobian, gamma * self._gamma_units)
-                step = solve_linear(jacobian[:, self._passive_columns], -phi)
+                step = np.zeros(len(q))
+                step[self._passive_columns] = solve_linear(
+                    jacobian[:, self._passive_columns], -phi
+                )
+                if q_a is not None and self._has_partly_active_rotations:
+                    moved = self._equations.coordinates.coordinate_derivatives(q, step)
+                    gamma = self._scaled_passive_gamma(jacobian)
+                    step += self._displacement_of(q, gamma, -moved[self._active_columns])
             except np.linalg.LinAlgError:
                 return None
-            if not np.abs(step).max() < 1.0:  # also NaN
+            if not np.abs(step).max(initial=0.0) < 1.0:  # also NaN
                 return None
             previous_residual = residual
-            q[self._passive_columns] += step * self._coordinate_units[self._passive_columns]
+            q = self._equations.displace(q, self._all_columns, step)
         return None
+
+    def _scaled_passive_gamma(self, jacobian: Array) -> Array:
+        return solve_linear(jacobian[:, self._passive_columns], -jacobian[:, self._active_columns])
+
+    def _displacement_of(self, q: Array, passive_gamma: Array, active_step: Array) -> Array:
+        """Scaled displacements (nv,) along which the active coordinates change by a step (n,).
+
+        The coordinates change by N gamma times the displacements of the active joints, with N of
+        `Coordinates.rate_matrix`; this is the identity without rotation vectors.
+
+        Raises:
+            LinAlgError: The active coordinates do not determine a rotation there.
+        """
+        gamma = np.zeros((len(q), len(active_step)))
+        gamma[self._active_columns] = np.eye(len(active_step))
+        gamma[self._passive_columns] = passive_gamma
+        coordinates = self._equations.coordinates
+        if coordinates.rotation_columns:
+            rates = (coordinates.rate_matrix(q) @ gamma)[self._active_columns]
+            active_step = solve_linear(rates, active_step)
+        return gamma @ active_step
 
     def continue_to(
         self, target: Array, known: ClosedConfiguration, sample: str = ""
@@ -268,30 +303,42 @@ class NewtonContinuation(ContinuationErrors):
         It may pass a change point. Where the least singular value is smaller than the error of the
         prediction, another branch may be as near.
         """
-        passive = self._passive_columns
-        units = self._coordinate_units[passive]
-        passive_step = current.passive_gamma @ (q_a - current.q_a)
-        predicted_step = np.abs(passive_step / units).max(initial=0.0)
+        passive, units = self._passive_columns, self._coordinate_units
+        active_step = (q_a - current.q_a) / units[self._active_columns]
+        gamma = current.passive_gamma / self._gamma_units
+        try:
+            step = self._displacement_of(current.q, gamma, active_step)
+        except np.linalg.LinAlgError:
+            return None
+        predicted_step = np.abs(step[passive]).max(initial=0.0)
         if not predicted_step < 1.0:
             return None
-        predicted = current.q.copy()
-        predicted[passive] += passive_step
+        predicted = self._equations.displace(current.q, self._all_columns, step)
         corrected = self.solve_newton(predicted, q_a, max_iterations)
         if corrected is None:
             return None
-        correction = np.abs((corrected.q - predicted)[passive] / units).max(initial=0.0)
+        correction = np.abs((corrected.q - predicted)[passive] / units[passive]).max(initial=0.0)
         if correction > 0.02 + 0.5 * predicted_step:
             return None
+        if not self._continues(current, corrected, float(correction)):
+            return None
+        q = self._equations.coordinates.wrap_rotations(corrected.q, self._passive_columns)
+        return replace(corrected, q=q)
+
+    def _continues(
+        self, current: ClosedConfiguration, corrected: ClosedConfiguration, correction: float
+    ) -> bool:
+        """Whether a configuration is on the branch of the current one; see above."""
         before, determinants = self.determinants(current), self.determinants(corrected)
         least = self._most_singular_block(corrected.jacobian)[0]
         regularity = least / self._home_regularity
         if regularity < _CHANGE_POINT_ZONE and self._is_bounded(current):
-            return None
+            return False
         if least < SINGULAR_TOLERANCE:  # the end of the branch itself
-            return corrected
+            return True
         if (before * determinants < 0).any():
-            return corrected if self._passes_change_point(current, corrected) else None
-        return corrected if regularity > _MIN_REGULARITY * correction else None
+            return self._passes_change_point(current, corrected)
+        return bool(regularity > _MIN_REGULARITY * correction)
 
     def _is_bounded(self, solution: ClosedConfiguration) -> bool:
         """Whether gamma is that of a motion through a change point, not towards a dead centre."""
@@ -303,10 +350,9 @@ class NewtonContinuation(ContinuationErrors):
 
     def _slope(self, at: ClosedConfiguration, active_rate: Array) -> Array:
         """Derivative (nq,) of the configuration along a rate (n,) of the active coordinates."""
-        out = np.empty(len(at.q))
-        out[self._active_columns] = active_rate
-        out[self._passive_columns] = at.passive_gamma @ active_rate
-        return out
+        rate = active_rate / self._coordinate_units[self._active_columns]
+        step = self._displacement_of(at.q, at.passive_gamma / self._gamma_units, rate)
+        return self._equations.displace(at.q, self._all_columns, step) - at.q
 
     def _passes_change_point(self, one: ClosedConfiguration, other: ClosedConfiguration) -> bool:
         """Whether a smooth motion joins two sides of a change point; warns of the first one."""
