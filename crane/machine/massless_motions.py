@@ -9,9 +9,10 @@ were at the characteristic length l. A motion n has no inertia where
 n^T M_A n <= `MIN_INERTIA_SHARE` n^T S n: a radius of gyration of less than 3e-6 l, where rounding
 leaves fewer than five digits of M_A.
 
-A motion without inertia in every configuration is idle: a rod between two balls turns about itself
-and nothing else depends on it. One active coordinate per idle motion is held, so that the others
-have a regular mass matrix; M_A a = f is met exactly, because f has no part along n.
+A motion that moves no inertia of any body in any configuration is idle: a rod between two balls
+turns about itself and nothing else depends on it. One active coordinate per idle motion is held,
+so that the others have a regular mass matrix; M_A a = f is met exactly, because f has no part
+along n.
 """
 
 from collections.abc import Iterator
@@ -40,12 +41,37 @@ def project_mass_matrix(model: pin.Model, closure: Closure, q: Array, gamma: Arr
 
 def extent_inertias(model: pin.Model, closure: Closure, q: Array, gamma: Array) -> Array:
     """S_ii (n,) of the columns of gamma (nv, n) at a closed configuration (nq,)."""
-    extended, square = pin.Model(model), closure.characteristic_length**2
+    extended = _with_masses_at_their_extent(model, closure)
+    return np.diag(project_mass_matrix(extended, closure, q, gamma)).copy()
+
+
+def _with_masses_at_their_extent(model: pin.Model, closure: Closure) -> pin.Model:
+    out, square = pin.Model(model), closure.characteristic_length**2
     for i, body in enumerate(list(model.inertias)[1:], start=1):
         mass = abs(body.mass)  # parameters of a fit may be those of no body
         moment = mass * square + abs(np.trace(body.inertia))
-        extended.inertias[i] = pin.Inertia(mass, body.lever, moment * np.eye(3))
-    return np.diag(project_mass_matrix(extended, closure, q, gamma)).copy()
+        out.inertias[i] = pin.Inertia(mass, body.lever, moment * np.eye(3))
+    return out
+
+
+def _moves_no_body(model: pin.Model, closure: Closure, motion: "IdleMotion") -> bool:
+    """Whether motions move no inertia of any single body, however large the others are."""
+    extended, data = _with_masses_at_their_extent(model, closure), model.createData()
+    pin.computeJointJacobians(model, data, closure.equations.coordinates.configuration(motion.q))
+    rates = closure.continuation.gamma(motion.q) @ motion.basis
+    twists = [
+        pin.getJointJacobian(model, data, i, pin.LOCAL).reshape(6, -1) @ rates
+        for i in range(1, model.njoints)
+    ]
+    fastest = np.max(np.abs(twists))
+    for i, twist in enumerate(twists, start=1):
+        moved, largest = (
+            np.sum(twist * (body.matrix() @ twist))
+            for body in (model.inertias[i], extended.inertias[i])
+        )
+        if moved > MIN_INERTIA_SHARE * largest and np.abs(twist).max() > _BODY_SHARE * fastest:
+            return False
+    return True
 
 
 def least_inertias(model: pin.Model, closure: Closure) -> Array:
@@ -99,7 +125,7 @@ class IdleMotion(NamedTuple):
 
 
 def find_idle_motions(model: pin.Model, closure: Closure) -> list[IdleMotion]:
-    """Motions that move no inertia at any of some closed configurations, home first.
+    """Motions that move no inertia of any body at some closed configurations, home first.
 
     Returns:
         Empty if there is none. Without home if the mass matrix is singular there only.
@@ -110,7 +136,8 @@ def find_idle_motions(model: pin.Model, closure: Closure) -> list[IdleMotion]:
     for q in _configurations_about_home(closure):
         found.append(IdleMotion(q, massless_motions_at(model, closure, q)))
     count = min(motion.basis.shape[1] for motion in found)
-    return [motion for motion in found if motion.basis.shape[1] == count] if count else []
+    idle = [motion for motion in found if motion.basis.shape[1] == count]
+    return idle if count and _moves_no_body(model, closure, idle[-1]) else []
 
 
 def _configurations_about_home(closure: Closure) -> Iterator[Array]:
