@@ -13,7 +13,12 @@ import pinocchio as pin
 from crane.closure.closure import Closure
 from crane.closure.coordinates import Coordinates
 from crane.closure.loop_equations import frame_id
-from crane.common.errors import CraneWarning, DescriptionError, InputError
+from crane.common.errors import (
+    CraneWarning,
+    DescriptionError,
+    InputError,
+    SingularConfigurationError,
+)
 from crane.description.findings import is_strict, report_error
 from crane.description.force_elements import AnyForceElement, GasSpring, element_name
 from crane.description.kinematic_tree import (
@@ -148,7 +153,10 @@ def check_masses(spec: MachineSpec, model: pin.Model, closure: Closure) -> tuple
         warnings.warn(f"{spec.path.name}: {text}", CraneWarning, stacklevel=3)
         return ()
     massless_joints = [joint for joint in joints_without_inertia if not body(joint).mass > 0]
-    is_regular, held = judge_massless_motions(spec, model, closure, joints_without_inertia)
+    try:
+        is_regular, held = judge_massless_motions(spec, model, closure, joints_without_inertia)
+    except SingularConfigurationError:  # home is no configuration to judge by
+        return ()
     ignored_joints = [joint for joint in massless_joints if not body(joint).inertia.any()]
     if ignored_joints and is_regular:
         first = spec.tree.links[ignored_joints[0].child]
