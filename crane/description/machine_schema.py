@@ -168,7 +168,7 @@ PAYLOAD = section_schema(
         )
     },
 )
-_POLYNOMIAL = NumberListKey("", "m", "rad")
+_POLYNOMIAL = NumberListKey("", *_COORDINATE, is_polynomial=True)
 _JOINT_VALUE = NumberKey("", *_COORDINATE)
 _RATE = NumberKey("", "m/s", "rad/s")
 VIA_POINT = section_schema(
@@ -215,7 +215,7 @@ TASK = section_schema(
         ),
         "joystick": MapKey(
             "lever positions of the valves, as pairs of time and position",
-            NumberListKey("", ""), "joint",
+            NumberListKey("", column_units=("s", "")), "joint",
         ),
         "phases": ListKey(
             "lever positions of the valves, each constant until joints reach given positions",

@@ -252,6 +252,7 @@ def _assemble_machine(
         locked_joints=MappingProxyType(
             {name: float(value) for name, value in (lock or {}).items()}
         ),
+        quantities=MappingProxyType(dict(spec.quantities)),
     )
     return machine.with_external_forces(*spec.external_forces) if spec.external_forces else machine
 

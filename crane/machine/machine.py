@@ -3,7 +3,7 @@
 import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -19,6 +19,7 @@ from crane.closure.loop_equations import frame_id
 from crane.common.errors import InputError, LimitError, suggest_names
 from crane.common.one_line_repr import OneLineRepr, format_count
 from crane.common.package_search import LoadOptions
+from crane.common.quantities import KeyPath, Quantity
 from crane.common.samples import Array, as_samples, read_only_copy
 from crane.description.external_forces import ExternalForce, PhasedWrench
 from crane.description.force_elements import (
@@ -86,6 +87,8 @@ class Machine(OneLineRepr):
         packages: Folders in which packages were searched for.
         arguments: Values of its file's arguments.
         trusts_xacro: Whether its xacro files may run Python and read all files.
+        quantities: Numbers of its machine file as they are written, with their units, by the keys
+            and names that lead to them.
     """
 
     name: str
@@ -121,6 +124,7 @@ class Machine(OneLineRepr):
     packages: tuple[str, ...]
     arguments: Mapping[str, str]
     trusts_xacro: bool = False
+    quantities: Mapping[KeyPath, Quantity] = field(default_factory=dict)
 
     def _one_line(self) -> str:
         words = [

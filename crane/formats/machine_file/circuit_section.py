@@ -14,7 +14,7 @@ from typing import Any
 from crane.common.errors import CraneWarning, DescriptionError, InputError, suggest_names
 from crane.common.package_search import read_plain_file
 from crane.common.plausible_ranges import implausible_value_text
-from crane.description.circuit_schema import AREA_KEYS, BORE_KEYS, ORIFICE_KEYS
+from crane.description.circuit_schema import AREA_KEYS, BORE_KEYS, ORIFICE_KEYS, PUMP
 from crane.description.findings import FollowUpError, UnknownNames, error_recovery, report_error
 from crane.formats.machine_file.structure_sections import TreeBuilder
 from crane.formats.machine_file.yaml_section import YamlSection
@@ -60,7 +60,9 @@ def read_hydraulics(
         if supply_section is None:
             raise section.error_at(None, "'hydraulics' has no 'supply', give its pressure")
         supply = read_component(
-            supply_section, supply_section.values(), check=lambda x: check_tank_pressure(x, oil)
+            supply_section,
+            _pump_values(section, supply_section),
+            check=lambda x: check_tank_pressure(x, oil),
         )
     for key in ("cylinders", "motors"):
         section.apply_common_item(key, section.item_names(key))
@@ -250,13 +252,18 @@ def _read_cylinder(
             )
         for key, value in (("bore", bore), ("rod", rod)):
             _warn_about_unit(item, key, value)
-        area = count * math.pi / 4.0
-        areas = {"area_a": area * bore**2, "area_b": area * (bore**2 - rod**2)}
+        areas = dict(zip(AREA_KEYS, piston_areas(bore, rod, int(count)), strict=True))
     constants = {"joint": joint, "count": int(count), **areas, **holding_valves}
     check = partial(_check_relief, supply)
     cylinder: Cylinder = read_component(item, values, is_rotary, check, **constants)
     _warn_about_relief(item, supply, cylinder)
     return cylinder
+
+
+def piston_areas(bore: float, rod: float, count: int) -> tuple[float, float]:
+    """Areas of the chambers A and B of equal cylinders in parallel [m2]."""
+    area = count * math.pi / 4.0
+    return area * bore**2, area * (bore**2 - rod**2)
 
 
 def _read_motor(
@@ -279,6 +286,25 @@ def _read_motor(
     return motor
 
 
+def _pump_values(circuit: YamlSection, item: YamlSection) -> dict[str, Any]:
+    """Values of a pump, its maximum flow from displacement and speed, that of the engine."""
+    values = item.values()
+    displacement, speed = values.pop("displacement", None), values.pop("speed", None)
+    if speed is not None and displacement is None:
+        raise item.error_at("speed", f"'speed' of {item.title} goes with 'displacement', give it")
+    if displacement is None:
+        return values
+    _warn_about_unit(item, "displacement", displacement)
+    if speed is None and (engine := circuit.section("engine")) is not None:
+        speed = engine.number("speed")
+    if speed is None:
+        raise item.error_at(
+            "displacement",
+            f"{item.title} has a displacement and no speed, give its speed or an engine",
+        )
+    return values | {"flow": displacement * speed}
+
+
 def _read_network(section: YamlSection) -> dict[str, Any]:
     """Pumps beside the first one, further nodes and elements, by fields of `Hydraulics`."""
 
@@ -286,7 +312,8 @@ def _read_network(section: YamlSection) -> dict[str, Any]:
         if not name or not set(name) <= _NAME_CHARACTERS:
             kind = item.schema.title
             raise item.error_at(None, f"a {kind} is called '{name}', use letters, digits, _")
-        return read_component(item, item.values())
+        values = _pump_values(section, item) if item.schema is PUMP else item.values()
+        return read_component(item, values)
 
     network: dict[str, Any] = {
         key: section.read_map(key, read_named) for key in (*_NODE_SECTIONS, "elements")

@@ -10,7 +10,9 @@ from lxml import etree
 
 from crane.common.atomic_output import portable_file_name, replace_folder
 from crane.common.errors import CraneError, CraneWarning, InputError, OutputError, format_one_line
+from crane.common.quantities import KeyPath, Quantity, shortest_number
 from crane.description.circuit_schema import (
+    AREA_KEYS,
     BORE_KEYS,
     CYLINDER,
     HYDRAULICS,
@@ -34,9 +36,10 @@ from crane.description.machine_schema import (
 )
 from crane.description.sensors import SENSOR_PARAMETERS, SENSOR_PREFIX, quantity_unit
 from crane.description.specification import LoopSpec, Task
+from crane.formats.machine_file.circuit_section import piston_areas
 from crane.formats.machine_file.force_sections import external_force_data, load_data
 from crane.formats.machine_file.machine_reader import estimation_data, read_machine_spec
-from crane.formats.machine_file.yaml_text import KeyPath, format_yaml
+from crane.formats.machine_file.yaml_text import format_yaml, with_written_units
 from crane.formats.urdf.urdf_writer import (
     compound_drive_factors,
     copy_shapes,
@@ -234,7 +237,9 @@ class MachineDraft:
             nonempty["hydraulics"] = {k: value for k, value in circuit.items() if k != "oil"}
         (folder / file).write_text(
             "".join(f"# {format_one_line(line)}\n" for line in self._header_notes)
-            + format_yaml(nonempty, self._line_notes),
+            + format_yaml(
+                with_written_units(nonempty, self._machine.quantities), self._line_notes
+            ),
             encoding="utf-8",
         )
 
@@ -281,7 +286,8 @@ def _machine_data(machine: Machine) -> dict[str, Any]:
         "rotor_inertia": rotor_inertias(machine),
         "payload": None,
         "tasks": {name: _task_data(task) for name, task in machine.tasks.items()},
-        "hydraulics": machine.hydraulics and _hydraulics_data(machine.hydraulics),
+        "hydraulics": machine.hydraulics
+        and _hydraulics_data(machine.hydraulics, machine.quantities),
         "sensors": {
             name: SENSOR.values_of(sensor) or {"zero": 0.0}
             for name, sensor in machine.sensors.items()
@@ -321,18 +327,64 @@ def _task_data(task: Task) -> dict[str, Any]:
     return data
 
 
-def _hydraulics_data(circuit: Hydraulics) -> dict[str, Any]:
+def _hydraulics_data(
+    circuit: Hydraulics, quantities: Mapping[KeyPath, Quantity]
+) -> dict[str, Any]:
     drives: dict[str, dict[str, Any]] = {"cylinders": {}, "motors": {}}
     for joint, item in circuit.cylinders.items():
         if item.motor:
             drives["motors"][joint] = _motor_data(item)
         else:
-            drives["cylinders"][joint] = CYLINDER.values_of(item, *BORE_KEYS)
-    data = HYDRAULICS.values_of(circuit, "cylinders", "valves") | {
+            has_bore = ("hydraulics", "cylinders", joint, "bore") in quantities
+            drives["cylinders"][joint] = _cylinder_data(item, has_bore)
+    data = HYDRAULICS.values_of(circuit, "cylinders", "valves")
+    pumps = {("supply",): data["supply"]} | {
+        ("supplies", name): pump for name, pump in data.get("supplies", {}).items()
+    }
+    for path, pump in pumps.items():
+        _write_displacement(pump, circuit, ("hydraulics", *path), quantities)
+    data |= {
         **{key: value for key, value in drives.items() if value},
         "valves": {joint: _valve_data(valve) for joint, valve in circuit.valves.items()},
     }
     return {key: data[key] for key in HYDRAULICS.keys if key in data}
+
+
+def _cylinder_data(cylinder: Cylinder, has_bore: bool) -> dict[str, Any]:
+    """The keys of a cylinder, by bore and rod where its file has them and they do for it."""
+    data = CYLINDER.values_of(cylinder, *BORE_KEYS)
+    count = cylinder.count
+    bore = shortest_number(
+        cylinder.bore, lambda x: piston_areas(x, 0.0, count)[0] == cylinder.area_a
+    )
+    if not has_bore or bore is None:
+        return data
+    rod = shortest_number(
+        cylinder.rod, lambda x: piston_areas(bore, x, count)[1] == cylinder.area_b
+    )
+    if rod is None:
+        return data
+    others = {key: value for key, value in data.items() if key not in AREA_KEYS}
+    return {"bore": bore, **({"rod": rod} if rod else {}), **others}
+
+
+def _write_displacement(
+    pump: dict[str, Any],
+    circuit: Hydraulics,
+    path: KeyPath,
+    quantities: Mapping[KeyPath, Quantity],
+) -> None:
+    """Write the displacement of a pump in place of its flow, where its file has it."""
+    if (*path, "displacement") not in quantities or not pump.get("flow"):
+        return
+    speed = quantities.get((*path, "speed"))
+    turns = speed.value if speed else circuit.engine.speed if circuit.engine else 0.0
+    displacement = turns and shortest_number(
+        pump["flow"] / turns, lambda x: x * turns == pump["flow"]
+    )
+    if displacement:
+        del pump["flow"]
+        pump |= {"displacement": displacement} | ({"speed": turns} if speed else {})
 
 
 def _motor_data(motor: Cylinder) -> dict[str, Any]:
@@ -369,12 +421,11 @@ def _valve_data(valve: Valve) -> dict[str, Any]:
     if not is_symmetric or valve.curves.keys() & {*ORIFICE_KEYS}:
         return size | values
     root = math.sqrt(valve.margin)
-    estimate = valve.c1 * root
-    for flow in (estimate, math.nextafter(estimate, 0.0), math.nextafter(estimate, math.inf)):
-        if flow / root == valve.c1:  # so that it is read to the last bit
-            size |= {"flow": flow, "meter_out": valve.c2}
-            return size | {x: value for x, value in values.items() if x not in ORIFICE_KEYS}
-    return size | values
+    flow = shortest_number(valve.c1 * root, lambda x: x / root == valve.c1)
+    if flow is None:
+        return size | values
+    size |= {"flow": flow, "meter_out": valve.c2}
+    return size | {x: value for x, value in values.items() if x not in ORIFICE_KEYS}
 
 
 def _payload_urdf(machine: Machine) -> Path | None:

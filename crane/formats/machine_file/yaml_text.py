@@ -1,6 +1,7 @@
 """YAML of machine files: parsed into mappings that know their lines, and written with notes."""
 
 import errno
+import re
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -10,10 +11,10 @@ import yaml
 
 from crane.common.errors import DescriptionError, format_one_line
 from crane.common.package_search import read_plain_file
+from crane.common.quantities import NUMBER_PATTERN, KeyPath, Quantity
 from crane.description.findings import report_error
 
 MAX_FILE_SIZE = 2_000_000  # bytes of a file; parsing ten million takes a minute
-KeyPath = tuple[str | int, ...]  # keys and indices down to a number
 
 
 class _BlockMapping(dict[str, Any]):
@@ -81,12 +82,13 @@ def _with_block_mappings(item: Any, key_path: KeyPath, block_paths: set[KeyPath]
 
 
 class LocatedMapping(dict[str, Any]):
-    """A mapping that remembers file and line of each key."""
+    """A mapping that remembers file and line of each key, and its numbers as they are written."""
 
     def __init__(self, file: Path, line: int):
         super().__init__()
         self.file, self.line = file, line
         self.locations: dict[str, tuple[Path, int]] = {}
+        self.quantities: dict[KeyPath, Quantity] = {}
 
     def copy_key(self, source: "LocatedMapping", key: str) -> None:
         """Take over the value of a key, and where it stands."""
@@ -105,8 +107,59 @@ class LocatedMapping(dict[str, Any]):
         self.file, self.line = variant.file, variant.line
 
 
+def quantities_by_path(data: LocatedMapping, path: KeyPath = ()) -> dict[KeyPath, Quantity]:
+    """The numbers that were read of a machine file, as written, by the ways to them."""
+    found = {(*path, *place): quantity for place, quantity in data.quantities.items()}
+    for key, value in data.items():
+        items = {key: value}
+        if isinstance(value, list):
+            items = dict(zip(_item_labels(value), value, strict=True))
+        for label, item in items.items():
+            if isinstance(item, LocatedMapping):
+                way = (*path, key) if item is value else (*path, key, label)
+                found |= quantities_by_path(item, way)
+    return found
+
+
+def with_written_units(
+    data: Any, quantities: Mapping[KeyPath, Quantity], path: KeyPath = ()
+) -> Any:
+    """The same with numbers in the units in which a machine file had them, to the last bit.
+
+    Args:
+        data: What a machine file says.
+        quantities: As `quantities_by_path` returns them.
+        path: The way to the data.
+    """
+    if isinstance(data, dict):
+        return {
+            key: with_written_units(value, quantities, (*path, key)) for key, value in data.items()
+        }
+    if isinstance(data, list):
+        return [
+            with_written_units(value, quantities, (*path, label))
+            for label, value in zip(_item_labels(data), data, strict=True)
+        ]
+    is_number = isinstance(data, int | float) and not isinstance(data, bool)
+    return quantities[path].write(data) if is_number and path in quantities else data
+
+
+def _item_labels(items: list[Any]) -> list[str | int]:
+    """What tells the items of a list apart where some are gone: names, else their numbers."""
+    labels: list[str | int] = []
+    for i, item in enumerate(items):
+        names = item if isinstance(item, dict) else {}
+        key = next((x for x in ("name", "joint", "between", "frame") if names.get(x)), None)
+        label = i if key is None else f"{names[key]}"
+        labels.append(i if label in labels else label)
+    return labels
+
+
 class _StrictConstructor(yaml.constructor.SafeConstructor):
-    """SafeConstructor with lines, and without silently taking the last of equal keys."""
+    """SafeConstructor with lines, and without silently taking the last of equal keys.
+
+    Numbers are those of YAML 1.2: 3:1 is no number in base 60, 012 is none in base 8.
+    """
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         """A value; what cannot be one (a 13th month, 0x without digits) is an error of YAML."""
@@ -125,10 +178,13 @@ class _StrictLoader(_StrictConstructor, yaml.SafeLoader):
     """Reads text, and says best what is wrong with it."""
 
 
+_LOADERS: list[Any] = [_StrictLoader]
 if yaml.__with_libyaml__:
 
     class _FastLoader(_StrictConstructor, yaml.CSafeLoader):
         """Reads text in a tenth of the time."""
+
+    _LOADERS.append(_FastLoader)
 
 
 def _construct_mapping(loader: Any, node: yaml.MappingNode) -> LocatedMapping:
@@ -160,7 +216,22 @@ def _construct_mapping(loader: Any, node: yaml.MappingNode) -> LocatedMapping:
     return data
 
 
+def _construct_integer(loader: Any, node: yaml.ScalarNode) -> int:
+    return int(loader.construct_scalar(node))
+
+
 _StrictConstructor.add_constructor("tag:yaml.org,2002:map", _construct_mapping)
+_StrictConstructor.add_constructor("tag:yaml.org,2002:int", _construct_integer)
+_FLOAT_PATTERN = rf"{NUMBER_PATTERN}|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"
+for _loader in _LOADERS:
+    _loader.yaml_implicit_resolvers = {
+        first: [x for x in resolvers if x[0].rpartition(":")[2] not in ("int", "float")]
+        for first, resolvers in _loader.yaml_implicit_resolvers.items()
+    }
+    for _kind, _pattern in (("int", "[-+]?[0-9]+"), ("float", _FLOAT_PATTERN)):
+        _loader.add_implicit_resolver(
+            f"tag:yaml.org,2002:{_kind}", re.compile(rf"(?:{_pattern})\Z"), list("-+.0123456789")
+        )
 
 
 def format_value(value: Any) -> str:
