@@ -71,8 +71,7 @@ TEXT = [
     ),
     case(
         "number without digits",
-        "four_bar.yaml:15: not YAML, '0x_' is no value of its kind, quote it if it "
-        "is text, correct it",
+        "four_bar.yaml:15: 'crank' of 'home' is '0x_', give a number in rad, as in 5 deg",
         swap("  crank: 1.2", "  crank: 0x_"),
     ),
     case(
@@ -363,7 +362,7 @@ TYPES = [
     ),
     case(
         "home is text",
-        "four_bar.yaml:15: 'crank' of 'home' is 'up', give a number",
+        "four_bar.yaml:15: 'crank' of 'home' is 'up', give a number in rad, as in 5 deg",
         swap("  crank: 1.2", "  crank: up"),
     ),
     case(
@@ -640,7 +639,7 @@ NAMES = [
     ),
     case(
         "pin without number",
-        "four_bar.yaml:29: 'coupler' of 'pins' is 'a', give a number",
+        "four_bar.yaml:29: 'coupler' of 'pins' is 'a', give a number in N, as in 5 kN",
         swap("tip: coupler_pin", "pins: {coupler: a}\ntip: coupler_pin"),
     ),
     case(

@@ -13,6 +13,7 @@ from crane.cli.options import (
     OutputFile,
     PackageOptions,
 )
+from crane.cli.parsing import number_option
 from crane.common.errors import InputError
 from crane.common.one_line_repr import format_count
 from crane.common.package_search import (
@@ -152,17 +153,16 @@ def cylinder(
             help="Attachment points of barrel and rod: LINK, or LINK:x,y,z in m.",
         ),
     ],
-    bore: Annotated[float, typer.Option(metavar="M", help="Diameter of the piston in m.")],
-    rod: Annotated[float, typer.Option(metavar="M", help="Diameter of the rod in m.")],
-    stroke: Annotated[float, typer.Option(metavar="M", help="Stroke in m.")],
+    bore: Annotated[float, number_option("m", "Diameter of the piston in m.")],
+    rod: Annotated[float, number_option("m", "Diameter of the rod in m.")],
+    stroke: Annotated[float, number_option("m", "Stroke in m.")],
     name: Annotated[
         str, typer.Option(help="Name of the cylinder and of its stroke.")
     ] = "cylinder",
     dead_length: Annotated[
         float | None,
-        typer.Option(
-            metavar="M",
-            help="Retracted length between the pins in m; by default the stroke plus four bores.",
+        number_option(
+            "m", "Retracted length between the pins in m; by default the stroke plus four bores."
         ),
     ] = None,
 ) -> None:

@@ -10,7 +10,7 @@ import typer
 
 import crane
 from crane.cli.command import OptionBlock
-from crane.cli.parsing import parse_arguments, parse_names, parse_values
+from crane.cli.parsing import number_option, parse_arguments, parse_changes, parse_names
 from crane.cli.terminal import status
 from crane.common.atomic_output import check_file_is_writable, check_folder_is_writable
 from crane.common.errors import OutputError
@@ -158,9 +158,9 @@ class ChangeOptions(OptionBlock):
         ),
     ] = None
 
-    def changed_values(self) -> dict[str, float]:
-        """Values of the changed parameters."""
-        return parse_values("--set", self.changes, "NAME=VALUE, as in payload.mass=200")
+    def changed_values(self) -> dict[str, float | str]:
+        """Values of the changed parameters, texts of those with units."""
+        return parse_changes("--set", self.changes, "NAME=VALUE, as in payload.mass=200")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,7 +178,7 @@ class ParameterOptions(ChangeOptions):
     def load(self, name: str) -> "crane.Machine":
         """Load a machine by its name or path."""
         return crane.load(
-            name, self.changed_values(), parse_values("--lock", self.lock), **self.assembly()
+            name, self.changed_values(), parse_changes("--lock", self.lock), **self.assembly()
         )
 
     def assembly(self) -> dict[str, Any]:
@@ -250,13 +250,11 @@ class TimeOptions(OptionBlock):
     panel = "Recording options"
     since: Annotated[
         float | None,
-        typer.Option(
-            "--from", metavar="SECONDS", help="Start of the part to read, in recorded time."
-        ),
+        number_option("s", "Start of the part to read, in recorded time.", "--from"),
     ] = None
     until: Annotated[
         float | None,
-        typer.Option("--until", metavar="SECONDS", help="End of the part to read."),
+        number_option("s", "End of the part to read.", "--until"),
     ] = None
 
     @property

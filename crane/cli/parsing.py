@@ -4,10 +4,13 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import typer
 
 import crane
 from crane.common.errors import InputError, check_name
+from crane.common.unit_conversions import UnitError, is_quantity, parse_number
 
 if TYPE_CHECKING:
     from crane.common.samples import Array
@@ -23,6 +26,8 @@ _GRID_FORM, _RANGE_FORM = "NAME=start:stop:count", "NAME=low~high"
 _MAX_GRID_VALUES = 10_000  # of one parameter
 _MAX_SLEW_ANGLES = 8  # that a page has room for
 _Value = TypeVar("_Value")
+_METAVARS = {"s": "SECONDS", "Hz": "HZ", "m": "M", "kg": "KG", "deg": "DEG", "": "FRACTION"}
+UnitsOf = Callable[[str], Sequence[str]]  # SI units that a name may have
 
 
 def parse_names(text: str | None) -> list[str] | None:
@@ -53,6 +58,8 @@ def _parse_named(
         name = name.strip()
         try:
             parsed = parse(name, value if equals else None)
+        except UnitError as error:
+            raise InputError(f"{option} is '{text}', {error}") from None
         except (InputError, TypeError, ValueError):
             name = ""
         if not name:
@@ -63,10 +70,10 @@ def _parse_named(
     return values
 
 
-def parse_values(
+def parse_changes(
     option: str, texts: Sequence[str] | None, form: str = _VALUE_FORM
-) -> dict[str, float]:
-    """Numbers by name from texts NAME=VALUE.
+) -> dict[str, float | str]:
+    """Numbers by name from texts NAME=VALUE, those with units as texts for `crane.load`.
 
     Args:
         option: Name of the option, for errors.
@@ -78,17 +85,88 @@ def parse_values(
     """
     from crane.common.samples import as_number
 
-    values = _parse_named(option, texts, form, lambda _, value: float(value or ""))
+    def parse(name: str, value: str | None) -> float | str:
+        if is_quantity(value or ""):
+            return str(value)
+        return as_number(float(value or ""), f"{option} {name}", "")
+
+    return _parse_named(option, texts, form, parse)
+
+
+def parse_values(
+    option: str,
+    texts: Sequence[str] | None,
+    units_of: UnitsOf,
+    form: str = _VALUE_FORM,
+) -> dict[str, float]:
+    """Numbers by name from texts NAME=VALUE, in SI units.
+
+    Args:
+        option: Name of the option, for errors.
+        texts: The texts.
+        units_of: Returns the SI units that a name may have.
+        form: The form that an error asks for.
+
+    Raises:
+        InputError: A text has another form, a name is given twice, or a number is out of range.
+    """
+    from crane.common.samples import as_number
+
+    values = _parse_named(
+        option, texts, form, lambda name, value: parse_number(value or "", units_of(name))
+    )
     return {name: as_number(value, f"{option} {name}", "") for name, value in values.items()}
 
 
-def parse_configuration(option: str, text: str | None) -> dict[str, float]:
+def parse_configuration(option: str, text: str | None, units_of: UnitsOf) -> dict[str, float]:
     """Numbers by joint from JOINT=VALUE,JOINT=VALUE.
 
     Raises:
         InputError: As `parse_values`.
     """
-    return parse_values(option, text.split(",") if text else None, CONFIGURATION_FORM)
+    return parse_values(option, text.split(",") if text else None, units_of, CONFIGURATION_FORM)
+
+
+def joint_units(machine: "crane.Machine", by_time: str = "") -> UnitsOf:
+    """SI units of the coordinates of joints, or of their rates: both of what is no joint.
+
+    Args:
+        machine: The machine.
+        by_time: As "/s" for rates, "/s2" for accelerations.
+    """
+
+    def units_of(name: str) -> Sequence[str]:
+        units = [machine.unit(name)] if name in machine.joints else ["m", "rad"]
+        return [f"{unit}{by_time}" for unit in units]
+
+    return units_of
+
+
+def parameter_units(machine: "crane.Machine") -> UnitsOf:
+    """SI unit of each parameter."""
+    from crane.description.machine_parameters import parameter_unit
+
+    return lambda name: (parameter_unit(machine.tree, name),)
+
+
+def number_option(unit: str, text: str, *names: str) -> Any:
+    """An option whose value is a number in a unit, or with another one.
+
+    Args:
+        unit: The unit of a plain number.
+        text: Its help.
+        names: Its names, if not that of its parameter.
+    """
+
+    def parse(text: str | float) -> float:
+        try:
+            return parse_number(str(text), (unit,))
+        except UnitError as error:
+            raise typer.BadParameter(f"{text!r}: {error}") from None
+        except ValueError:
+            raise typer.BadParameter(f"{text!r} is not a valid float.") from None
+
+    return typer.Option(*names, metavar=_METAVARS[unit], parser=parse, help=text)
 
 
 def parse_arguments(texts: Sequence[str] | None) -> dict[str, str]:
@@ -114,22 +192,29 @@ def parse_window(text: str | None) -> tuple[float, float]:
     """
     first, colon, last = (text or ":").partition(":")
     try:
-        start, end = float(first or "-inf"), float(last or "inf")
-    except ValueError:
+        start, end = (parse_number(text, ("s",)) for text in (first or "-inf", last or "inf"))
+    except (UnitError, ValueError):
         start, end = 0.0, 0.0
     if not colon or not start < end:
         raise InputError(f"--train is '{text}', write FROM:TO in seconds, as 0:13.5")
     return start, end
 
 
-def parse_numbers(texts: Sequence[str], message: str) -> list[float]:
-    """Numbers of texts.
+def parse_numbers(texts: Sequence[str], message: str, units: Sequence[str]) -> list[float]:
+    """Numbers of texts, in SI units.
+
+    Args:
+        texts: The texts.
+        message: The error where a text is no number.
+        units: SI units that they may have.
 
     Raises:
-        InputError: A text is no number; with this message.
+        InputError: A text is no number, or one of something else.
     """
     try:
-        return [float(text) for text in texts]
+        return [parse_number(text, units) for text in texts]
+    except UnitError as error:
+        raise InputError(f"{message}: {error}") from None
     except ValueError:
         raise InputError(message) from None
 
@@ -140,7 +225,8 @@ def parse_slew_angles(text: str) -> list[float]:
     Raises:
         InputError: The text has another form, or there are too many angles.
     """
-    angles = parse_numbers(text.split(","), f"--slew is '{text}', write degrees, as 0,45,90")
+    message = f"--slew is '{text}', write degrees, as 0,45,90"
+    angles = parse_numbers(text.split(","), message, ("deg",))
     if len(angles) > _MAX_SLEW_ANGLES:
         raise InputError(
             f"--slew has {len(angles)} angles, a page has room for {_MAX_SLEW_ANGLES}"
@@ -148,21 +234,26 @@ def parse_slew_angles(text: str) -> list[float]:
     return angles
 
 
-def parse_fits(texts: Sequence[str]) -> dict[str, object]:
+def parse_fits(texts: Sequence[str], units_of: UnitsOf) -> dict[str, object]:
     """What is fitted, by name: None, an initial guess, or initial guess, lower and upper bound.
+
+    Args:
+        texts: The texts.
+        units_of: Returns the SI units that a name may have.
 
     Raises:
         InputError: A text has another form, or a name is given twice.
     """
 
-    def parse(_: str, text: str | None) -> object:
+    def parse(name: str, text: str | None) -> object:
         if text is None:
             return None
         start, comma, bounds = text.partition(",")
-        if not comma:
-            return float(start)
-        low, _, high = bounds.partition("~")
-        return float(start), float(low), float(high)
+        words = [start, *(bounds.split("~") if comma else ())]
+        numbers = [parse_number(word, units_of(name)) for word in words]
+        if len(numbers) == 2:
+            raise ValueError
+        return tuple(numbers) if comma else numbers[0]
 
     return _parse_named("--fit", texts, _FIT_FORM, parse)
 
@@ -216,13 +307,20 @@ def parse_trials(texts: Sequence[str] | None) -> "dict[str, list[float | Paramet
 
     def parse(name: str, values: str | None) -> "list[float | ParameterPrior]":
         words = (values or "").split(",")
-        return [float(x) if name == "bandwidth" else ParameterPrior.parse(x) for x in words]
+        return [
+            parse_number(x, ("Hz",)) if name == "bandwidth" else ParameterPrior.parse(x)
+            for x in words
+        ]
 
     return _parse_named("--try", texts, _TRIAL_FORM, parse)
 
 
-def parse_grids(texts: Sequence[str] | None) -> "dict[str, Array]":
+def parse_grids(texts: Sequence[str] | None, units_of: UnitsOf) -> "dict[str, Array]":
     """Values by parameter from NAME=start:stop:count.
+
+    Args:
+        texts: The texts.
+        units_of: Returns the SI units that a parameter may have.
 
     Raises:
         InputError: A text has another form, or a name is given twice.
@@ -235,7 +333,7 @@ def parse_grids(texts: Sequence[str] | None) -> "dict[str, Array]":
         words = values.split(":")
         if len(words) != 3:
             raise InputError(f"--vary {text}: '{values}' is no grid, give {_GRID_FORM}")
-        start, stop = _finite_numbers(text, words[:2], _GRID_FORM)
+        start, stop = _finite_numbers(text, words[:2], _GRID_FORM, units_of)
         count = int(words[2]) if words[2].strip().isdecimal() else 0
         if not 1 <= count <= _MAX_GRID_VALUES:
             raise InputError(
@@ -249,8 +347,12 @@ def parse_grids(texts: Sequence[str] | None) -> "dict[str, Array]":
     return _parse_varied(texts, parse)
 
 
-def parse_ranges(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
+def parse_ranges(texts: Sequence[str], units_of: UnitsOf) -> dict[str, tuple[float, float]]:
     """Ends of ranges by parameter from NAME=low~high.
+
+    Args:
+        texts: The texts.
+        units_of: Returns the SI units that a parameter may have.
 
     Raises:
         InputError: A text has another form, or a name is given twice.
@@ -262,7 +364,7 @@ def parse_ranges(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
         words = values.split("~")
         if len(words) != 2:
             raise InputError(f"--vary {text}: a range has two ends, give {_RANGE_FORM}")
-        low, high = _finite_numbers(text, words, _RANGE_FORM)
+        low, high = _finite_numbers(text, words, _RANGE_FORM, units_of)
         if not low < high:
             raise InputError(f"--vary {text}: {low:g} is not below {high:g}, give {_RANGE_FORM}")
         return low, high
@@ -284,9 +386,9 @@ def _parse_varied(
     return {name: parse(f"{name}={values}", values) for name, values in varied.items()}
 
 
-def _finite_numbers(text: str, words: list[str], form: str) -> list[float]:
+def _finite_numbers(text: str, words: list[str], form: str, units_of: UnitsOf) -> list[float]:
     message = f"--vary {text}: '{':'.join(words)}' are no numbers, give {form}"
-    numbers = parse_numbers(words, message)
+    numbers = parse_numbers(words, message, units_of(text.partition("=")[0]))
     if not all(map(isfinite, numbers)):
         raise InputError(message)
     return numbers
@@ -309,7 +411,9 @@ def parse_load(text: str) -> "crane.Wrench":
         times, force, moment = _read_wrenches(Path(wrench))
         return crane.Wrench(frame, force, moment, times, axes)
     message = f"{what}: give 3 or 6 numbers with commas, or a CSV file"
-    numbers = parse_numbers(wrench.split(","), message)
+    words = wrench.split(",")
+    numbers = parse_numbers(words[:3], message, ("N",))
+    numbers += parse_numbers(words[3:], message, ("N m",))
     if len(numbers) not in (3, 6):
         raise InputError(message)
     return crane.Wrench(frame, numbers[:3], numbers[3:] or (0.0, 0.0, 0.0), axes=axes)

@@ -25,14 +25,15 @@ from crane.cli.options import (
     Seed,
     Task,
 )
-from crane.cli.parsing import parse_numbers, parse_slew_angles
+from crane.cli.parsing import number_option, parse_numbers, parse_slew_angles
 from crane.cli.show import active_coordinates
 from crane.cli.terminal import status
 from crane.common.errors import CraneWarning, InputError
 from crane.common.result import Result
 
 ChartStep = Annotated[
-    float | None, typer.Option("--step", metavar="M", help="Distance of grid points in m.")
+    float | None,
+    number_option("m", "Distance of grid points in m.", "--step"),
 ]
 
 
@@ -109,6 +110,7 @@ def breakout(
                 vector = parse_numbers(
                     direction.split(","),
                     f"--direction {direction} is no X,Y,Z, give three numbers",
+                    ("",),
                 )
             result = crane.ratings.tool_force(
                 loaded, vector, frame, joint=bucket, weights=weights, step=step
@@ -124,17 +126,13 @@ class RatingOptions(OptionBlock):
     rule: Rule = "none"
     hydraulic: Annotated[
         float | None,
-        typer.Option(
-            metavar="FRACTION",
-            help="Rated fraction of the hydraulic lifting load, instead of that of the rule.",
+        number_option(
+            "", "Rated fraction of the hydraulic lifting load, instead of that of the rule."
         ),
     ] = None
     tipping: Annotated[
         float | None,
-        typer.Option(
-            metavar="FRACTION",
-            help="Rated fraction of the tipping load, instead of that of the rule.",
-        ),
+        number_option("", "Rated fraction of the tipping load, instead of that of the rule."),
     ] = None
     raising: Annotated[
         list[str] | None,
@@ -154,9 +152,7 @@ class RatingOptions(OptionBlock):
     ] = None
     slope: Annotated[
         float,
-        typer.Option(
-            metavar="DEG", help="Slope of the ground in the most unfavourable direction."
-        ),
+        number_option("deg", "Slope of the ground in the most unfavourable direction."),
     ] = 0.0
     friction: Annotated[
         bool,
@@ -200,9 +196,8 @@ def capacity(
     step: ChartStep = None,
     torque: Annotated[
         float | None,
-        typer.Option(
-            metavar="RADIUS",
-            help="Also compute lifting torques at this radius in m, and the slewing torque.",
+        number_option(
+            "m", "Also compute lifting torques at this radius in m, and the slewing torque."
         ),
     ] = None,
     by: OptionalParameters = None,
@@ -280,7 +275,7 @@ def power(
     ] = None,
     moved: Annotated[
         float | None,
-        typer.Option(metavar="KG", help="Mass that each run moves, for the work per kg."),
+        number_option("kg", "Mass that each run moves, for the work per kg."),
     ] = None,
 ) -> None:
     """Compute the power balance of a hydraulic run.

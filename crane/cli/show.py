@@ -15,7 +15,7 @@ from crane.cli.options import (
     ParameterOptions,
     RecordingOptions,
 )
-from crane.cli.parsing import parse_configuration
+from crane.cli.parsing import joint_units, parse_configuration
 from crane.cli.terminal import hide_activity_line
 from crane.common.atomic_output import portable_file_name
 from crane.common.errors import InputError, check_name
@@ -196,7 +196,7 @@ def active_coordinates(machine: "crane.Machine", at: str | None) -> "Array":
         InputError: --at has another form, or names something that is no active joint.
     """
     q_a = machine.home[machine.closure.active].copy()
-    for joint, value in parse_configuration("--at", at).items():
+    for joint, value in parse_configuration("--at", at, joint_units(machine)).items():
         check_name(joint, machine.active, f"--at: '{joint}' is no active joint")
         q_a[machine.active.index(joint)] = value
     return q_a

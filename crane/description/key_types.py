@@ -7,6 +7,7 @@ from typing import Any
 
 from crane.common.plausible_ranges import PlausibleRange, plausible_range
 
+QUANTITY_UNIT = "unit of the quantity"  # of a number whose unit is that of what is measured
 REQUIRED: Any = object()  # the default of a key that has to be given
 
 

@@ -5,6 +5,7 @@ from crane.description.external_force_schema import CONTACT, CUTTER, GROUND, LOA
 from crane.description.floating_bases import FLOATING_FREEDOMS
 from crane.description.force_elements import EndStop, ForceElement, Friction, GasSpring, Rope
 from crane.description.key_types import (
+    QUANTITY_UNIT,
     REQUIRED,
     FileKey,
     FlagKey,
@@ -289,12 +290,13 @@ SENSOR = section_schema(
             default_text="name of the quantity",
         ),
         "unit": TextKey("unit of that column", default_text="SI unit"),
-        "zero": NumberKey("offset, in the unit of the quantity"),
+        "zero": NumberKey("offset", QUANTITY_UNIT),
         "scale": NumberKey("scale factor, not 0"),
         "delay": NumberKey("delay of the sensor", "s"),
         "noise": NumberKey(
             "standard deviation of the noise, which sets the weight of the channel in a "
             "calibration",
+            QUANTITY_UNIT,
             default_text="derived from the recording",
         ),
     },

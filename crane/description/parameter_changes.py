@@ -11,6 +11,7 @@ import numpy as np
 from crane.common.errors import CraneWarning, InputError, suggest_names
 from crane.common.plausible_ranges import implausible_value_text
 from crane.common.samples import MAX_COORDINATE, as_number
+from crane.common.unit_conversions import UnitError, parse_quantity
 from crane.description.external_forces import ExternalForce
 from crane.description.floating_bases import convert_locked_rotations
 from crane.description.force_elements import (
@@ -24,6 +25,7 @@ from crane.description.machine_parameters import (
     PINS_PREFIX,
     FieldPath,
     parameter_paths,
+    parameter_unit,
     parameters,
     unknown_parameter_text,
     value_at,
@@ -40,6 +42,48 @@ from crane.description.specification import Coupling, Drive, MachineSpec, Task
 _LIMIT_TOLERANCE = 1e-9  # relative to a limit, for rounding
 
 T = TypeVar("T")
+
+
+def changes_in_si(spec: MachineSpec, changes: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Parameter changes with numbers in place of texts with units; unknown names are left.
+
+    Raises:
+        InputError: A text is no number in a unit of its parameter.
+    """
+    changes = changes or {}
+    texts = [name for name in changes if isinstance(changes[name], str)]
+    known = parameters(spec) if texts else {}
+    numbers = {
+        name: _in_si(f"parameter '{name}'", changes[name], (parameter_unit(spec.tree, name),))
+        for name in texts
+        if name in known or name.startswith(SENSOR_PREFIX)
+    }
+    return {**changes, **numbers}
+
+
+def locks_in_si(spec: MachineSpec, lock: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Coordinates of locked joints with numbers in place of texts with units.
+
+    Raises:
+        InputError: A text is no number in a unit of its joint.
+    """
+
+    def units_of(name: str) -> tuple[str, ...]:
+        return tuple(filter(None, [quantity_unit(spec.tree, name)])) or ("m", "rad")
+
+    return {
+        name: _in_si(f"the coordinate to lock '{name}' at", value, units_of(name))
+        if isinstance(value, str)
+        else value
+        for name, value in (lock or {}).items()
+    }
+
+
+def _in_si(what: str, text: str, units: Sequence[str]) -> float:
+    try:
+        return parse_quantity(text, units).value
+    except UnitError as error:
+        raise InputError(f"{what} is '{text}', {error}") from None
 
 
 def apply_parameter_changes(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:

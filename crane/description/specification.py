@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from crane.common.errors import InputError, suggest_names
-from crane.common.quantities import KeyPath, Quantity
+from crane.common.unit_conversions import KeyPath, WrittenNumber
 from crane.description.external_forces import ExternalForce, Wrench
 from crane.description.force_elements import (
     AnyForceElement,
@@ -399,7 +399,7 @@ class MachineSpec:
         default_factory=dict
     )  # by joint or loop, most force [N]
     # numbers as they are written, by the keys and names that lead to them in the machine file
-    quantities: Mapping[KeyPath, Quantity] = field(default_factory=dict)
+    written_numbers: Mapping[KeyPath, WrittenNumber] = field(default_factory=dict)
 
     @property
     def force_elements(self) -> tuple[AnyForceElement, ...]:

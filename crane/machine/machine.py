@@ -19,8 +19,8 @@ from crane.closure.loop_equations import frame_id
 from crane.common.errors import InputError, LimitError, suggest_names
 from crane.common.one_line_repr import OneLineRepr, format_count
 from crane.common.package_search import LoadOptions
-from crane.common.quantities import KeyPath, Quantity
 from crane.common.samples import Array, as_samples, read_only_copy
+from crane.common.unit_conversions import KeyPath, WrittenNumber
 from crane.description.external_forces import ExternalForce, PhasedWrench
 from crane.description.force_elements import (
     AnyForceElement,
@@ -87,8 +87,7 @@ class Machine(OneLineRepr):
         packages: Folders in which packages were searched for.
         arguments: Values of its file's arguments.
         trusts_xacro: Whether its xacro files may run Python and read all files.
-        quantities: Numbers of its machine file as they are written, with their units, by the keys
-            and names that lead to them.
+        written_numbers: Numbers of its machine file with their units, by the keys to them.
     """
 
     name: str
@@ -124,7 +123,7 @@ class Machine(OneLineRepr):
     packages: tuple[str, ...]
     arguments: Mapping[str, str]
     trusts_xacro: bool = False
-    quantities: Mapping[KeyPath, Quantity] = field(default_factory=dict)
+    written_numbers: Mapping[KeyPath, WrittenNumber] = field(default_factory=dict)
 
     def _one_line(self) -> str:
         words = [
@@ -132,8 +131,8 @@ class Machine(OneLineRepr):
             format_count(len(self.active), "degree of freedom", "degrees of freedom"),
             format_count(len(self.joints), "joint"),
             format_count(len(self.closure.equations.loops), "loop"),
-            *(["hydraulic"] if self.hydraulics is not None else []),
-            *([f"{len(self.free)} free"] if self.free else []),
+            *["hydraulic"] * (self.hydraulics is not None),
+            *[f"{len(self.free)} free"] * bool(self.free),
         ]
         return f"Machine({', '.join(words)})"
 
@@ -218,12 +217,10 @@ class Machine(OneLineRepr):
         For example 'patu655 with {"changes": {"payload.mass": 200.0}, "lock": {"slew": 0.0}}'.
         """
         given = {
-            "changes": dict(self.parameter_changes),
-            "lock": dict(self.locked_joints),
-            "floating": self.floating_base,
-            "packages": self.packages,
+            "changes": dict(self.parameter_changes), "lock": dict(self.locked_joints),
+            "floating": self.floating_base, "packages": self.packages,
             "arguments": dict(self.arguments),
-        }
+        }  # fmt: skip
         options = {name: x for name, x in (given | dict(self.chosen_joints)).items() if x}
         return self.load_name + (CHANGES_SEPARATOR + json.dumps(options) if options else "")
 
@@ -449,6 +446,5 @@ class Machine(OneLineRepr):
         load = payload.rigid_body()
         model = pin.Model(self.model)
         model.appendBodyToJoint(frame.parentJoint, load, frame.placement)
-        return dataclasses.replace(
-            self, model=model, tree=add_rigid_load(self.tree, payload.frame, load)
-        )
+        tree = add_rigid_load(self.tree, payload.frame, load)
+        return dataclasses.replace(self, model=model, tree=tree)

@@ -1,7 +1,7 @@
 """Reading of tables from CSV and npz files, with bounds and messages that name the line.
 
-Tables are in SI units: columns in bar, deg, mm and other units of `crane.common.quantities` are
-converted, those in units that are not known stay as they are.
+Tables are in SI units: columns in bar, deg, mm and other units of
+`crane.common.unit_conversions` are converted, those in units that are not known stay as they are.
 """
 
 import codecs
@@ -18,8 +18,8 @@ import numpy as np
 
 from crane.common import scratch_arrays
 from crane.common.errors import RecordingError
-from crane.common.quantities import accepted_units, column_conversion
 from crane.common.samples import Array
+from crane.common.unit_conversions import accepted_units, column_conversion
 from crane.description.sensors import TIME
 from crane.recordings.npz import MAX_COLUMNS, MAX_NUMBERS, read_arrays, read_columns
 from crane.recordings.timeseries import (
@@ -306,7 +306,7 @@ def _parse_header(heading: str) -> dict[str, str]:
             f"no column '{TIME}' in the header, add '{TIME} [s]', or say by a file of columns "
             "(--columns) which column of a log is which"
         )
-    check_unit(TIME, units[TIME], accepted_units("s"))
+    check_unit(TIME, column_conversion(units[TIME])[0], accepted_units("s"))
     return units
 
 

@@ -5,8 +5,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-from crane.common.quantities import NUMBER_PATTERN, accepted_units, unit_names, unit_size
+from crane.common.unit_conversions import NUMBER_PATTERN, accepted_units, unit_names, unit_size
 from crane.description.key_types import (
+    QUANTITY_UNIT,
     REQUIRED,
     FlagKey,
     Key,
@@ -116,11 +117,12 @@ class _SchemaDefinitions:
             bounds = {"exclusiveMinimum": 0}
         columns = getattr(key, "column_units", ())
         units = tuple(dict.fromkeys(columns or key.si_units(None, (0,))))
-        name = "_or_".join(["number", *filter(None, units)])
+        name = "_or_".join(["number", *(unit or "ratio" for unit in units if any(units))])
         name = re.sub(r"\W", "_", name.replace("/", "_per_"))
         if name not in self.schemas:
             pattern = rf"^\s*{NUMBER_PATTERN}\s*(?:{'|'.join(map(_unit_pattern, units))})?\s*$"
-            examples = [f"1 {other}" for unit in units for other in accepted_units(unit) if other]
+            others = [x for unit in units if unit != QUANTITY_UNIT for x in accepted_units(unit)]
+            examples = [f"1 {unit}" for unit in others if unit]
             number = {"type": ["number", "string"], "pattern": pattern, "examples": examples}
             self.schemas[name] = number
             self.schemas[f"{name}_or_none"] = number | {"type": _NUMBER_OR_NONE}
@@ -166,6 +168,8 @@ def _unit_pattern(unit: str) -> str:
     """Pattern of the units of what a unit is of: their names, with prefixes, and products."""
     if not unit:
         return _RATIO
+    if unit == QUANTITY_UNIT:
+        return rf"{_RATIO}|[^\s%:0-9].*"
     names = [name for name in unit_names() if unit_size(name, unit) is not None]
     simple = rf"[numcdhkMG\u00b5\u03bc]?(?:{'|'.join(names)})|" if names else ""
     return simple + _COMPOUND_UNIT

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from crane.common.errors import DescriptionError, InputError, suggest_names
 from crane.common.package_search import load_options
-from crane.common.quantities import accepted_units, unit_size
+from crane.common.unit_conversions import accepted_units, unit_size
 from crane.description.external_forces import ExternalForce
 from crane.description.findings import UnknownNames, error_recovery, report_error
 from crane.description.ground_contact import Contact
@@ -207,7 +207,7 @@ def _read_machine(path: Path) -> MachineSpec:
         _read_or_default(_read_supports, (), top, tree, external_forces),
         _read_or_default(_read_pins, {}, top, tree, loops),
     )
-    return dataclasses.replace(spec, quantities=top.quantities())
+    return dataclasses.replace(spec, written_numbers=top.written_numbers())
 
 
 def _read_supports(

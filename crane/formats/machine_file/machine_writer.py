@@ -10,7 +10,7 @@ from lxml import etree
 
 from crane.common.atomic_output import portable_file_name, replace_folder
 from crane.common.errors import CraneError, CraneWarning, InputError, OutputError, format_one_line
-from crane.common.quantities import KeyPath, Quantity, shortest_number
+from crane.common.unit_conversions import KeyPath, WrittenNumber, shortest_number
 from crane.description.circuit_schema import (
     AREA_KEYS,
     BORE_KEYS,
@@ -238,7 +238,7 @@ class MachineDraft:
         (folder / file).write_text(
             "".join(f"# {format_one_line(line)}\n" for line in self._header_notes)
             + format_yaml(
-                with_written_units(nonempty, self._machine.quantities), self._line_notes
+                with_written_units(nonempty, self._machine.written_numbers), self._line_notes
             ),
             encoding="utf-8",
         )
@@ -287,7 +287,7 @@ def _machine_data(machine: Machine) -> dict[str, Any]:
         "payload": None,
         "tasks": {name: _task_data(task) for name, task in machine.tasks.items()},
         "hydraulics": machine.hydraulics
-        and _hydraulics_data(machine.hydraulics, machine.quantities),
+        and _hydraulics_data(machine.hydraulics, machine.written_numbers),
         "sensors": {
             name: SENSOR.values_of(sensor) or {"zero": 0.0}
             for name, sensor in machine.sensors.items()
@@ -328,21 +328,21 @@ def _task_data(task: Task) -> dict[str, Any]:
 
 
 def _hydraulics_data(
-    circuit: Hydraulics, quantities: Mapping[KeyPath, Quantity]
+    circuit: Hydraulics, written_numbers: Mapping[KeyPath, WrittenNumber]
 ) -> dict[str, Any]:
     drives: dict[str, dict[str, Any]] = {"cylinders": {}, "motors": {}}
     for joint, item in circuit.cylinders.items():
         if item.motor:
             drives["motors"][joint] = _motor_data(item)
         else:
-            has_bore = ("hydraulics", "cylinders", joint, "bore") in quantities
+            has_bore = ("hydraulics", "cylinders", joint, "bore") in written_numbers
             drives["cylinders"][joint] = _cylinder_data(item, has_bore)
     data = HYDRAULICS.values_of(circuit, "cylinders", "valves")
     pumps = {("supply",): data["supply"]} | {
         ("supplies", name): pump for name, pump in data.get("supplies", {}).items()
     }
     for path, pump in pumps.items():
-        _write_displacement(pump, circuit, ("hydraulics", *path), quantities)
+        _write_displacement(pump, circuit, ("hydraulics", *path), written_numbers)
     data |= {
         **{key: value for key, value in drives.items() if value},
         "valves": {joint: _valve_data(valve) for joint, valve in circuit.valves.items()},
@@ -372,12 +372,12 @@ def _write_displacement(
     pump: dict[str, Any],
     circuit: Hydraulics,
     path: KeyPath,
-    quantities: Mapping[KeyPath, Quantity],
+    written_numbers: Mapping[KeyPath, WrittenNumber],
 ) -> None:
     """Write the displacement of a pump in place of its flow, where its file has it."""
-    if (*path, "displacement") not in quantities or not pump.get("flow"):
+    if (*path, "displacement") not in written_numbers or not pump.get("flow"):
         return
-    speed = quantities.get((*path, "speed"))
+    speed = written_numbers.get((*path, "speed"))
     turns = speed.value if speed else circuit.engine.speed if circuit.engine else 0.0
     displacement = turns and shortest_number(
         pump["flow"] / turns, lambda x: x * turns == pump["flow"]

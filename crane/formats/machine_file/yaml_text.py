@@ -11,7 +11,7 @@ import yaml
 
 from crane.common.errors import DescriptionError, format_one_line
 from crane.common.package_search import read_plain_file
-from crane.common.quantities import NUMBER_PATTERN, KeyPath, Quantity
+from crane.common.unit_conversions import NUMBER_PATTERN, KeyPath, WrittenNumber
 from crane.description.findings import report_error
 
 MAX_FILE_SIZE = 2_000_000  # bytes of a file; parsing ten million takes a minute
@@ -88,7 +88,7 @@ class LocatedMapping(dict[str, Any]):
         super().__init__()
         self.file, self.line = file, line
         self.locations: dict[str, tuple[Path, int]] = {}
-        self.quantities: dict[KeyPath, Quantity] = {}
+        self.written_numbers: dict[KeyPath, WrittenNumber] = {}
 
     def copy_key(self, source: "LocatedMapping", key: str) -> None:
         """Take over the value of a key, and where it stands."""
@@ -107,9 +107,11 @@ class LocatedMapping(dict[str, Any]):
         self.file, self.line = variant.file, variant.line
 
 
-def quantities_by_path(data: LocatedMapping, path: KeyPath = ()) -> dict[KeyPath, Quantity]:
+def written_numbers_by_path(
+    data: LocatedMapping, path: KeyPath = ()
+) -> dict[KeyPath, WrittenNumber]:
     """The numbers that were read of a machine file, as written, by the ways to them."""
-    found = {(*path, *place): quantity for place, quantity in data.quantities.items()}
+    found = {(*path, *place): quantity for place, quantity in data.written_numbers.items()}
     for key, value in data.items():
         items = {key: value}
         if isinstance(value, list):
@@ -117,31 +119,32 @@ def quantities_by_path(data: LocatedMapping, path: KeyPath = ()) -> dict[KeyPath
         for label, item in items.items():
             if isinstance(item, LocatedMapping):
                 way = (*path, key) if item is value else (*path, key, label)
-                found |= quantities_by_path(item, way)
+                found |= written_numbers_by_path(item, way)
     return found
 
 
 def with_written_units(
-    data: Any, quantities: Mapping[KeyPath, Quantity], path: KeyPath = ()
+    data: Any, written_numbers: Mapping[KeyPath, WrittenNumber], path: KeyPath = ()
 ) -> Any:
     """The same with numbers in the units in which a machine file had them, to the last bit.
 
     Args:
         data: What a machine file says.
-        quantities: As `quantities_by_path` returns them.
+        written_numbers: As `written_numbers_by_path` returns them.
         path: The way to the data.
     """
     if isinstance(data, dict):
         return {
-            key: with_written_units(value, quantities, (*path, key)) for key, value in data.items()
+            key: with_written_units(value, written_numbers, (*path, key))
+            for key, value in data.items()
         }
     if isinstance(data, list):
         return [
-            with_written_units(value, quantities, (*path, label))
+            with_written_units(value, written_numbers, (*path, label))
             for label, value in zip(_item_labels(data), data, strict=True)
         ]
     is_number = isinstance(data, int | float) and not isinstance(data, bool)
-    return quantities[path].write(data) if is_number and path in quantities else data
+    return written_numbers[path].write(data) if is_number and path in written_numbers else data
 
 
 def _item_labels(items: list[Any]) -> list[str | int]:

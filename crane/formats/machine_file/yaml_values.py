@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from crane.common.errors import DescriptionError, suggest_names
-from crane.common.quantities import KeyPath, Quantity, UnitError, parse_quantity
+from crane.common.unit_conversions import KeyPath, UnitError, WrittenNumber, parse_quantity
 from crane.description.findings import UnknownNames, error_recovery, report_error
 from crane.description.key_types import (
     REQUIRED,
@@ -24,7 +24,7 @@ from crane.description.key_types import (
 from crane.formats.machine_file.yaml_text import (
     LocatedMapping,
     format_value,
-    quantities_by_path,
+    written_numbers_by_path,
 )
 
 _BOOLEAN_WORDS = {"on": True, "yes": True, "true": True, "off": False, "no": False, "false": False}
@@ -107,9 +107,9 @@ class YamlValues:
                 self._data[near[0]] = self._data[key]
                 self._data.locations[near[0]] = self._data.locations[key]
 
-    def quantities(self) -> dict[KeyPath, Quantity]:
+    def written_numbers(self) -> dict[KeyPath, WrittenNumber]:
         """The numbers that were read of the section, as written, by the ways to them."""
-        return quantities_by_path(self._data)
+        return written_numbers_by_path(self._data)
 
     def source_location(self, key: str | None = None) -> str:
         """File and line of the section or of one of its keys."""
@@ -245,7 +245,7 @@ class YamlValues:
         if not math.isfinite(number) and isinstance(value, str) and "," not in value:
             return self._read_quantity(key, value, position)
         if math.isfinite(number):
-            self._data.quantities[key, *position] = Quantity(number)
+            self._data.written_numbers[key, *position] = WrittenNumber(number)
             return number
         hint = "give a number"
         if isinstance(value, float):
@@ -259,7 +259,7 @@ class YamlValues:
             quantity = parse_quantity(text, self.si_units(key, position))
         except UnitError as error:
             raise self._value_error(key, format_value(text), str(error)) from None
-        self._data.quantities[key, *position] = quantity
+        self._data.written_numbers[key, *position] = quantity
         return quantity.value
 
     def boolean(self, key: str) -> bool:

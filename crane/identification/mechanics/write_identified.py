@@ -12,8 +12,8 @@ from lxml import etree
 
 from crane.common.atomic_output import replace_folder
 from crane.common.errors import CraneError, CraneWarning, InputError, OutputError
-from crane.common.quantities import KeyPath
 from crane.common.samples import Array
+from crane.common.unit_conversions import KeyPath
 from crane.description.force_elements import Friction
 from crane.description.kinematic_tree import inertia_problem
 from crane.description.machine_schema import END_STOP, FORCE, GAS_SPRING, LOOP, ROPE
@@ -237,7 +237,7 @@ def _machine_file_content(
         if not data.get(key):
             data.pop(key, None)
     notes = _uncertainty_notes(result, data)
-    return format_yaml(with_written_units(data, spec.quantities), notes), motor_urdfs
+    return format_yaml(with_written_units(data, spec.written_numbers), notes), motor_urdfs
 
 
 def _uncertainty_notes(result: Identification, data: Mapping[str, Any]) -> dict[KeyPath, str]:

@@ -44,10 +44,10 @@ COMMON_UNITS: dict[str, tuple[str, Fraction]] = {
     "mV": ("V", Fraction(1, 1000)),
     "%": ("", Fraction(1, 100)),
 }
-# SI units of columns of recordings, to which columns in other units are converted
+# SI units of columns of recordings, to which columns in other units are converted; g is no mass
 _COLUMN_UNITS = (
-    "s", "m", "rad", "m/s", "rad/s", "m/s2", "rad/s2", "kg", "N", "N m", "Pa", "m3/s", "m3", "W",
-    "J", "V",
+    "s", "m", "rad", "m/s", "rad/s", "m/s2", "rad/s2", "N", "N m", "Pa", "m3/s", "m3", "W", "J",
+    "V",
 )  # fmt: skip
 UNIT_DEFINITIONS = f"""
 nano- = 1e-9 = n-
@@ -104,7 +104,7 @@ class UnitError(InputError):
     """A text is no number in a wanted unit; the message says what to give."""
 
 
-class Quantity(NamedTuple):
+class WrittenNumber(NamedTuple):
     """A number as it was written.
 
     Attributes:
@@ -142,7 +142,23 @@ def shortest_number(estimate: float, is_exact: Callable[[float], bool]) -> float
     return next((x for x in numbers if is_exact(x)), None)
 
 
-def parse_quantity(text: str, units: Sequence[str] = ("",)) -> Quantity:
+def is_quantity(text: str) -> bool:
+    """Whether a text is a number with a unit, whichever that is."""
+    match = _QUANTITY_PATTERN.fullmatch(text[: _MAX_LENGTH + 1])
+    return match is not None and bool(match[2])
+
+
+def parse_number(text: str, units: Sequence[str]) -> float:
+    """A plain number, as Python reads it, or one with a unit.
+
+    Raises:
+        UnitError: See `parse_quantity`.
+        ValueError: It is neither.
+    """
+    return parse_quantity(text, units).value if is_quantity(text) else float(text)
+
+
+def parse_quantity(text: str, units: Sequence[str] = ("",)) -> WrittenNumber:
     """A number with a unit or without, in which case it is in the SI unit.
 
     Args:
@@ -159,9 +175,9 @@ def parse_quantity(text: str, units: Sequence[str] = ("",)) -> Quantity:
     for si_unit in units:
         size = Fraction(1) if not unit else unit_size(unit, si_unit)
         if size is not None:
-            return Quantity(float(number * size), unit, size)
+            return WrittenNumber(float(number * size), unit, size)
     is_known = _RATIO_PATTERN.fullmatch(unit) or unit == "%" or _dimension(unit)
-    problem = f"'{unit}' is {'another quantity' if is_known else 'no known unit'}"
+    problem = f"'{unit}' is {'a unit of something else' if is_known else 'no known unit'}"
     raise UnitError(f"and {problem}, give a number{_unit_hint(units)}")
 
 
