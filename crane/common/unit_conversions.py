@@ -210,7 +210,7 @@ def _registry() -> Any:
     """The library of units, which takes a tenth of a second, with the units of machines."""
     import pint
 
-    registry = pint.UnitRegistry(None, non_int_type=Fraction, cache_folder=None)
+    registry: Any = pint.UnitRegistry(None, non_int_type=Fraction, cache_folder=None)
     registry.load_definitions(UNIT_DEFINITIONS.strip().splitlines())
     return registry
 

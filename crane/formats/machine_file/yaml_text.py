@@ -113,7 +113,7 @@ def written_numbers_by_path(
     """The numbers that were read of a machine file, as written, by the ways to them."""
     found = {(*path, *place): quantity for place, quantity in data.written_numbers.items()}
     for key, value in data.items():
-        items = {key: value}
+        items: dict[str | int, Any] = {key: value}
         if isinstance(value, list):
             items = dict(zip(_item_labels(value), value, strict=True))
         for label, item in items.items():

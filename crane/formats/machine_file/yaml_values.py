@@ -224,17 +224,15 @@ class YamlValues:
             key: The key.
             position: Where it is in the list or the rows of the key.
         """
-        kinds = (NumberListKey, RowListKey) if position else (NumberKey,)
-        spec = self._number_key(key, *kinds)
+        lists = (NumberListKey, RowListKey)
+        spec = self._number_key(key, *(lists if position else (NumberKey,)))
         if not isinstance(spec, NumberKey):
             return ("",)
         coordinate = key if key not in self.schema.keys else ""
-        joints = self._data.get("joint"), *(self._data.get("joints") or ())
-        kinds = {
-            self.turns[x]
-            for x in (coordinate, self._name, *joints)
-            if isinstance(x, str) and x in self.turns
-        }
+        joints = self._data.get("joints")
+        names = [coordinate, self._name, self._data.get("joint")]
+        names += joints if isinstance(joints, dict | list) else ()
+        kinds = {self.turns[x] for x in names if isinstance(x, str) and x in self.turns}
         turns = kinds.pop() if len(kinds) == 1 else None
         if "between" in self._data:
             turns = False
