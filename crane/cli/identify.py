@@ -148,7 +148,12 @@ def excite(
     deviations = parse_values(
         "--noise", noise, lambda name: (quantity_unit(loaded.tree, name + suffix) or "",)
     )
-    common: dict[str, Any] = {"criterion": criterion, "noise": deviations, "step": step, "seed": seed}
+    common: dict[str, Any] = {
+        "criterion": criterion,
+        "noise": deviations,
+        "step": step,
+        "seed": seed,
+    }
     result: Result
     with progress_bar("optimising") as progress:
         if fits is None:

@@ -296,7 +296,11 @@ _SPOOL_KEYS: dict[str, Key] = {
     "full": NumberKey(
         "signal of $u = 1$; $u = (U - \\text{neutral}) / (\\text{full} - \\text{neutral})$", "V"
     ),
-    "dead_band": NumberKey("fraction of the spool stroke without flow"),
+    "dead_band": NumberKey(
+        "fraction of the spool stroke without flow; negative: underlap, over which the inlet and "
+        "outlet of a chamber are both open",
+        minimum=-1.0,
+    ),
     "bandwidth": NumberKey("natural frequency of the spool; 0: the spool follows immediately"),
     "damping": NumberKey("damping ratio of the spool"),
     "rate": NumberKey("maximum speed in strokes per second; 0: no limit"),

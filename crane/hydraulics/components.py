@@ -198,7 +198,8 @@ class Spool:
         joint: Joint of the cylinder.
         neutral: Signal of the middle position [V].
         full: Signal of u = 1, which drains chamber B [V].
-        dead_band: Share of the spool stroke without flow.
+        dead_band: Share of the spool stroke without flow; negative: an underlap, the share over
+            which inlet and outlet of a chamber are both open, on either side of the middle.
         bandwidth: Natural frequency of the spool [rad/s]; 0 for a spool without inertia.
         damping: Damping ratio of the spool.
         rate: Largest speed of the spool, in strokes per second; 0 for no limit.
@@ -209,7 +210,7 @@ class Spool:
     joint: str
     neutral: float = signed_field(0.0)
     full: float = signed_field(1.0)
-    dead_band: float = 0.0
+    dead_band: float = signed_field(0.0)
     bandwidth: float = 0.0
     damping: float = positive_field(1.0)
     rate: float = 0.0
@@ -221,16 +222,23 @@ class Spool:
         check_parameters(self, label)
         _check_spool(self, label)
 
+    @property
+    def overlap(self) -> float:
+        """The dead band that a signal has to pass; 0 of a spool with underlap."""
+        return max(self.dead_band, 0.0)
+
 
 @dataclass(frozen=True)
 class Valve:
     """A proportional directional valve of one cylinder.
 
     The signal U [V] sets the target u = (U - neutral) / (full - neutral), from -1 to 1, that the
-    spool position follows. Outside of the dead band the opening is
-    y = sign(u) (|u| - dead_band) / (1 - dead_band). With a dead time the spool follows the signal
-    of the time t - delay, and before that the first signal. The flows through the edges are
-    equations (21) and (22) of the electro-hydraulic forwarder paper,
+    spool position follows. Outside of the dead band d the opening is
+    y = sign(u) (|u| - d) / (1 - d). Each edge has its own opening, (u - d) / (1 - d) of c1 and c2,
+    (-u - d) / (1 - d) of c3 and c4, within 0 and 1: with an underlap, d < 0, all four are open by
+    -d / (1 - d) in the middle, and oil flows from the supply to the tank. With a dead time the
+    spool follows the signal of the time t - delay, and before that the first signal. The flows
+    through the edges are equations (21) and (22) of the electro-hydraulic forwarder paper,
 
         y > 0:  Q_A = c1 y sqrt(p_S - p_A),  Q_B = -c2 y sqrt(p_B - p_R),
         y < 0:  Q_A = c3 y sqrt(p_A - p_R),  Q_B = -c4 y sqrt(p_S - p_B).
@@ -261,7 +269,8 @@ class Valve:
         margin: Pressure drop that the compensator keeps [Pa]; 0 without compensation.
         neutral: Signal of the middle position [V].
         full: Signal of u = 1 [V].
-        dead_band: Share of the spool stroke without flow.
+        dead_band: Share of the spool stroke without flow; negative: an underlap, the share over
+            which inlet and outlet of a chamber are both open, on either side of the middle.
         bandwidth: Natural frequency of the spool [rad/s]; 0 for a spool without inertia.
         damping: Damping ratio of the spool.
         rate: Largest speed of the spool, in strokes (of u from 0 to 1) per second; 0 for no limit.
@@ -293,7 +302,7 @@ class Valve:
     margin: float = 0.0
     neutral: float = signed_field(0.0)
     full: float = signed_field(1.0)
-    dead_band: float = 0.0
+    dead_band: float = signed_field(0.0)
     bandwidth: float = 0.0
     damping: float = positive_field(1.0)
     rate: float = 0.0
@@ -350,8 +359,13 @@ class Valve:
         """Its spools by the names of their signals."""
         return {self.joint: self} | ({f"{self.joint}_b": self.spool_b} if self.spool_b else {})
 
+    @property
+    def overlap(self) -> float:
+        """The dead band that a signal has to pass; 0 of a spool with underlap."""
+        return max(self.dead_band, 0.0)
+
     def opening(self, u: float) -> float:
-        """Opening y at a spool position u."""
+        """Opening y at a spool position u, of the edges that it opens."""
         return math.copysign(
             min(max((abs(u) - self.dead_band) / (1.0 - self.dead_band), 0.0), 1.0), u
         )
@@ -364,7 +378,8 @@ def _check_spool(spool: Spool | Valve, label: str) -> None:
         ComponentParameterError: One is invalid.
     """
     dead_band = spool.dead_band
-    hint = f": looks like percent, write {dead_band / 100:g}" if dead_band < 100 else ""
+    is_percent = 1 <= abs(dead_band) < 100
+    hint = f": looks like percent, write {dead_band / 100:g}" if is_percent else ""
     check_conditions(
         (
             spool.hysteresis >= 0.5,
@@ -378,9 +393,10 @@ def _check_spool(spool: Spool | Valve, label: str) -> None:
             f"full and neutral of {label} are both {spool.full:g}, give two",
         ),
         (
-            dead_band >= 1,
+            abs(dead_band) >= 1,
             "dead_band",
-            f"dead_band of {label} is {dead_band:g}, it must be below 1{hint}",
+            f"dead_band of {label} is {dead_band:g}, it must be "
+            f"{'below 1' if dead_band > 0 else 'above -1'}{hint}",
         ),
         (
             spool.rate > 0 and not spool.bandwidth,
