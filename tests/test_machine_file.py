@@ -71,7 +71,8 @@ TEXT = [
     ),
     case(
         "number without digits",
-        "four_bar.yaml:15: 'crank' of 'home' is '0x_', give a number in rad, as in 5 deg",
+        "four_bar.yaml:15: 'crank' of 'home' is '0x_', and 'x_' is no known unit, give a number "
+        "in rad, as in 5 deg",
         swap("  crank: 1.2", "  crank: 0x_"),
     ),
     case(

@@ -81,9 +81,7 @@ class _SchemaDefinitions:
         excluded: dict[str, list[dict[str, Any]]] = {}
         for first, second, _ in section.exclusive:
             for key in first:
-                excluded.setdefault(key, []).extend(
-                    [{"required": [x]} for x in second if x != key]
-                )
+                excluded.setdefault(key, []).extend(_given(x) for x in second if x != key)
         return {
             "type": ["object", "null"],
             "properties": {
@@ -91,7 +89,12 @@ class _SchemaDefinitions:
             },
             "additionalProperties": others or False,
             "required": required,
-            "dependentSchemas": {key: {"not": {"anyOf": x}} for key, x in excluded.items()},
+            "dependentSchemas": {
+                key: {"if": _given(key), "then": {"not": {"anyOf": x}}}
+                if is_partial
+                else {"not": {"anyOf": x}}
+                for key, x in excluded.items()
+            },
         }
 
     def _described(self, name: str, key: Key, is_partial: bool) -> dict[str, Any]:
@@ -151,6 +154,11 @@ class _SchemaDefinitions:
             case NumberKey():
                 return self._number(key)
         return {"enum": [*key.choices]} if key.choices else {"type": "string", "minLength": 1}
+
+
+def _given(key: str) -> dict[str, Any]:
+    """A schema of mappings that have a key, and do not remove it by an empty value."""
+    return {"required": [key], "properties": {key: {"not": {"type": "null"}}}}
 
 
 def _nullable(value: dict[str, Any]) -> dict[str, Any]:
