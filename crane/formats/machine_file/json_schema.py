@@ -120,8 +120,8 @@ class _SchemaDefinitions:
             bounds = {"exclusiveMinimum": 0}
         columns = getattr(key, "column_units", ())
         units = tuple(dict.fromkeys(columns or key.si_units(None, (0,))))
-        name = "_or_".join(["number", *(unit or "ratio" for unit in units if any(units))])
-        name = re.sub(r"\W", "_", name.replace("/", "_per_"))
+        name = "_or_".join(unit or "ratio" for unit in units)
+        name = "number_" + re.sub(r"\W", "_", name.replace("/", "_per_"))
         if name not in self.schemas:
             pattern = rf"^\s*{NUMBER_PATTERN}\s*(?:{'|'.join(map(_unit_pattern, units))})?\s*$"
             others = [x for unit in units if unit != QUANTITY_UNIT for x in accepted_units(unit)]
