@@ -212,7 +212,7 @@ def identify(
         float | None,
         number_option("Hz", "Passband of the filter; derived from the motion by default."),
     ] = None,
-    slow: Annotated[
+    min_speed: Annotated[
         list[str] | None,
         typer.Option(
             metavar="JOINT=VALUE",
@@ -242,7 +242,7 @@ def identify(
 
     window, terms, priors = parse_window(train), parse_terms(model.term), parse_priors(model.prior)
     loaded, trials = options.load(machine), parse_trials(tried)
-    slowest = parse_values("--slow", slow, joint_units(loaded, "/s"))
+    min_speeds = parse_values("--min-speed", min_speed, joint_units(loaded, "/s"))
     if priors is None:
         loaded = loaded.replace(estimation=replace(loaded.estimation, prior={}))
     if model.feasible:
@@ -262,7 +262,7 @@ def identify(
         as_number(bandwidth, "the bandwidth", "Hz", greater_than=5 / shortest)
     settings: dict[str, Any] = {
         "method": method, "prior": priors, "feasible": model.feasible, "terms": terms,
-        "bandwidth": bandwidth, "slow": slowest, "trust": trust,
+        "bandwidth": bandwidth, "min_speed": min_speeds, "trust": trust,
     }  # fmt: skip
     if trials:
         with progress_bar("cross-validating") as progress:
@@ -403,9 +403,10 @@ def circuit(
             raise InputError(f"--model {model} takes one recording, {len(recording)} are given")
     loaded = options.load(machine)
     check_name(joint, loaded.active, f"'{joint}' is not an active joint")
-    needs = required_channels(joint) if model == "orifices" else []
-    if model == "valve":
-        needs.append((f"voltage_{joint}",))
+    needs_by_model: dict[str, list[tuple[str, ...]]] = {
+        "orifices": required_channels(joint), "valve": [(f"voltage_{joint}",)], "friction": [],
+    }  # fmt: skip
+    needs = needs_by_model[model]
     runs = _read(recording, loaded, reading, needs)
     held_out = _read(validation or [], loaded, RecordingOptions(columns=reading.columns), needs)
     result: Result
@@ -413,9 +414,9 @@ def circuit(
     with status("identifying"):
         if model == "valve":
             result = crane.identification.identify_valve(loaded, runs[0], joint)
-        elif model == "friction":
+        if model == "friction":
             result = crane.identification.identify_cylinder_friction(loaded, runs[0], joint)
-        else:
+        if model == "orifices":
             result = crane.identification.identify_orifices(
                 loaded, runs, joint, method or "weak", period=period
             )
