@@ -59,7 +59,7 @@ hydraulics:
     X_ext: {flow: 36 l/min, meter_out: null, margin: 7 bar}
 sensors:
   X_lift: {zero: 3.3 mm, delay: 20 ms}
-identification: {bandwidth: 5 Hz, slow: {X_lift: 1 mm/s}}
+identification: {bandwidth: 5 Hz, min_speed: {X_lift: 1 mm/s}}
 tasks:
   via:
     via:
@@ -99,7 +99,7 @@ hydraulics:
     X_ext: {flow: 6e-4, meter_out: null, margin: 7e5}
 sensors:
   X_lift: {zero: 0.0033, delay: 0.02}
-identification: {bandwidth: 5, slow: {X_lift: 0.001}}
+identification: {bandwidth: 5, min_speed: {X_lift: 0.001}}
 tasks:
   via:
     via:
@@ -287,7 +287,10 @@ ERRORS = {
     "area_a: 14 cm2 m/rad": ("area_a: 14 cm2", "21: 'area_a' of cylinder of 'slew' is '14 cm2'"),
     "hysteresis: 1.3 %": ("hysteresis: 2 mm", "23: 'hysteresis' of valve of 'slew' is '2 mm'"),
     "zero: 3.3 mm": ("zero: 3.3 bar", "27: 'zero' of sensor 'X_lift' is '3.3 bar'"),
-    "slow: {X_lift: 1 mm/s": ("slow: {X_lift: 1 mm", "28: 'X_lift' of 'slow' is '1 mm'"),
+    "min_speed: {X_lift: 1 mm/s": (
+        "min_speed: {X_lift: 1 mm",
+        "28: 'X_lift' of 'min_speed' is '1 mm'",
+    ),
     "10 in,": ("10 deg,", "33: 'X_lift' of a via point of task 'via' is '10 deg'"),
     "3 mm/s, 1": ("3 mm, 1", "36: 'X_lift' of 'active' of task 'poly' is '3 mm'"),
     "2 s, 60 %": ("2 s, 60 s", "39: 'X_lift' of 'joystick' is '60 s'"),

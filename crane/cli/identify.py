@@ -80,18 +80,14 @@ class SignalOptions(OptionBlock):
     """Valve signals for calibration."""
 
     panel = "Options of valve signals (with --fit)"
-    duration: Annotated[
-        float,
-        number_option("s", "Duration of the signals."),
-    ] = 20.0
+    duration: Annotated[float, number_option("s", "Duration of the signals.")] = 20.0
     sensors: ComparedColumns = None
     rate: Annotated[
         float, typer.Option(help="Maximum rate of the signals, in spool strokes per second.")
     ] = 2.0
-    margin: Annotated[
-        float,
-        number_option("", "Fraction of a stroke kept free at both ends."),
-    ] = 0.1
+    margin: Annotated[float, number_option("", "Fraction of a stroke kept free at both ends.")] = (
+        0.1
+    )
 
     def arguments(self) -> dict[str, Any]:
         """Arguments of `crane.identification.excite_valves` by name."""
@@ -125,10 +121,7 @@ def excite(
             "limit, or with --fit of a column; may be repeated.",
         ),
     ] = None,
-    step: Annotated[
-        float,
-        number_option("s", "Interval of the written samples."),
-    ] = 0.01,
+    step: Annotated[float, number_option("s", "Interval of the written samples.")] = 0.01,
 ) -> None:
     """Design an excitation: a motion or valve signals.
 

@@ -249,13 +249,11 @@ class TimeOptions(OptionBlock):
 
     panel = "Recording options"
     since: Annotated[
-        float | None,
-        number_option("s", "Start of the part to read, in recorded time.", "--from"),
+        float | None, number_option("s", "Start of the part to read, in recorded time.", "--from")
     ] = None
-    until: Annotated[
-        float | None,
-        number_option("s", "End of the part to read.", "--until"),
-    ] = None
+    until: Annotated[float | None, number_option("s", "End of the part to read.", "--until")] = (
+        None
+    )
 
     @property
     def span(self) -> tuple[float, float]:

@@ -31,10 +31,7 @@ from crane.cli.terminal import status
 from crane.common.errors import CraneWarning, InputError
 from crane.common.result import Result
 
-ChartStep = Annotated[
-    float | None,
-    number_option("m", "Distance of grid points in m.", "--step"),
-]
+ChartStep = Annotated[float | None, number_option("m", "Distance of grid points in m.", "--step")]
 
 
 @command()
@@ -148,8 +145,7 @@ class RatingOptions(OptionBlock):
         ),
     ] = None
     slope: Annotated[
-        float,
-        number_option("deg", "Slope of the ground in the most unfavourable direction."),
+        float, number_option("deg", "Slope of the ground in the most unfavourable direction.")
     ] = 0.0
     friction: Annotated[
         bool,
@@ -271,8 +267,7 @@ def power(
         ),
     ] = None,
     moved_mass: Annotated[
-        float | None,
-        number_option("kg", "Mass that each run moves, for the work per kg."),
+        float | None, number_option("kg", "Mass that each run moves, for the work per kg.")
     ] = None,
 ) -> None:
     """Compute the power balance of a hydraulic run.

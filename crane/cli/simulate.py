@@ -58,13 +58,9 @@ ControllerName = Annotated[
     ),
 ]
 Duration = Annotated[
-    float | None,
-    number_option("s", "Duration; that of the task or path by default."),
+    float | None, number_option("s", "Duration; that of the task or path by default.")
 ]
-Step = Annotated[
-    float,
-    number_option("s", "Step of the recorded samples."),
-]
+Step = Annotated[float, number_option("s", "Step of the recorded samples.")]
 
 
 @command()
