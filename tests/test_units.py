@@ -259,6 +259,7 @@ def test_what_units_mean(text, unit, value):
         ("5 m)(m", "m2", "'m)(m' is no known unit"),
         ("5 __import__('os')", "m", "is no known unit"),
         ("5e99999 bar", "Pa", "give a number in Pa"),
+        ("5e999 bar", "Pa", "give a smaller number"),
         ("bar", "Pa", "give a number in Pa, as in 5 bar"),
         ("1_000 bar", "Pa", "give a number in Pa"),
         ("٣ bar", "Pa", "give a number in Pa"),
@@ -339,8 +340,12 @@ def test_a_pump_has_displacement_and_speed(tmp_path):
     assert again.hydraulics == other.hydraulics and data["speed"] == "2200 rpm"
     engine = "engine: {speed: 2200 rpm, torque: 300 Nm, inertia: 2 kg m2}"
     path.write_text(f"{head}{size}}}\n  {engine}\n")
-    assert crane.load(path).hydraulics == crane.load(path).hydraulics
     assert crane.load(path).hydraulics.supply == machine.hydraulics.supply
+    slower = crane.load(path, {"engine.speed": "1100 rpm"})  # the flow follows
+    assert slower.hydraulics.supply.flow == pytest.approx(45e-6 * 1100 / 60, rel=1e-15)
+    data = parse_yaml_file(write_machine(slower, tmp_path / "slower"))["hydraulics"]
+    assert data["supply"]["displacement"] == "45 cm3/rev" and "speed" not in data["supply"]
+    assert data["engine"]["speed"] == "1100 rpm"
     for rest, message in (
         (f"{size}}}", "pump.yaml:3: 'supply' has a displacement and no speed"),
         (f"{size}, flow: 1e-3}}", "'flow' stands beside 'displacement', keep one of them"),
@@ -400,6 +405,26 @@ def test_changes_locks_and_options_take_units(tmp_path):
     typed("simulate", "mini_forwarder", "--task", "lift", "--duration", "20 ms", "--step", "1 ms",
           "--load", "link7_tip=0,0,-0.01 kN", "--out", str(out))  # fmt: skip
     assert crane.Recording.read(out / "recording.csv").time[-1] == pytest.approx(0.02)
+
+
+def test_curves_and_their_files_have_units(tmp_path):
+    path = tmp_path / "valve.yaml"
+    (tmp_path / "flow.csv").write_text("u [%], flow [l/min]\n10, 0\n\n100, 20\n")
+    edge = "{valves: {X_ext: {type: orifice, margin: null, flow: null, meter_out: null, "
+    edge += "c1: [[10 %, 0], [1, 20 l/min/bar^0.5]], c4: 6 l/min/bar^0.5, "
+    edge += "c2: {flow: [[0.1, 0], [100 %, 20 l/min]], drop: 4 bar}, "
+    path.write_text(
+        f"extends: patu655\nhydraulics: {edge}c3: {{file: flow.csv, drop: 4 bar}}}}}}}}"
+    )
+    valve = crane.load(path).hydraulics.valves["X_ext"]
+    unit = 1 / 6e4 / math.sqrt(1e5)
+    expected = [20 * unit, 10 * unit, 10 * unit, 6 * unit]
+    assert [valve.c1, valve.c2, valve.c3, valve.c4] == pytest.approx(expected, rel=1e-14)
+    for edge in ("c1", "c2", "c3"):
+        assert valve.curves[edge].points == ((0.1, 0.0), (1.0, 1.0))
+    (tmp_path / "flow.csv").write_text("u [%], flow [bar]\n10, 0\n100, 20\n")
+    with pytest.raises(CraneError, match="flow.csv:2 has '10, 0', and 'bar' is a unit of something else"):
+        crane.load(path)
 
 
 def test_columns_in_any_unit(tmp_path):

@@ -214,7 +214,7 @@ def parse_numbers(texts: Sequence[str], message: str, units: Sequence[str]) -> l
     try:
         return [parse_number(text, units) for text in texts]
     except UnitError as error:
-        raise InputError(f"{message}: {error}") from None
+        raise InputError(f"{message}, {error}") from None
     except ValueError:
         raise InputError(message) from None
 

@@ -175,10 +175,17 @@ def parse_quantity(text: str, units: Sequence[str] = ("",)) -> WrittenNumber:
     for si_unit in units:
         size = Fraction(1) if not unit else unit_size(unit, si_unit)
         if size is not None:
-            return WrittenNumber(float(number * size), unit, size)
+            return WrittenNumber(_as_float(number * size), unit, size)
     is_known = _RATIO_PATTERN.fullmatch(unit) or unit == "%" or _dimension(unit)
     problem = f"'{unit}' is {'a unit of something else' if is_known else 'no known unit'}"
     raise UnitError(f"and {problem}, give a number{_unit_hint(units)}")
+
+
+def _as_float(number: Fraction) -> float:
+    try:
+        return float(number)
+    except OverflowError:
+        raise UnitError("give a smaller number") from None
 
 
 def _unit_hint(units: Sequence[str]) -> str:

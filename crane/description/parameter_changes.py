@@ -98,6 +98,7 @@ def apply_parameter_changes(spec: MachineSpec, changes: Mapping[str, float]) -> 
     """
     names, paths = parameters(spec), parameter_paths(spec)
     values = {name: _check_change(spec, names, name, changes[name]) for name in changes}
+    values = _flows_at_engine_speed(spec, values) | values
     payload_mass = values.pop(PAYLOAD_MASS, 0.0)
     sensor_changes = {x: value for x, value in values.items() if x.startswith(SENSOR_PREFIX)}
     new_values: dict[FieldPath, Any] = {}
@@ -123,6 +124,21 @@ def apply_parameter_changes(spec: MachineSpec, changes: Mapping[str, float]) -> 
         changed, sensors=MappingProxyType(with_sensor_parameters(spec.sensors, sensor_changes))
     )
     return _add_payload(changed, payload_mass) if payload_mass else changed
+
+
+def _flows_at_engine_speed(spec: MachineSpec, values: Mapping[str, float]) -> dict[str, float]:
+    """Flows of the pumps of which the file gives the displacement, at another engine speed."""
+    if "engine.speed" not in values or spec.hydraulics is None:
+        return {}
+    numbers, flows = spec.written_numbers, {}
+    for prefix, path in (
+        ("supply", ("supply",)),
+        *((f"supply.{name}", ("supplies", name)) for name in spec.hydraulics.supplies),
+    ):
+        size = numbers.get(("hydraulics", *path, "displacement"))
+        if size is not None and ("hydraulics", *path, "speed") not in numbers:
+            flows[f"{prefix}.flow"] = size.value * values["engine.speed"]
+    return flows
 
 
 def _check_change(

@@ -1,29 +1,24 @@
 """The section `hydraulics` of a machine file."""
 
-import csv
-import io
 import itertools
 import math
 import string
 import warnings
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-from crane.common.errors import CraneWarning, DescriptionError, InputError, suggest_names
-from crane.common.package_search import read_plain_file
+from crane.common.errors import CraneWarning, DescriptionError, suggest_names
 from crane.common.plausible_ranges import implausible_value_text
 from crane.description.circuit_schema import AREA_KEYS, BORE_KEYS, ORIFICE_KEYS, PUMP
 from crane.description.findings import FollowUpError, UnknownNames, error_recovery, report_error
+from crane.formats.machine_file.edge_curves import read_edge_curve
 from crane.formats.machine_file.structure_sections import TreeBuilder
 from crane.formats.machine_file.yaml_section import YamlSection
-from crane.formats.machine_file.yaml_text import MAX_FILE_SIZE
 from crane.hydraulics.circuit_elements import MAIN_PUMP, Supply
 from crane.hydraulics.components import (
     COUNTERBALANCE_KEYS,
     Cylinder,
-    OpeningCurve,
     Valve,
 )
 from crane.hydraulics.hydraulic_circuit import (
@@ -346,7 +341,7 @@ def _read_valve(joint: str, item: YamlSection) -> Valve:
         constants |= {"c1": inlet, "c2": outlet, "c3": outlet, "c4": inlet}
         edge_keys = edge_keys[len(ORIFICE_KEYS) :]
     for name in edge_keys:
-        curve = _read_curve(item, name)
+        curve = read_edge_curve(item, name)
         if curve is None:
             values[name] = item.number(name)
         else:
@@ -362,89 +357,3 @@ def _read_valve(joint: str, item: YamlSection) -> Valve:
         )
     valve: Valve = read_component(item, values, **constants)
     return valve
-
-
-def _read_curve(item: YamlSection, key: str) -> tuple[float, OpeningCurve] | None:
-    """A valve's edge: its coefficient when wide open, and its share over |u|.
-
-    `[[u, c], ...]`, or a mapping with `flow: [[u, Q], ...]` at a pressure `drop`,
-    c = Q / sqrt(drop), or `area: [[u, A], ...]`, c = discharge A sqrt(2 / density), or `file`, a
-    CSV with the columns u and flow (with `drop`), area or coefficient; or `coefficient` and
-    `shape`. None where it is a number.
-
-    Raises:
-        DescriptionError: With file and line.
-    """
-    value = item.raw_value(key)
-    if not isinstance(value, list | dict):
-        return None
-    try:
-        if isinstance(value, list):
-            return _normalize_curve(_read_pairs(item, key))
-        inner = item.section(key, f"'{key}' of {item.title}")
-        assert inner is not None
-        if "shape" in inner:
-            return inner.number("coefficient"), OpeningCurve(tuple(_read_pairs(inner, "shape")))
-        given_keys = [name for name in ("flow", "area", "file") if name in inner]
-        if len(given_keys) != 1:
-            raise InputError("give one of flow, area, file, or coefficient and shape")
-        quantity = given_keys[0]
-        if quantity == "file":
-            quantity, points = _read_csv_table(inner.file("file"))
-        else:
-            points = _read_pairs(inner, quantity)
-        return _normalize_curve([(u, x * _coefficient_factor(inner, quantity)) for u, x in points])
-    except InputError as error:
-        raise item.error_at(key, f"'{key}' of {item.title}: {error}") from None
-
-
-def _normalize_curve(points: Sequence[tuple[float, float]]) -> tuple[float, OpeningCurve]:
-    coefficient = max((value for _, value in points), default=0.0)
-    return coefficient, OpeningCurve(
-        tuple((u, value / coefficient if coefficient > 0 else value) for u, value in points)
-    )
-
-
-def _read_pairs(item: YamlSection, key: str) -> Sequence[tuple[float, float]]:
-    rows = item.rows(key)
-    if any(len(row) != 2 for row in rows):
-        raise InputError("give pairs [u, value]")
-    return tuple((u, value) for u, value in rows)
-
-
-def _read_csv_table(path: Path) -> tuple[str, Sequence[tuple[float, float]]]:
-    try:
-        rows = list(
-            csv.DictReader(
-                io.StringIO(read_plain_file(path, MAX_FILE_SIZE).decode("utf-8-sig"), newline=""),
-                skipinitialspace=True,
-            )
-        )
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path.name} cannot be read ({error}), give a CSV file") from None
-    names = [name for name in ("flow", "area", "coefficient") if rows and name in rows[0]]
-    if len(names) != 1 or "u" not in rows[0]:
-        raise InputError(
-            f"{path.name} has no columns u and flow, area or coefficient, name them in line 1"
-        )
-    points = []
-    for number, row in enumerate(rows, 2):
-        try:
-            pair = float(row["u"]), float(row[names[0]])
-        except (TypeError, ValueError):
-            pair = math.nan, math.nan
-        if not all(map(math.isfinite, pair)):
-            raise InputError(f"{path.name}:{number} has no two finite numbers, correct it")
-        points.append(pair)
-    return names[0], points
-
-
-def _coefficient_factor(section: YamlSection, quantity: str) -> float:
-    if quantity == "coefficient":
-        return 1.0
-    if quantity == "flow":
-        drop = section.number("drop")
-        if not drop > 0:
-            raise InputError("'drop' is 0, give the pressure drop that the flows were measured at")
-        return 1.0 / math.sqrt(drop)
-    return section.number("discharge") * math.sqrt(2.0 / section.number("density"))
