@@ -400,7 +400,7 @@ def test_changes_locks_and_options_take_units(tmp_path):
         done = typed("modes", "patu655", *arguments)
         assert done.returncode == 2 and message in done.stderr, done.stderr
     done = typed("simulate", "patu655", "--task", "reach", "--duration", "2 kg")
-    assert done.returncode == 2 and "'2 kg': and 'kg' is a unit of something else" in done.stderr
+    assert done.returncode == 2 and "'2 kg', and 'kg' is a unit of something else" in done.stderr
     out = tmp_path / "run"
     typed("simulate", "mini_forwarder", "--task", "lift", "--duration", "20 ms", "--step", "1 ms",
           "--load", "link7_tip=0,0,-0.01 kN", "--out", str(out))  # fmt: skip
@@ -423,7 +423,9 @@ def test_curves_and_their_files_have_units(tmp_path):
     for edge in ("c1", "c2", "c3"):
         assert valve.curves[edge].points == ((0.1, 0.0), (1.0, 1.0))
     (tmp_path / "flow.csv").write_text("u [%], flow [bar]\n10, 0\n100, 20\n")
-    with pytest.raises(CraneError, match="flow.csv:2 has '10, 0', and 'bar' is a unit of something else"):
+    with pytest.raises(
+        CraneError, match="flow.csv:2 has '10, 0', and 'bar' is a unit of something else"
+    ):
         crane.load(path)
 
 

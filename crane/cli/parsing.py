@@ -113,7 +113,7 @@ def parse_values(
     from crane.common.samples import as_number
 
     values = _parse_named(
-        option, texts, form, lambda name, value: parse_number(value or "", units_of(name))
+        option, texts, form, lambda name, value: _named_number(name, value or "", units_of)
     )
     return {name: as_number(value, f"{option} {name}", "") for name, value in values.items()}
 
@@ -125,6 +125,11 @@ def parse_configuration(option: str, text: str | None, units_of: UnitsOf) -> dic
         InputError: As `parse_values`.
     """
     return parse_values(option, text.split(",") if text else None, units_of, CONFIGURATION_FORM)
+
+
+def _named_number(name: str, text: str, units_of: UnitsOf) -> float:
+    """A plain number, of whatever it is, or one in a unit of what is named."""
+    return parse_number(text, units_of(name) if is_quantity(text) else ())
 
 
 def joint_units(machine: "crane.Machine", by_time: str = "") -> UnitsOf:
@@ -162,7 +167,7 @@ def number_option(unit: str, text: str, *names: str) -> Any:
         try:
             return parse_number(str(text), (unit,))
         except UnitError as error:
-            raise typer.BadParameter(f"{text!r}: {error}") from None
+            raise typer.BadParameter(f"{text!r}, {error}") from None
         except ValueError:
             raise typer.BadParameter(f"{text!r} is not a valid float.") from None
 
@@ -250,7 +255,7 @@ def parse_fits(texts: Sequence[str], units_of: UnitsOf) -> dict[str, object]:
             return None
         start, comma, bounds = text.partition(",")
         words = [start, *(bounds.split("~") if comma else ())]
-        numbers = [parse_number(word, units_of(name)) for word in words]
+        numbers = [_named_number(name, word, units_of) for word in words]
         if len(numbers) == 2:
             raise ValueError
         return tuple(numbers) if comma else numbers[0]
@@ -388,7 +393,8 @@ def _parse_varied(
 
 def _finite_numbers(text: str, words: list[str], form: str, units_of: UnitsOf) -> list[float]:
     message = f"--vary {text}: '{':'.join(words)}' are no numbers, give {form}"
-    numbers = parse_numbers(words, message, units_of(text.partition("=")[0]))
+    units = units_of(text.partition("=")[0]) if any(map(is_quantity, words)) else ()
+    numbers = parse_numbers(words, message, units)
     if not all(map(isfinite, numbers)):
         raise InputError(message)
     return numbers
