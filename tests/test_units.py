@@ -262,6 +262,8 @@ def test_what_units_mean(text, unit, value):
         ("5e999 bar", "Pa", "give a smaller number"),
         ("bar", "Pa", "give a number in Pa, as in 5 bar"),
         ("1_000 bar", "Pa", "give a number in Pa"),
+        ("200 Bar", "Pa", "'Bar' is no known unit, did you mean 'bar'?, give a number in Pa"),
+        ("5 KN", "N", "did you mean 'kN'?"),
         ("٣ bar", "Pa", "give a number in Pa"),
         ("1:0", "", "give a number without a unit"),
         ("5 " + "m" * 1000, "m", "give a number in m"),

@@ -178,6 +178,9 @@ def parse_quantity(text: str, units: Sequence[str] = ("",)) -> WrittenNumber:
             return WrittenNumber(_as_float(number * size), unit, size)
     is_known = _RATIO_PATTERN.fullmatch(unit) or unit == "%" or _dimension(unit)
     problem = f"'{unit}' is {'a unit of something else' if is_known else 'no known unit'}"
+    names = *COMMON_UNITS, *(si_unit for si_unit, _ in COMMON_UNITS.values()), *unit_names()
+    if not is_known and (meant := [name for name in names if name.lower() == unit.lower()]):
+        problem += f", did you mean '{meant[0]}'?"
     raise UnitError(f"and {problem}, give a number{_unit_hint(units)}")
 
 

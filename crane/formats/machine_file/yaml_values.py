@@ -7,7 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from crane.common.errors import DescriptionError, suggest_names
-from crane.common.unit_conversions import KeyPath, UnitError, WrittenNumber, parse_quantity
+from crane.common.unit_conversions import (
+    KeyPath,
+    UnitError,
+    WrittenNumber,
+    parse_quantity,
+)
 from crane.description.findings import UnknownNames, error_recovery, report_error
 from crane.description.key_types import (
     REQUIRED,
@@ -31,7 +36,7 @@ _BOOLEAN_WORDS = {"on": True, "yes": True, "true": True, "off": False, "no": Fal
 
 
 def as_float(value: Any) -> float:
-    """A value as a number, NaN where it is none; PyYAML reads 2e5 as text."""
+    """A value as a number, NaN where it is none; in quotes it is a text."""
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         return math.nan
     try:
@@ -239,26 +244,19 @@ class YamlValues:
         return spec.si_units(turns, position)
 
     def _read_number(self, key: str, value: Any, *position: int) -> float:
-        number = as_float(value)
-        if not math.isfinite(number) and isinstance(value, str) and "," not in value:
-            return self._read_quantity(key, value, position)
-        if math.isfinite(number):
-            self._data.written_numbers[key, *position] = WrittenNumber(number)
-            return number
-        hint = "give a number"
-        if isinstance(value, float):
-            hint = "give a finite number"
-        elif isinstance(value, str) and "," in value:
-            hint = "give a number with a decimal point"
-        raise self._value_error(key, format_value(value), hint)
-
-    def _read_quantity(self, key: str, text: str, position: tuple[int, ...]) -> float:
-        try:
-            quantity = parse_quantity(text, self.si_units(key, position))
-        except UnitError as error:
-            raise self._value_error(key, format_value(text), str(error)) from None
-        self._data.written_numbers[key, *position] = quantity
-        return quantity.value
+        written = WrittenNumber(as_float(value))
+        if isinstance(value, str) and "," in value:
+            raise self._value_error(key, format_value(value), "give a number with a decimal point")
+        if isinstance(value, str):
+            try:
+                written = parse_quantity(value, self.si_units(key, position))
+            except UnitError as error:
+                raise self._value_error(key, format_value(value), str(error)) from None
+        if not math.isfinite(written.value):
+            hint = f"give a {'finite ' if isinstance(value, float) else ''}number"
+            raise self._value_error(key, format_value(value), hint)
+        self._data.written_numbers[key, *position] = written
+        return written.value
 
     def boolean(self, key: str) -> bool:
         """True or false, as on and off, in quotes or without."""
