@@ -145,7 +145,8 @@ def test_a_written_machine_keeps_units_and_bits(file, tmp_path):
     changes = {"friction.X_lift.coulomb": 1234.5678901234567, "supply.pressure": "95 bar",
                "cylinder.X_lift.hose_a": 2e-4 / 3}  # fmt: skip
     machine = crane.load(file, changes)
-    written = write_machine(machine, tmp_path / "out")
+    written = write_machine(machine, tmp_path / "out", {"supply.pressure": "fitted ±1e4"})
+    assert "pressure: 95 bar  # 9.5e+06 in SI units, fitted ±1e4\n" in written.read_text()
     again = crane.load(written)
     read = parameters(read_machine_spec(written))
     assert machine.hydraulics == again.hydraulics

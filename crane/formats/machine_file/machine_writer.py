@@ -39,7 +39,7 @@ from crane.description.specification import LoopSpec, Task
 from crane.formats.machine_file.circuit_section import piston_areas
 from crane.formats.machine_file.force_sections import external_force_data, load_data
 from crane.formats.machine_file.machine_reader import estimation_data, read_machine_spec
-from crane.formats.machine_file.yaml_text import format_yaml, with_written_units
+from crane.formats.machine_file.yaml_text import format_yaml
 from crane.formats.urdf.urdf_writer import (
     compound_drive_factors,
     copy_shapes,
@@ -237,9 +237,7 @@ class MachineDraft:
             nonempty["hydraulics"] = {k: value for k, value in circuit.items() if k != "oil"}
         (folder / file).write_text(
             "".join(f"# {format_one_line(line)}\n" for line in self._header_notes)
-            + format_yaml(
-                with_written_units(nonempty, self._machine.written_numbers), self._line_notes
-            ),
+            + format_yaml(nonempty, self._line_notes, self._machine.written_numbers),
             encoding="utf-8",
         )
 

@@ -11,7 +11,7 @@ import yaml
 
 from crane.common.errors import DescriptionError, format_one_line
 from crane.common.package_search import read_plain_file
-from crane.common.unit_conversions import NUMBER_PATTERN, KeyPath, WrittenNumber
+from crane.common.unit_conversions import NUMBER_PATTERN, KeyPath, WrittenNumber, is_quantity
 from crane.description.findings import report_error
 
 MAX_FILE_SIZE = 2_000_000  # bytes of a file; parsing ten million takes a minute
@@ -32,17 +32,22 @@ def _represent_block_mapping(dumper: _MachineFileDumper, data: _BlockMapping) ->
 _MachineFileDumper.add_representer(_BlockMapping, _represent_block_mapping)
 
 
-def format_yaml(data: Mapping[str, Any], notes: Mapping[KeyPath, str] | None = None) -> str:
+def format_yaml(
+    data: Mapping[str, Any],
+    notes: Mapping[KeyPath, str],
+    written_numbers: Mapping[KeyPath, WrittenNumber],
+) -> str:
     """The text of a machine file.
 
     A number with a note stands in a line of its own, at whose end the note is a comment.
 
     Args:
-        data: What it says.
-        notes: By the way to a number.
+        data: What it says, numbers in SI units.
+        notes: By the way to a number; in SI units.
+        written_numbers: Numbers whose units are kept, see `written_numbers_by_path`.
     """
-    notes = notes or {}
-    block_data = _with_block_mappings(dict(data), (), {way[:-1] for way in notes})
+    in_units = with_written_units(dict(data), written_numbers)
+    block_data = _with_block_mappings(in_units, (), {way[:-1] for way in notes})
     text = str(
         yaml.dump(
             block_data, Dumper=_MachineFileDumper, sort_keys=False, allow_unicode=True, width=100,
@@ -55,13 +60,16 @@ def format_yaml(data: Mapping[str, Any], notes: Mapping[KeyPath, str] | None = N
     assert top is not None, "it was just written"
     for key_path, note in notes.items():
         node: Any = top
+        value: Any = data
         for key in key_path:
+            value = value[key]
             node = (
                 node.value[key]
                 if isinstance(key, int)
                 else next(value for name, value in node.value if name.value == key)
             )
-        lines[node.end_mark.line] += f"  # {format_one_line(note)}"
+        in_si = f"{value:.6g} in SI units, " if is_quantity(node.value) else ""
+        lines[node.end_mark.line] += f"  # {in_si}{format_one_line(note)}"
     return "\n".join(lines)
 
 

@@ -22,7 +22,7 @@ from crane.description.specification import Chain, MachineSpec
 from crane.dynamics.dynamics import Dynamics
 from crane.formats.machine_file.machine_reader import read_machine_spec, read_plain_data
 from crane.formats.machine_file.machine_writer import friction_data
-from crane.formats.machine_file.yaml_text import format_yaml, with_written_units
+from crane.formats.machine_file.yaml_text import format_yaml
 from crane.formats.machine_loading import load
 from crane.formats.parallel_robots import is_parallel_robot
 from crane.identification.mechanics.base_parameters import random_samples
@@ -237,7 +237,7 @@ def _machine_file_content(
         if not data.get(key):
             data.pop(key, None)
     notes = _uncertainty_notes(result, data)
-    return format_yaml(with_written_units(data, spec.written_numbers), notes), motor_urdfs
+    return format_yaml(data, notes, spec.written_numbers), motor_urdfs
 
 
 def _uncertainty_notes(result: Identification, data: Mapping[str, Any]) -> dict[KeyPath, str]:
