@@ -91,11 +91,11 @@ horsepower = 745.69987158227022 * watt = hp
 metric_horsepower = 75 * kilopond * meter / second = PS
 """
 NUMBER_PATTERN = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]{1,3})?"
-_QUANTITY_PATTERN = re.compile(rf"\s*({NUMBER_PATTERN})\s*(\S.*?)?\s*")
-_RATIO_PATTERN = re.compile(r":\s*([1-9][0-9]{0,8})")
+_QUANTITY_PATTERN = rf"\s*({NUMBER_PATTERN})\s*(\S.*?)?\s*"
+_RATIO_PATTERN = r":\s*([1-9][0-9]{0,8})"
 # names with exponents of one digit, so that no text takes long
 _FACTOR = r"(?:1(?=\s*/)|(?:[^\W\d_]+|\N{DEGREE SIGN})(?:\^?-?[0-9](?:\.[0-9])?|[²³])?)"
-_UNIT_PATTERN = re.compile(rf"[\s(]*{_FACTOR}(?:[\s()*/·]+{_FACTOR})*[\s)]*")
+_UNIT_PATTERN = rf"[\s(]*{_FACTOR}(?:[\s()*/·]+{_FACTOR})*[\s)]*"
 _MAX_LENGTH = 60  # characters of a number with its unit
 _MAX_DIGITS = 25  # more than tell any two float64 apart
 
@@ -144,7 +144,7 @@ def shortest_number(estimate: float, is_exact: Callable[[float], bool]) -> float
 
 def is_quantity(text: str) -> bool:
     """Whether a text is a number with a unit, whichever that is."""
-    match = _QUANTITY_PATTERN.fullmatch(text[: _MAX_LENGTH + 1])
+    match = re.fullmatch(_QUANTITY_PATTERN, text[: _MAX_LENGTH + 1])
     return match is not None and bool(match[2])
 
 
@@ -168,7 +168,7 @@ def parse_quantity(text: str, units: Sequence[str] = ("",)) -> WrittenNumber:
     Raises:
         UnitError: It is no number, its unit is not known or is one of something else.
     """
-    match = _QUANTITY_PATTERN.fullmatch(text[: _MAX_LENGTH + 1])
+    match = re.fullmatch(_QUANTITY_PATTERN, text[: _MAX_LENGTH + 1])
     if match is None or len(text) > _MAX_LENGTH:
         raise UnitError(f"give a number{_unit_hint(units)}")
     number, unit = Fraction(match[1]), match[2] or ""
@@ -176,7 +176,7 @@ def parse_quantity(text: str, units: Sequence[str] = ("",)) -> WrittenNumber:
         size = Fraction(1) if not unit else unit_size(unit, si_unit)
         if size is not None:
             return WrittenNumber(_as_float(number * size), unit, size)
-    is_known = _RATIO_PATTERN.fullmatch(unit) or unit == "%" or _dimension(unit)
+    is_known = re.fullmatch(_RATIO_PATTERN, unit) or unit == "%" or _dimension(unit)
     problem = f"'{unit}' is {'a unit of something else' if is_known else 'no known unit'}"
     names = *COMMON_UNITS, *(si_unit for si_unit, _ in COMMON_UNITS.values()), *unit_names()
     if not is_known and (meant := [name for name in names if name.lower() == unit.lower()]):
@@ -207,7 +207,7 @@ def unit_size(unit: str, si_unit: str) -> Fraction | None:
     if unit in COMMON_UNITS and COMMON_UNITS[unit][0] == si_unit:
         return COMMON_UNITS[unit][1]
     if not si_unit:
-        ratio = _RATIO_PATTERN.fullmatch(unit)
+        ratio = re.fullmatch(_RATIO_PATTERN, unit)
         return Fraction(1, int(ratio[1])) if ratio else None
     size, wanted = _dimension(unit), _dimension(si_unit)
     if size is None or wanted is None or size[1] != wanted[1]:
@@ -228,7 +228,7 @@ def _registry() -> Any:
 @cache
 def _dimension(unit: str) -> tuple[Fraction, Any] | None:
     """Size of a unit in base units, and its dimension; None of one that is not known."""
-    if not _UNIT_PATTERN.fullmatch(unit):
+    if not re.fullmatch(_UNIT_PATTERN, unit):
         return None
     text = re.sub(r"(?<=[^\W\d])\^?(-?[0-9](?:\.[0-9])?)", r"**(\1)", unit.replace("·", "*"))
     try:
