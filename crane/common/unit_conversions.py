@@ -195,8 +195,9 @@ def _unit_hint(units: Sequence[str]) -> str:
     """What a number may be in, with an example."""
     if not any(units):
         return " without a unit, as in 0.6, 60 % or 3:1"
-    examples = [f"5 {accepted_units(unit)[-1]}" for unit in units]
-    return f" in {' or '.join(units)}, as in {' or '.join(examples)}"
+    others = [accepted_units(unit)[-1] for unit in units if accepted_units(unit)[1:]]
+    example = f", as in {' or '.join(f'5 {unit}' for unit in others)}" if others else ""
+    return f" in {' or '.join(units)}{example}"
 
 
 @cache

@@ -11,7 +11,13 @@ from typing import Any
 from crane.common.errors import CraneWarning, DescriptionError, suggest_names
 from crane.common.plausible_ranges import implausible_value_text
 from crane.description.circuit_schema import AREA_KEYS, BORE_KEYS, ORIFICE_KEYS, PUMP
-from crane.description.findings import FollowUpError, UnknownNames, error_recovery, report_error
+from crane.description.findings import (
+    FollowUpError,
+    UnknownNames,
+    error_recovery,
+    raise_errors,
+    report_error,
+)
 from crane.formats.machine_file.edge_curves import read_edge_curve
 from crane.formats.machine_file.structure_sections import TreeBuilder
 from crane.formats.machine_file.yaml_section import YamlSection
@@ -291,7 +297,11 @@ def _pump_values(circuit: YamlSection, item: YamlSection) -> dict[str, Any]:
         return values
     _warn_about_unit(item, "displacement", displacement)
     if speed is None and (engine := circuit.section("engine")) is not None:
-        speed = engine.number("speed")
+        try:
+            with raise_errors():
+                speed = engine.number("speed")
+        except DescriptionError as error:  # which the section of the engine reports
+            raise FollowUpError(str(error)) from None
     if speed is None:
         raise item.error_at(
             "displacement",
