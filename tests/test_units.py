@@ -248,7 +248,7 @@ def test_what_units_mean(text, unit, value):
         (
             "5 N m",
             "N m/rad",
-            "'N m' is a unit of something else, give a number in N m/rad, as in 5 N m/rad",
+            "'N m' is a unit of something else, give a number in N m/rad",
         ),
         ("30 deg", "", "'deg' is a unit of something else, give a number without a unit"),
         ("3:1", "Pa", "':1' is a unit of something else, give a number in Pa, as in 5 bar"),

@@ -85,12 +85,14 @@ def parse_changes(
     """
     from crane.common.samples import as_number
 
-    def parse(name: str, value: str | None) -> float | str:
-        if is_quantity(value or ""):
-            return str(value)
-        return as_number(float(value or ""), f"{option} {name}", "")
+    def parse(_: str, value: str | None) -> float | str:
+        return str(value) if is_quantity(value or "") else float(value or "")
 
-    return _parse_named(option, texts, form, parse)
+    values = _parse_named(option, texts, form, parse)
+    return {
+        name: value if isinstance(value, str) else as_number(value, f"{option} {name}", "")
+        for name, value in values.items()
+    }
 
 
 def parse_values(
