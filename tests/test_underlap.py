@@ -38,6 +38,20 @@ def test_each_edge_opens_by_itself(tmp_path, u):
     assert drawn - returned == pytest.approx(q_a + q_b, rel=1e-12, abs=1e-18)
 
 
+@pytest.mark.parametrize("u", [-0.3, -0.04, 0.0, 0.02, 0.2])
+def test_curves_may_begin_before_the_middle(tmp_path, u):
+    """Straight curves from -U to 1 are the edges of the dead band -U."""
+    curves = {f"c{i}": [[-D, 0.0], [1.0, ORIFICE[f"c{i}"]]] for i in (1, 2, 3, 4)}
+    flows = []
+    for name, valve in (("curves", curves), ("underlap", {"dead_band": -D})):
+        (tmp_path / name).mkdir()
+        machine = rig(tmp_path / name, ORIFICE | valve, supply={"tank": TANK})
+        assert machine.hydraulics.valves["x"].is_underlapped
+        _, now = instant(machine, (6e6, 2.5e6), u)
+        flows.append([x.rate for x in now.flows if x.path in ("inlet", "outlet")])
+    np.testing.assert_allclose(*flows, rtol=1e-12, atol=1e-18)
+
+
 def test_in_the_middle_oil_leaks_from_the_supply_to_the_tank(tmp_path):
     """A piston at rest on equal edges: half of the pressure in each chamber, and the central flow
     2 c U / (1 + U) sqrt((p_S - p_T) / 2); all of its power is lost in the edges."""

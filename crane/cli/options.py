@@ -154,7 +154,8 @@ class ChangeOptions(OptionBlock):
         typer.Option(
             "--set",
             metavar="NAME=VALUE",
-            help="New value of a parameter, e.g. payload.mass=200; may be repeated.",
+            help="New value of a parameter, e.g. payload.mass=200 or supply.pressure=200bar; may "
+            "be repeated.",
         ),
     ] = None
 
@@ -171,7 +172,8 @@ class ParameterOptions(ChangeOptions):
         list[str] | None,
         typer.Option(
             metavar="JOINT=VALUE",
-            help="A joint to lock and its coordinate in m or rad; may be repeated.",
+            help="A joint to lock and its coordinate in m or rad or with a unit, e.g. slew=30deg; "
+            "may be repeated.",
         ),
     ] = None
 

@@ -23,12 +23,13 @@ COUNTERBALANCE_KEYS = ("counterbalance_a", "counterbalance_b")
 
 @dataclass(frozen=True)
 class OpeningCurve:
-    """Share of a flow coefficient over the spool stroke |u|: linear between points.
+    """Share of a flow coefficient over the spool stroke: linear between points.
 
-    Before the first and behind the last point the curve is constant.
+    Before the first and behind the last point the curve is constant. The stroke is that in the
+    direction in which the edge opens; an edge with points below 0 is open around the middle.
 
     Attributes:
-        points: Pairs of |u|, increasing from 0 to 1, and shares, at least 0.
+        points: Pairs of strokes, increasing from -1 or more to 1, and shares, at least 0.
     """
 
     points: tuple[tuple[float, float], ...]
@@ -37,9 +38,9 @@ class OpeningCurve:
         if len(self.points) < 2:
             raise InputError("a curve has two points at least, give pairs [u, value]")
         strokes = [u for u, _ in self.points]
-        if strokes[0] < 0 or strokes[-1] > 1:
+        if strokes[0] < -1 or strokes[-1] > 1:
             raise InputError(
-                f"a curve goes over the share of the spool's stroke, from 0 to 1, this one from "
+                f"a curve goes over the share of the spool's stroke, up to 1, this one from "
                 f"{strokes[0]:g} to {strokes[-1]:g}"
             )
         if any(after <= before for before, after in itertools.pairwise(strokes)):
@@ -49,8 +50,13 @@ class OpeningCurve:
         if not any(share for _, share in self.points):
             raise InputError("all values of a curve are 0, leave it out")
 
+    @property
+    def is_underlapped(self) -> bool:
+        """Whether the edge is open around the middle."""
+        return self.points[0][0] < 0
+
     def evaluate(self, u: Scalar) -> Scalar:
-        """Share at the stroke |u|, a float or a formula."""
+        """Share at the stroke u, a float or a formula."""
         share: Scalar = self.points[0][1]
         for (u0, share0), (u1, share1) in itertools.pairwise(self.points):
             share = share + ((share1 - share0) / (u1 - u0)) * (clip(u, u0, u1) - u0)
@@ -353,6 +359,12 @@ class Valve:
                 for key in ("centre", "regeneration", "float_from")
             )
         )
+
+    @property
+    def is_underlapped(self) -> bool:
+        """Whether edges are open around the middle."""
+        curves = any(curve.is_underlapped for curve in self.curves.values())
+        return curves or any(spool.dead_band < 0 for spool in self.spools.values())
 
     @property
     def spools(self) -> "dict[str, Valve | Spool]":

@@ -307,7 +307,9 @@ class ValveCylinderEquations:
         """Flow coefficient of an edge of a chamber that opens for spool positions of a sign."""
         if (curve := self.valve.curves.get(name)) is not None:
             u = self._spool_positions[-1 if side else 0]
-            stroke = clip(u if sign > 0 else -u, 0.0, 1.0)
+            stroke = clip(u if sign > 0 else -u, -1.0 if curve.is_underlapped else 0.0, 1.0)
+            if curve.is_underlapped:
+                return self._constants[name] * curve.evaluate(stroke)
             return self._constants[name] * where_positive(stroke, curve.evaluate(stroke), 0.0)
         return self._constants[name] * opening
 

@@ -96,7 +96,7 @@ class LinearizedDrive:
         moving = {
             x
             for x, i in zip(circuit.joints, self._active_indices, strict=True)
-            if v_a[i] or circuit.hydraulics.valves[x].dead_band < 0
+            if v_a[i] or circuit.hydraulics.valves[x].is_underlapped
         }
         initial_states = [
             self._joint_of_state[name] in moving
