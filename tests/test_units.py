@@ -170,6 +170,20 @@ def test_a_written_machine_keeps_units_and_bits(file, tmp_path):
     assert data["tasks"]["levers"]["joystick"]["X_lift"] == ["0 s", 0.0, "2 s", "60 %"]
 
 
+def test_a_note_is_of_the_parameter_itself(file, tmp_path):
+    """Beside an area or a flow, also where the file has a bore or a displacement."""
+    pump = "displacement: 45 cm3/rev, speed: 2200 rpm"
+    file.write_text(IN_UNITS.replace("flow: 99 l/min", f"flow: null, {pump}"), encoding="utf-8")
+    machine = crane.load(file, {"cylinder.X_lift.area_a": 8e-3, "valve.X_ext.c1": 8e-7})
+    names = "cylinder.X_lift.area_a", "supply.flow", "valve.X_ext.c1"
+    written = write_machine(machine, tmp_path / "out", dict.fromkeys(names, "fitted"))
+    text = written.read_text(encoding="utf-8")
+    for line in ("area_a: 0.008  # fitted", "flow: 0.00165  # fitted", "c1: 8.0e-07  # fitted"):
+        assert line in text
+    assert not any(key in text for key in ("bore", "displacement"))
+    assert crane.load(written).hydraulics == machine.hydraulics
+
+
 def test_units_stay_with_their_elements_where_others_are_locked(file, tmp_path):
     machine = crane.load(file, lock={"X_tilt": "246 mm"})
     data = parse_yaml_file(write_machine(machine, tmp_path / "out"))
