@@ -7,13 +7,13 @@ import typer
 
 import crane
 from crane.cli.command import app, command
+from crane.cli.option_units import number_option
 from crane.cli.options import (
     AssemblyOptions,
     MachineName,
     OutputFile,
     PackageOptions,
 )
-from crane.cli.parsing import number_option
 from crane.common.errors import InputError
 from crane.common.one_line_repr import format_count
 from crane.common.package_search import (

@@ -10,6 +10,7 @@ import typer
 
 import crane
 from crane.cli.command import OptionBlock, command, refuse_options
+from crane.cli.option_units import joint_units, number_option, parameter_units
 from crane.cli.options import (
     ComparedColumns,
     Fit,
@@ -29,9 +30,6 @@ from crane.cli.options import (
     Validation,
 )
 from crane.cli.parsing import (
-    joint_units,
-    number_option,
-    parameter_units,
     parse_fits,
     parse_names,
     parse_priors,

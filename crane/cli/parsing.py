@@ -4,11 +4,10 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
-
-import typer
+from typing import TYPE_CHECKING, TypeVar
 
 import crane
+from crane.cli.option_units import UnitsOf
 from crane.common.errors import InputError, check_name
 from crane.common.unit_conversions import UnitError, is_quantity, parse_number
 
@@ -26,8 +25,6 @@ _GRID_FORM, _RANGE_FORM = "NAME=start:stop:count", "NAME=low~high"
 _MAX_GRID_VALUES = 10_000  # of one parameter
 _MAX_SLEW_ANGLES = 8  # that a page has room for
 _Value = TypeVar("_Value")
-_METAVARS = {"s": "SECONDS", "Hz": "HZ", "m": "M", "kg": "KG", "deg": "DEG", "": "FRACTION"}
-UnitsOf = Callable[[str], Sequence[str]]  # SI units that a name may have
 
 
 def parse_names(text: str | None) -> list[str] | None:
@@ -134,48 +131,6 @@ def _named_number(name: str, text: str, units_of: UnitsOf) -> float:
     return parse_number(text, units_of(name) if is_quantity(text) else ())
 
 
-def joint_units(machine: "crane.Machine", by_time: str = "") -> UnitsOf:
-    """SI units of the coordinates of joints, or of their rates: both of what is no joint.
-
-    Args:
-        machine: The machine.
-        by_time: As "/s" for rates, "/s2" for accelerations.
-    """
-
-    def units_of(name: str) -> Sequence[str]:
-        units = [machine.unit(name)] if name in machine.joints else ["m", "rad"]
-        return [f"{unit}{by_time}" for unit in units]
-
-    return units_of
-
-
-def parameter_units(machine: "crane.Machine") -> UnitsOf:
-    """SI unit of each parameter."""
-    from crane.description.machine_parameters import parameter_unit
-
-    return lambda name: (parameter_unit(machine.tree, name),)
-
-
-def number_option(unit: str, text: str, *names: str) -> Any:
-    """An option whose value is a number in a unit, or with another one.
-
-    Args:
-        unit: The unit of a plain number.
-        text: Its help.
-        names: Its names, if not that of its parameter.
-    """
-
-    def parse(text: str | float) -> float:
-        try:
-            return parse_number(str(text), (unit,))
-        except UnitError as error:
-            raise typer.BadParameter(f"{text!r}, {error}") from None
-        except ValueError:
-            raise typer.BadParameter(f"{text!r} is not a valid float.") from None
-
-    return typer.Option(*names, metavar=_METAVARS[unit], parser=parse, help=text)
-
-
 def parse_arguments(texts: Sequence[str] | None) -> dict[str, str]:
     """Arguments of xacro files by name from NAME:=VALUE.
 
@@ -224,6 +179,19 @@ def parse_numbers(texts: Sequence[str], message: str, units: Sequence[str]) -> l
         raise InputError(f"{message}, {error}") from None
     except ValueError:
         raise InputError(message) from None
+
+
+def parse_gravity(text: str) -> tuple[float, ...]:
+    """Acceleration of gravity (3,) [m/s2] from X,Y,Z.
+
+    Raises:
+        InputError: The text has another form.
+    """
+    message = f"--gravity is '{text}', write X,Y,Z in m/s2, as 0,0,-1.62"
+    numbers = parse_numbers(text.split(","), message, ("m/s2",))
+    if len(numbers) != 3 or not all(map(isfinite, numbers)):
+        raise InputError(message)
+    return tuple(numbers)
 
 
 def parse_slew_angles(text: str) -> list[float]:

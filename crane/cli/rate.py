@@ -11,6 +11,7 @@ import typer
 
 import crane
 from crane.cli.command import OptionBlock, command, refuse_options
+from crane.cli.option_units import number_option
 from crane.cli.options import (
     Bucket,
     Configuration,
@@ -25,7 +26,7 @@ from crane.cli.options import (
     Seed,
     Task,
 )
-from crane.cli.parsing import number_option, parse_numbers, parse_slew_angles
+from crane.cli.parsing import parse_numbers, parse_slew_angles
 from crane.cli.show import active_coordinates
 from crane.cli.terminal import status
 from crane.common.errors import CraneWarning, InputError

@@ -12,6 +12,7 @@ import typer
 
 import crane
 from crane.cli.command import OptionBlock, command, refuse_options
+from crane.cli.option_units import joint_units, number_option, parameter_units
 from crane.cli.options import (
     ChangeOptions,
     Configuration,
@@ -26,9 +27,6 @@ from crane.cli.options import (
     Task,
 )
 from crane.cli.parsing import (
-    joint_units,
-    number_option,
-    parameter_units,
     parse_configuration,
     parse_grids,
     parse_load,

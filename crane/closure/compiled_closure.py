@@ -152,6 +152,7 @@ class CompiledClosure:
             equations.sign,
             equations.coupling_factors,
             equations.coupling_offsets,
+            equations.coupling_powers,
             structure.independent_rows,
             structure.redundant_rows,
             self._active_columns,

@@ -91,7 +91,7 @@ def complete_active_joints(
     """
     basis = null_space_basis(jacobian, equations.motion_scales, DEAD_CENTRE_TOLERANCE)
     names = equations.coordinates.names
-    is_coupled = (equations.coupling_factors != 0).any(axis=0)
+    is_coupled = equations.is_coupled.any(axis=0)
     driven = spec.active or specified_driven_joints(spec)
     undriven = specified_free_joints(spec)
     specified = tuple(dict.fromkeys((*driven, *undriven)))

@@ -57,8 +57,7 @@ class Machine(OneLineRepr):
         path: The machine file or URDF that it was read from.
         chains: Its open sub-chains.
         tree: Its links and joints, all sub-chains connected.
-        model: Pinocchio's model of the spanning tree, depth-first; nq = nv without floating bases,
-            see `coordinates`.
+        model: Pinocchio's model of the tree, depth-first; for nq and nv see `coordinates`.
         closure: Its loops.
         active: Names of the active joints, in the order of q_A.
         lower: (n,) lower limits of the active joints [m], [rad].
@@ -131,15 +130,25 @@ class Machine(OneLineRepr):
             format_count(len(self.active), "degree of freedom", "degrees of freedom"),
             format_count(len(self.joints), "joint"),
             format_count(len(self.closure.equations.loops), "loop"),
-            *["hydraulic"] * (self.hydraulics is not None),
-            *[f"{len(self.free)} free"] * bool(self.free),
-        ]
+            *["hydraulic"] * bool(self.hydraulics), *[f"{len(self.free)} free"] * bool(self.free),
+        ]  # fmt: skip
         return f"Machine({', '.join(words)})"
 
     @property
     def home(self) -> Array:
         """(nv,) closed home configuration."""
         return self.closure.home
+
+    @property
+    def gravity(self) -> tuple[float, ...]:
+        """(3,) acceleration of gravity in the axes of the world [m/s2]."""
+        return tuple(self.model.gravity.linear.tolist())
+
+    @property
+    def up_direction(self) -> Array:
+        """Unit vector (3,) against gravity; z without gravity."""
+        length = float(np.linalg.norm(self.gravity))
+        return -np.array(self.gravity) / length if length else np.array([0.0, 0.0, 1.0])
 
     @property
     def has_traceable_forces(self) -> bool:
@@ -161,25 +170,17 @@ class Machine(OneLineRepr):
         `free`.
         """
         driven = {
-            *self.free,
-            *self.chosen_joints.get("active", ()),
-            *self.control,
+            *self.free, *self.chosen_joints.get("active", ()), *self.control,
             *(self.hydraulics.joints if self.hydraulics else ()),
-        }
+        }  # fmt: skip
         driven |= {joint for motor in self.explicit_drives for joint in motor.factors}
-        efforts = self.model.effortLimit[self.closure.active]
-        return tuple(
-            joint
-            for joint, effort in zip(self.active, efforts, strict=True)
-            if joint not in driven and not (np.isfinite(effort) and effort > 0)
-        )
+        efforts = zip(self.active, self.model.effortLimit[self.closure.active], strict=True)
+        return tuple(x for x, effort in efforts if x not in driven and not 0 < effort < np.inf)
 
     @cached_property
     def drives(self) -> tuple[Drive, ...]:
         """The drives of the machine: those of the file, or one along each driven active joint."""
-        return self.explicit_drives or tuple(
-            Drive(joint, {joint: 1.0}) for joint in self.driven_joints
-        )
+        return self.explicit_drives or tuple(Drive(x, {x: 1.0}) for x in self.driven_joints)
 
     @property
     def driven_joints(self) -> tuple[str, ...]:
@@ -279,9 +280,8 @@ class Machine(OneLineRepr):
         outside = (q_a < self.lower - slack) | (q_a > self.upper + slack)
         if outside.any():
             index = tuple(int(i) for i in np.argwhere(outside)[0])
-            joint = index[-1]
+            joint, name = index[-1], self.active[index[-1]]
             sample = f" in sample {index[0]}" if q_a.ndim == 2 else ""
-            name = self.active[joint]
             place = self.tree.joints[name].limits.source_location
             raise LimitError(
                 f"{label}: {name} = {q_a[index]:.6g}{sample} is outside of its limits "

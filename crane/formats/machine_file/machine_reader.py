@@ -28,6 +28,7 @@ from crane.description.sensors import (
 )
 from crane.description.specification import (
     ATTITUDE_COORDINATES,
+    STANDARD_GRAVITY,
     TIP_COORDINATES,
     Chain,
     EstimationSettings,
@@ -122,6 +123,7 @@ def _read_robot(path: Path) -> MachineSpec:
         tip=tree.single_leaf_link() if urdf.tip is None else urdf.tip,
         couplings=urdf.couplings,
         source_locations=locations,
+        gravity=urdf.gravity or STANDARD_GRAVITY,
     )
 
 
@@ -137,7 +139,7 @@ def read_plain_data(path: Path) -> dict[str, Any]:
 def _read_machine(path: Path) -> MachineSpec:
     top = YamlSection.read(path, MACHINE)
     name, source = top.text("name"), top.text("source")
-    chains, tree, friction, couplings, springs = read_chains(top, path)
+    chains, tree, friction, couplings, springs, gravity = read_chains(top, path)
     top.turns |= dict.fromkeys(TIP_COORDINATES, False)
     top.turns |= {x: True for group in ATTITUDE_COORDINATES for x in group}
     top.turns |= {name: joint.kind != "prismatic" for name, joint in tree.joints.items()}
@@ -206,6 +208,7 @@ def _read_machine(path: Path) -> MachineSpec:
         external_forces,
         _read_or_default(_read_supports, (), top, tree, external_forces),
         _read_or_default(_read_pins, {}, top, tree, loops),
+        gravity,
     )
     return dataclasses.replace(spec, written_numbers=top.written_numbers())
 

@@ -16,6 +16,7 @@ from crane.common.samples import Array
 from crane.common.unit_conversions import KeyPath
 from crane.description.force_elements import Friction
 from crane.description.kinematic_tree import inertia_problem
+from crane.description.machine_parameters import GRAVITY_PREFIX
 from crane.description.machine_schema import END_STOP, FORCE, GAS_SPRING, LOOP, ROPE
 from crane.description.parameter_changes import lock_joints
 from crane.description.specification import Chain, MachineSpec
@@ -126,7 +127,8 @@ def check_rewritable(machine: Machine) -> None:
     """Check that the files of a machine can be written with other parameters.
 
     Raises:
-        InputError: The format is not supported, or the machine has parameter changes.
+        InputError: The format is not supported, or the machine has parameter changes other than
+            its gravity.
     """
     if any(chain.urdf.suffix.lower() != ".urdf" for chain in machine.chains) or (
         not (machine.path.suffix.lower() == ".urdf") and is_parallel_robot(machine.path)
@@ -135,7 +137,7 @@ def check_rewritable(machine: Machine) -> None:
             f"{machine.path.name}: an identified machine needs a machine file or URDF, make "
             f"one: crane convert {machine.command_line_arguments} FOLDER"
         )
-    if machine.parameter_changes:
+    if not all(name.startswith(GRAVITY_PREFIX) for name in machine.parameter_changes):
         raise InputError(
             f"'{machine.name}' was loaded with parameter changes, identify it as its files "
             "describe it"
@@ -194,6 +196,8 @@ def _machine_file_content(
             data["tip"] = machine.tip
     else:
         data = read_plain_data(machine.path)
+    if machine.gravity != spec.gravity:
+        data["gravity"] = list(machine.gravity)
     data["source"] = f"{origin_text}; else {machine.source or machine.path.name}"
     for chain in data["chains"]:
         chain["urdf"] = names[chain["name"]]
