@@ -238,7 +238,7 @@ def _assemble_machine(
     )
     _SPEC_BEFORE_CHANGES[closure] = spec_before_changes
     spec, model = replace_infeasible_inertias(spec, model, closure)
-    check_masses(spec, model, closure)
+    held = [closure.active_names[i] for i in check_masses(spec, model, closure)]
     check_frame_elements(spec, closure)
     coordinates = closure.equations.coordinates
     lower, upper = coordinates.lower, coordinates.upper
@@ -272,7 +272,7 @@ def _assemble_machine(
         parameter_changes=MappingProxyType(
             {name: float(value) for name, value in changes.items()}
         ),
-        free=select_free_joints(spec, closure.active_names),
+        free=select_free_joints(spec, closure.active_names, held),
         external_forces=(),
         supports=spec.supports,
         pin_capacities=MappingProxyType(dict(spec.pin_capacities)),

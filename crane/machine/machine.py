@@ -42,13 +42,14 @@ from crane.description.sensors import Sensor
 from crane.description.specification import Chain, Drive, EstimationSettings, PIGains, Task
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.machine.machine_checks import check_force_elements, check_limited
+from crane.machine.massless_motions import MassProperties
 from crane.machine.payload import Payload
 
 _LIMIT_TOLERANCE = 1e-9  # scaled distance beyond a limit that counts as on it
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Machine(OneLineRepr):
+class Machine(MassProperties, OneLineRepr):
     """A machine with closed kinematic chains, assembled and closed.
 
     Attributes:
@@ -206,8 +207,7 @@ class Machine(OneLineRepr):
     @cached_property
     def load_name(self) -> str:
         """Argument of `crane.load` for this machine: the bundled name, or the path."""
-        known_as = self.path.stem
-        bundle = bundled_machines()
+        known_as, bundle = self.path.stem, bundled_machines()
         named = bundle if known_as in bundle else example_robots()
         return known_as if named.get(known_as) == self.path else str(self.path)
 
