@@ -1,4 +1,4 @@
-"""Elements of MJCF files that are written: tendons, placements, inertias, polynomials."""
+"""Elements of written MJCF: placements, inertias, tendons and coefficients of couplings."""
 
 import warnings
 from collections.abc import Mapping
@@ -11,11 +11,11 @@ from crane.common.errors import CraneWarning, InputError
 from crane.description.specification import Coupling
 from crane.formats.xml_file import format_numbers
 
-_MIN_MOMENT = 1e-14  # [kg m2] smallest moment of inertia that MuJoCo accepts
 _ROUNDING_TOLERANCE = 1e-9  # relative to the largest moment
+_MIN_MOMENT = 1e-14  # [kg m2] smallest moment of inertia that MuJoCo accepts
 
 
-def polynomial_of_coupling(coupling: Coupling) -> tuple[list[str], list[float]]:
+def solve_polynomial(coupling: Coupling) -> tuple[list[str], list[float]]:
     """Return follower and leader of a coupling with powers, and its five coefficients.
 
     Raises:

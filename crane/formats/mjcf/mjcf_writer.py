@@ -18,7 +18,7 @@ from crane.formats.mjcf.mjcf_elements import (
     add_inertial,
     add_tendon,
     placement_attributes,
-    polynomial_of_coupling,
+    solve_polynomial,
 )
 from crane.formats.urdf.urdf_writer import (
     format_document,
@@ -370,7 +370,7 @@ class _MjcfWriter:
         coefficients = [offset, *(derivatives or [0.0]), 0, 0, 0]
         tag = "joint"
         if coupling.powers:
-            joints, coefficients = polynomial_of_coupling(coupling)
+            joints, coefficients = solve_polynomial(coupling)
         if len(joints) > 2:
             tag, coefficients = "tendon", [coupling.offset, 0, 0, 0, 0]
             joints = [add_fixed_tendon(tendons, coupling.name, coupling.factors)]
