@@ -9,10 +9,10 @@ from crane.cli.command import command
 from crane.cli.options import (
     Frame,
     MachineName,
-    OutputFolder,
     ParallelOptions,
     ParameterOptions,
     Requirements,
+    ResumableFolder,
     Rule,
     Seed,
     Tasks,
@@ -27,7 +27,7 @@ def study(
     machine: MachineName,
     options: ParameterOptions,
     parallel: ParallelOptions,
-    output: OutputFolder,
+    output: ResumableFolder,
     vary: Annotated[
         list[str],
         typer.Option(
@@ -53,11 +53,12 @@ def study(
 ) -> None:
     """Compute measures of variants, on a grid or at random."""
     axes = parse_grids(vary) if draws is None else parse_ranges(vary)
-    with progress_bar("computing variants") as progress:
+    loaded = options.load(machine)
+    with output.checkpoint() as checkpoint, progress_bar("computing variants") as progress:
         result = crane.study(
-            options.load(machine), axes, task, measure, require=require or (),
+            loaded, axes, task, measure, require=require or (),
             user_measures=measures, frame=frame, rule=rule, draws=draws, seed=seed,
-            progress=progress, **parallel.arguments(),
+            checkpoint=checkpoint, progress=progress, **parallel.arguments(),
         )  # fmt: skip
     output.write(result)
 
@@ -67,7 +68,7 @@ def design(
     machine: MachineName,
     options: ParameterOptions,
     parallel: ParallelOptions,
-    output: OutputFolder,
+    output: ResumableFolder,
     vary: Annotated[
         list[str],
         typer.Option(metavar="NAME=LOW~HIGH", help="A parameter and its range; may be repeated."),
@@ -93,10 +94,11 @@ def design(
 ) -> None:
     """Optimize parameters for objectives and constraints."""
     loaded = options.load(machine)
-    with progress_bar("searching") as progress:
+    with output.checkpoint() as checkpoint, progress_bar("searching") as progress:
         result = crane.design(
             loaded, parse_ranges(vary), minimise=minimise or (), maximise=maximise or (),
             require=require or (), measures=measures, frame=frame, rule=rule, tasks=task,
-            starts=starts, points=points, seed=seed, progress=progress, **parallel.arguments(),
+            starts=starts, points=points, seed=seed, checkpoint=checkpoint, progress=progress,
+            **parallel.arguments(),
         )  # fmt: skip
     output.write(result)

@@ -18,6 +18,7 @@ from crane.cli.options import (
     Method,
     OptionalFit,
     OptionalOutputFolder,
+    OptionalResumableFolder,
     OutputFolder,
     ParameterOptions,
     RecordingFile,
@@ -423,7 +424,7 @@ def calibrate(
     recording: RecordingFiles,
     options: ParameterOptions,
     reading: RecordingOptions,
-    output: OptionalOutputFolder,
+    output: OptionalResumableFolder,
     fit: Fit,
     train: TrainingWindow = None,
     validation: Validation = None,
@@ -437,10 +438,10 @@ def calibrate(
     paths, held_out = (
         [recording_file(x) for x in given or ()] for given in (recording, validation)
     )
-    with progress_bar("simulating") as progress:
+    with output.checkpoint() as checkpoint, progress_bar("simulating") as progress:
         result = crane.calibrate(
             loaded, paths, fits, train=window, validation=held_out,
             columns=reading.columns, span=reading.span, sensors=parse_names(sensors),
-            progress=progress,
+            checkpoint=checkpoint, progress=progress,
         )  # fmt: skip
     output.write(result, f"; see {output.out}/report.html")

@@ -115,6 +115,10 @@ class SimulationError(CraneError):
     recording: Any = None
 
 
+class LostWorkError(CraneError):
+    """Processes of a computation ended before their time; what is finished is kept if asked."""
+
+
 class OutputError(CraneError):
     """A result cannot be written to the requested path."""
 

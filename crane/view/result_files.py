@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from crane.common.atomic_output import check_folder_is_writable, replace_folder
+from crane.common.checkpoint import UNFINISHED
 from crane.common.errors import CraneWarning, InputError
 from crane.common.result import Result
 from crane.formats.machine_file.machine_writer import write_machine
@@ -311,7 +312,7 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         documents={REPORT: "page.calibration_page.write_calibration_report"},
         more=_write_calibrated_machine,
         more_files=(_MACHINE,),
-        stale=lambda result, folder: _machine_files(result.machine, folder),
+        stale=lambda result, folder: (*_machine_files(result.machine, folder), UNFINISHED),
     ),
     "Capacity": ResultFiles(
         summary="capacity.md",
@@ -349,6 +350,7 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         figures={"design.png": "study_figures.design_figure"},
         more=_write_design,
         more_files=("before.png", "after.png", _MACHINE),
+        stale=lambda *_: (UNFINISHED,),
     ),
     "Excitation": ResultFiles(
         tables={"reference.csv": "to_csv", "coefficients.yaml": "to_yaml"},
@@ -412,7 +414,9 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         figures={"signals.png": "identification_figures.signals_figure"},
     ),
     "Study": ResultFiles(
-        tables={"study.csv": "to_csv"}, figures={"study.png": "study_figures.study_figure"}
+        tables={"study.csv": "to_csv"},
+        figures={"study.png": "study_figures.study_figure"},
+        stale=lambda *_: (UNFINISHED,),
     ),
     "ToolForce": ResultFiles(
         summary="tool_force.md",
