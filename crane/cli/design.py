@@ -12,13 +12,13 @@ from crane.cli.options import (
     ParallelOptions,
     ParameterOptions,
     Requirements,
-    ResumableFolder,
     Rule,
     Seed,
     Tasks,
     UserMeasures,
 )
 from crane.cli.parsing import parse_grids, parse_ranges
+from crane.cli.resumable_output import ResumableFolder
 from crane.cli.terminal import progress_bar
 
 

@@ -18,7 +18,6 @@ from crane.cli.options import (
     Method,
     OptionalFit,
     OptionalOutputFolder,
-    OptionalResumableFolder,
     OutputFolder,
     ParameterOptions,
     RecordingFile,
@@ -38,6 +37,7 @@ from crane.cli.parsing import (
     parse_values,
     parse_window,
 )
+from crane.cli.resumable_output import OptionalResumableFolder
 from crane.cli.terminal import progress_bar, status
 from crane.common.errors import CraneWarning, InputError, RecordingError, check_name
 from crane.common.result import Result

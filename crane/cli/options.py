@@ -1,8 +1,6 @@
 """Arguments and options that several commands share, each declared once."""
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
@@ -11,12 +9,12 @@ from typing import Annotated, Any
 import typer
 
 import crane
-from crane.cli.command import OptionBlock, refuse_options
+from crane.cli.command import OptionBlock
 from crane.cli.parsing import parse_arguments, parse_names, parse_values
-from crane.cli.terminal import print_message, status
+from crane.cli.terminal import status
 from crane.common.atomic_output import check_file_is_writable, check_folder_is_writable
 from crane.common.checkpoint import UNFINISHED
-from crane.common.errors import LostWorkError, OutputError
+from crane.common.errors import OutputError
 from crane.common.result import Result
 
 # Arguments and options of several commands that are not part of a block.
@@ -373,50 +371,6 @@ class OutputFolder(OptionalOutputFolder):
             help="Folder of the results; named like the command by default.",
         ),
     ] = Path()
-
-
-@dataclass(frozen=True, kw_only=True)
-class OptionalResumableFolder(OptionalOutputFolder):
-    """The folder of a result, none by default, with what is finished until it is complete."""
-
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the unfinished result in the folder.")
-    ] = False
-
-    def check(self) -> None:
-        """Raise an error if the folder cannot be written, or holds an unfinished result."""
-        if self.out is None:
-            refuse_options({"--resume": self.resume}, "needs the folder, add --out FOLDER")
-        elif not (self.out / UNFINISHED).is_file():
-            super().check()
-        elif self.resume or self.force:
-            check_folder_is_writable(self.out)
-        else:
-            raise OutputError(
-                f"{self.out}: holds an unfinished result, add --resume to go on with it, or "
-                "--force to begin anew"
-            )
-
-    @contextmanager
-    def checkpoint(self) -> Iterator[Path | None]:
-        """Context of the file of what is finished; says that it is kept if the block is ended."""
-        if self.out is None:
-            yield None
-            return
-        file = self.out / UNFINISHED
-        if not self.resume:
-            file.unlink(missing_ok=True)
-        try:
-            yield file
-        except (KeyboardInterrupt, LostWorkError):
-            if file.is_file():
-                print_message(f"what is finished is kept in {file}: add --resume to go on")
-            raise
-
-
-@dataclass(frozen=True, kw_only=True)
-class ResumableFolder(OptionalResumableFolder, OutputFolder):
-    """The folder of a result, with what is finished until it is complete."""
 
 
 @dataclass(frozen=True, kw_only=True)

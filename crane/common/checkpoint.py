@@ -123,12 +123,11 @@ class Checkpoint:
 
     def __exit__(self, kind: type | None, error: BaseException | None, _: object) -> None:
         would_repeat = isinstance(error, CraneError) and not isinstance(error, _PASSING_ERRORS)
-        if would_repeat or not self._has_rows:
-            self._path.unlink(missing_ok=True)
-            for folder in self._missing_folders:
-                with suppress(OSError):  # something else is in it
+        with self._file, suppress(OSError):  # or something else is in a folder
+            if would_repeat or not self._has_rows:
+                self._path.unlink()
+                for folder in self._missing_folders:
                     folder.rmdir()
-        self._file.close()
 
     def _output_error(self, error: OSError) -> OutputError:
         reason = error.strerror or str(error)

@@ -92,9 +92,9 @@ def write_entry(name: str, content: bytes) -> None:
     """Write a cache entry, if possible, in place of whatever has its name."""
     path = cache_folder() / name
     with suppress(OSError, OutputError):
-        for folder in reversed(path.parents):  # none that others may write, whatever the umask
-            if not folder.exists():
-                folder.mkdir(mode=0o700, exist_ok=True)
+        missing = [folder for folder in path.parents if not folder.exists()]
+        for folder in reversed(missing):  # none that others may write, whatever the umask
+            folder.mkdir(mode=0o700, exist_ok=True)
         if not _is_private(path.parent):
             return
         data = _content_digest(name, content) + content

@@ -143,7 +143,7 @@ def check_process_count(count: int) -> int:
 
 
 @dataclass(frozen=True)
-class KeptResults(Generic[R]):
+class StoredResults(Generic[R]):
     """Results of jobs as rows of a checkpoint.
 
     Attributes:
@@ -181,7 +181,7 @@ def compute_jobs(
     processes: int,
     scheduler: str | None,
     report: Callable[[int], object],
-    kept: KeptResults[R] | None = None,
+    kept: StoredResults[R] | None = None,
 ) -> list[R]:
     """Return the results of jobs.
 

@@ -51,7 +51,7 @@ from crane.studies.optimization.variant_measures import (
     load_positions,
 )
 from crane.studies.parallel_jobs import (
-    KeptResults,
+    StoredResults,
     check_process_count,
     compute_jobs,
     machine_from_files,
@@ -168,18 +168,13 @@ def study(
     options = MeasureOptions(frame, find_rule(rule), tasks, transferable_measures(user_measures))
     if not set(selected_measures) & set(task_measure_units):
         tasks = ()
+    job = StudyJob(
+        name, dict(base_machine.parameter_changes), dict(base_machine.locked_joints), tasks,
+        not set(selected_measures) <= set(task_measure_units), expressions, tuple(require), options,
+    )  # fmt: skip
     jobs = [
-        StudyJob(
-            name,
-            {**base_machine.parameter_changes, **dict(zip(vary, row.tolist(), strict=True))},
-            dict(base_machine.locked_joints),
-            tasks,
-            not set(selected_measures) <= set(task_measure_units),
-            expressions,
-            tuple(require),
-            options,
-        )
-        for row in values
+        job._replace(changes=job.changes | dict(zip(vary, row, strict=True)))
+        for row in values.tolist()
     ]
     measures = tuple(dict.fromkeys((*(measures or ()), *selected_measures)))
     available |= {x: PLAIN_MEASURES.get(x, "") for x in expressions}
@@ -192,7 +187,7 @@ def study(
     }  # fmt: skip
     units |= {column: available[measure] for column, measure in column_measures.items()}
     with _kept_rows(
-        checkpoint, base_machine, (jobs[0], values, measure_source(user_measures)),
+        checkpoint, base_machine, (job, values, measure_source(user_measures)),
         [*vary, *column_measures], units,
     ) as kept:  # fmt: skip
         rows = compute_jobs(
@@ -221,7 +216,7 @@ def _kept_rows(
     settings: tuple[StudyJob, Array, object],
     columns: Sequence[str],
     units: Mapping[str, str],
-) -> "Iterator[KeptResults[_VariantRow] | None]":
+) -> "Iterator[StoredResults[_VariantRow] | None]":
     """Context of the rows of a study in a checkpoint, if there is one; see `Study.to_csv`."""
     if checkpoint is None:
         yield None
@@ -243,7 +238,7 @@ def _kept_rows(
         count,
     ) as table:
         keys = [tuple(map(repr, row)) for row in values.tolist()]
-        yield KeptResults(table, keys, to_cells, from_cells)
+        yield StoredResults(table, keys, to_cells, from_cells)
 
 
 def measure_variant(study_job: StudyJob) -> _VariantRow:

@@ -43,7 +43,7 @@ class WorkerPool(Generic[J, R]):
         self._waiting, self._tries = deque(jobs), Counter[int]()
         self._lost: dict[int, str] = {}  # causes by index of jobs that are given up
         self._deaths = 0  # since a job was finished
-        self._workers = [_Worker(function) for _ in range(min(processes, len(jobs)))]
+        self._workers = [_WorkerProcess(function) for _ in range(min(processes, len(jobs)))]
 
     def results(self) -> Iterator[tuple[int, R]]:
         """Yield indices and results as jobs finish.
@@ -63,7 +63,7 @@ class WorkerPool(Generic[J, R]):
                 "fewer processes"
             )
 
-    def _take_answer(self, worker: "_Worker") -> Iterator[tuple[int, R]]:
+    def _take_answer(self, worker: "_WorkerProcess") -> Iterator[tuple[int, R]]:
         """Yield the result of a worker, if it has one, and let it begin the next job."""
         index, worker.job = worker.job, None
         try:
@@ -81,7 +81,7 @@ class WorkerPool(Generic[J, R]):
             next_index = self._waiting.popleft()
             worker.begin(next_index, self._jobs[next_index])
 
-    def _replace(self, worker: "_Worker", index: int | None) -> None:
+    def _replace(self, worker: "_WorkerProcess", index: int | None) -> None:
         """Start another process for one that has died with a job, and the job again."""
         self._workers.remove(worker)
         status = worker.exit_status()
@@ -107,7 +107,7 @@ class WorkerPool(Generic[J, R]):
             else:
                 self._lost[index] = cause
         if self._waiting:
-            self._workers.append(_Worker(self._function))
+            self._workers.append(_WorkerProcess(self._function))
 
     def close(self) -> None:
         """End all processes."""
@@ -115,7 +115,7 @@ class WorkerPool(Generic[J, R]):
             worker.end()
 
 
-class _Worker:
+class _WorkerProcess:
     """A process, and the connection over which it gets jobs.
 
     Attributes:

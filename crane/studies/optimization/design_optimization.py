@@ -41,7 +41,7 @@ from crane.studies.optimization.variant_measures import (
     load_positions,
 )
 from crane.studies.parallel_jobs import (
-    KeptResults,
+    StoredResults,
     check_process_count,
     compute_jobs,
     machine_from_files,
@@ -234,7 +234,7 @@ def design(
     total = starts * len(objectives) + (points if is_multi_objective else 0)
 
     def solve_jobs(
-        jobs: Sequence[DesignJob], finished: int, kept: KeptResults[DesignSolution] | None
+        jobs: Sequence[DesignJob], finished: int, kept: StoredResults[DesignSolution] | None
     ) -> list[DesignSolution]:
         return compute_jobs(
             solve_design_job, jobs, processes, scheduler,

@@ -27,7 +27,7 @@ from crane.studies.optimization.variant_measures import (
     VariantEvaluation,
     load_positions,
 )
-from crane.studies.parallel_jobs import KeptResults
+from crane.studies.parallel_jobs import StoredResults
 
 _OBJECTIVE_TOLERANCE = 1e-10  # of an objective, as a share of its scale
 _MAX_ITERATIONS = 200
@@ -189,7 +189,7 @@ def solution_columns(
 @contextmanager
 def kept_solutions(
     checkpoint: str | Path | None, machine: Machine, job: DesignJob, settings: tuple[object, ...]
-) -> Iterator[KeptResults[DesignSolution] | None]:
+) -> Iterator[StoredResults[DesignSolution] | None]:
     """Context of the solutions in a checkpoint, if there is one, without the keys of jobs.
 
     Args:
@@ -227,7 +227,7 @@ def kept_solutions(
         ["search", *columns, *starts, "termination"],
         1,
     ) as table:
-        yield KeptResults(table, (), to_cells, from_cells)
+        yield StoredResults(table, (), to_cells, from_cells)
 
 
 def solve_design_job(job: DesignJob) -> DesignSolution:
