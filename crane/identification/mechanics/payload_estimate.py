@@ -120,7 +120,7 @@ class PayloadEstimate(EstimatedValues):
                 continue
             interval = f"{low:.5g} to {high:.5g} {unit}"
             rows.append([name, f"{value:.5g}", f"{deviation:.2g}", interval, ""])
-        at = ", taken as a point there" if np.isnan(self.com).all() else ""
+        at = ", modelled as a point mass at this frame" if np.isnan(self.com).all() else ""
         lines = [f"load on {self.frame}{at}", *format_table(rows, (0, 3))]
         if self.confidence_interval()[0, 0] <= 0:
             lines.append("the mass may be zero: do not trust its centre")
@@ -131,8 +131,7 @@ class PayloadEstimate(EstimatedValues):
         if self.warning:
             lines.append(f"do not trust this: {self.warning}")
         lines.append(
-            f"forces left unexplained: {100 * self.fit.overall_relative_error:.3g} % of the "
-            f"load's share"
+            f"residual forces: {100 * self.fit.overall_relative_error:.3g} % of the load's share"
         )
         return "\n".join(lines) + "\n"
 
