@@ -125,7 +125,8 @@ def count_steps(control: Controller, duration: float | None, step: float) -> int
     if duration > min(_MAX_DURATION, _MAX_STEPS * step):
         raise InputError(
             f"{duration:g} s are {duration / step:.3g} steps of {step:g} s, at most {_MAX_STEPS} "
-            f"and {_MAX_DURATION:g} s: simulate less, or go on from the last sample of a first part"
+            f"and {_MAX_DURATION:g} s: simulate less, or go on from the last sample of a first "
+            "part"
         )
     steps = int(np.ceil(duration / step - 1e-9)) if levers else round(duration / step)
     if steps < 1 or not levers and abs(steps * step - duration) > 1e-9 * duration:

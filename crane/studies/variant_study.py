@@ -162,15 +162,15 @@ def study(
     selected_measures = _unique_names(
         "measure", available, named_measures or (None if not expressions else ())
     )
-    units = _parameter_units(
-        base_machine, vary, has_lever_tasks or bool(expressions) or bool(require)
-    )
+    with_circuit = bool(has_lever_tasks or expressions or require)
+    units = _parameter_units(base_machine, vary, with_circuit)
     options = MeasureOptions(frame, find_rule(rule), tasks, transferable_measures(user_measures))
     if not set(selected_measures) & set(task_measure_units):
         tasks = ()
     job = StudyJob(
         name, dict(base_machine.parameter_changes), dict(base_machine.locked_joints), tasks,
-        not set(selected_measures) <= set(task_measure_units), expressions, tuple(require), options,
+        not set(selected_measures) <= set(task_measure_units), expressions, tuple(require),
+        options,
     )  # fmt: skip
     jobs = [
         job._replace(changes=job.changes | dict(zip(vary, row, strict=True)))
