@@ -13,9 +13,8 @@ from crane.cli.command import OptionBlock
 from crane.cli.parsing import parse_arguments, parse_names, parse_values
 from crane.cli.terminal import status
 from crane.common.atomic_output import check_file_is_writable, check_folder_is_writable
-from crane.common.checkpoint import UNFINISHED
 from crane.common.errors import OutputError
-from crane.common.result import Result
+from crane.common.result import UNFINISHED, Result
 
 # Arguments and options of several commands that are not part of a block.
 MachineName = Annotated[

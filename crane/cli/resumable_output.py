@@ -12,8 +12,8 @@ from crane.cli.command import refuse_options
 from crane.cli.options import OptionalOutputFolder, OutputFolder
 from crane.cli.terminal import print_message
 from crane.common.atomic_output import check_folder_is_writable
-from crane.common.checkpoint import UNFINISHED
 from crane.common.errors import LostWorkError, OutputError
+from crane.common.result import UNFINISHED
 
 
 @dataclass(frozen=True, kw_only=True)

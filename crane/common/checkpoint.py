@@ -25,9 +25,6 @@ import crane
 from crane.common.errors import CraneError, InputError, LostWorkError, OutputError
 from crane.common.temporary_files import try_lock
 
-UNFINISHED = "unfinished.csv"  # the checkpoint in the folder of a result
-
-
 _PASSING_ERRORS = LostWorkError, OutputError  # of this run, not of what is computed
 
 

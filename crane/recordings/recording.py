@@ -252,6 +252,8 @@ class Recording(Result):
 
     def at(self, mask: np.ndarray) -> "Recording":
         """The samples that a mask (N,) selects."""
+        if mask.all():
+            return self
         return replace(
             self, time=self.time[mask], q=self.q[mask], v=self.v[mask], tau=self.tau[mask],
             channels={name: values[mask] for name, values in self.channels.items()},

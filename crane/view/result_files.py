@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from crane.common.atomic_output import check_folder_is_writable, replace_folder
-from crane.common.checkpoint import UNFINISHED
 from crane.common.errors import CraneWarning, InputError
-from crane.common.result import Result
+from crane.common.result import UNFINISHED, Result
 from crane.formats.machine_file.machine_writer import write_machine
 from crane.formats.machine_loading import load_from_expression
 from crane.machine.machine import Machine
