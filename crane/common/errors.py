@@ -19,13 +19,19 @@ _MAX_WORD_LENGTH, _MAX_LINE_LENGTH = (
 def format_one_line(text: str) -> str:
     """Text as one printable line.
 
-    Characters that cannot be printed become spaces; very long words and lines are shortened in the
-    middle.
+    Characters that cannot be printed become spaces, bytes of paths that are no text are escaped;
+    very long words and lines are shortened in the middle.
     """
+    text = escape_bytes(text)
     text = "".join(c if c.isprintable() else " " for c in text)
     if len(text) > _MAX_WORD_LENGTH:
         text = " ".join(_shorten(word, _MAX_WORD_LENGTH) for word in text.split(" "))
     return _shorten(text, _MAX_LINE_LENGTH)
+
+
+def escape_bytes(text: str) -> str:
+    """Text in which bytes of a path that are no text are escaped by their surrogates."""
+    return text.encode(errors="backslashreplace").decode()
 
 
 def prefix_location(location: str, error: Exception) -> str:

@@ -27,7 +27,13 @@ from pathlib import Path
 import numpy as np
 
 from crane.common import scratch_arrays
-from crane.common.errors import InputError, RecordingError, check_name, suggest_names
+from crane.common.errors import (
+    InputError,
+    RecordingError,
+    check_name,
+    escape_bytes,
+    suggest_names,
+)
 from crane.common.one_line_repr import format_count
 from crane.common.result import Result
 from crane.common.samples import Array, as_number, as_seed
@@ -151,7 +157,7 @@ class Recording(Result):
             timeseries.check_column_name(name, unit)
         for name in ("machine", "task", "controller", "machine_name", "stopped", "start"):
             text = getattr(self, name)
-            if text != text.strip() or not text.isprintable():
+            if text != text.strip() or not escape_bytes(text).isprintable():
                 raise RecordingError(f"{name} {text!r} is not one line of text, give one")
 
     def _check_values(self) -> None:

@@ -22,6 +22,7 @@ from crane.common.errors import (
     check_name,
     suggest_names,
 )
+from crane.common.number_text import parse_float
 from crane.description.sensors import (
     PRESSURE_PREFIX,
     SENSOR_PREFIX,
@@ -185,7 +186,7 @@ def _sensor_notes(table: Table) -> dict[str, float]:
             continue
         try:
             quantity, _ = parse_sensor_parameter(name)
-            parameters[name] = float(text)
+            parameters[name] = parse_float(text)
             problem = f"the note '{name}' is of no column"
             check_name(quantity, table.units, problem, RecordingError)
         except InputError as error:

@@ -97,7 +97,10 @@ class Study(Result):
         Raises:
             OutputError: The file cannot be written.
         """
-        with replace_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        with (
+            replace_file(path) as part,
+            part.open("w", newline="", encoding="utf-8", errors="surrogateescape") as file,
+        ):
             file.write(f"# machine: {self.machine_reference}\n")
             file.writelines(f"# note: {note}\n" for note in self.resolution_notes)
             writer = csv.writer(file, lineterminator="\n")

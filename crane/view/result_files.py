@@ -83,7 +83,7 @@ def write_result(
     ) as part:
         text = files.text(result, **options)
         if files.summary:
-            (part / files.summary).write_text(text, encoding="utf-8")
+            (part / files.summary).write_text(text, encoding="utf-8", errors="backslashreplace")
         for name, method in files.tables.items():
             getattr(result, method)(part / name)
         for name, function in files.figures.items():
@@ -188,7 +188,9 @@ def _comparison_text(comparison: Any, **_: object) -> str:
 
 def _write_comparison(comparison: Any, folder: Path, npz: bool = False) -> None:
     if (run := comparison.recording) is not None:
-        (folder / SUMMARY).write_text(_recording_text(run), encoding="utf-8")
+        (folder / SUMMARY).write_text(
+            _recording_text(run), encoding="utf-8", errors="backslashreplace"
+        )
         _write_recording(run, folder, npz)
     if comparison.channels:
         _write_figure(

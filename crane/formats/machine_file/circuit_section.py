@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from crane.common.errors import CraneWarning, DescriptionError, InputError, suggest_names
+from crane.common.number_text import parse_float
 from crane.common.package_search import read_plain_file
 from crane.common.plausible_ranges import implausible_value_text
 from crane.description.circuit_schema import AREA_KEYS, BORE_KEYS, ORIFICE_KEYS
@@ -403,7 +404,7 @@ def _read_csv_table(path: Path) -> tuple[str, Sequence[tuple[float, float]]]:
     points = []
     for number, row in enumerate(rows, 2):
         try:
-            pair = float(row["u"]), float(row[names[0]])
+            pair = parse_float(row["u"]), parse_float(row[names[0]])
         except (TypeError, ValueError):
             pair = math.nan, math.nan
         if not all(map(math.isfinite, pair)):

@@ -36,13 +36,12 @@ def spectral_edge_frequency(x: Array, step: float, share: float = 0.995) -> floa
         step: Step between samples [s].
         share: Share of the power below it, 0 to 1.
     """
-    from scipy.signal.windows import hann
-
     edges = []
     for column in x.T[np.ptp(x, axis=0) > 0]:
         windowed = column - column.mean()
         windowed /= max(column.std(), 1e-300)
-        windowed *= hann(len(column), sym=False)
+        phase = np.linspace(0.0, 2 * np.pi, len(column), endpoint=False)
+        windowed *= 1.0 - np.cos(phase, out=phase)  # window of Hann
         power = np.abs(np.fft.rfft(windowed))
         power *= power
         power[1 : (len(column) + 1) // 2] *= 2.0  # those of negative frequencies
