@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import random
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -364,6 +365,52 @@ def test_a_script_without_a_guard_is_told_so(tmp_path):
     assert done.returncode == 1
     last = done.stderr.splitlines()[-1]
     assert "InputError: a process could not import your script: guard what it runs with" in last
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_ends_leaves_what_is_finished(tmp_path):
+    pytest.importorskip("distributed")
+    address = f"tcp://127.0.0.1:{free_port()}"
+    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--no-dashboard"]
+    command += ["--host", "127.0.0.1", "--port", address.rpartition(":")[2]]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL, cwd=tmp_path) as scheduler:
+        worker = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1"]
+        worker += ["--no-dashboard", "--no-nanny", "--death-timeout", "60"]
+        with subprocess.Popen(worker, stderr=subprocess.DEVNULL, cwd=tmp_path) as process:
+            file = tmp_path / "unfinished.csv"
+            wait_for(address)
+
+            def end(share):
+                if share > 0.2 and scheduler.poll() is None:
+                    scheduler.kill()
+
+            try:
+                with pytest.raises(LostWorkError, match="the scheduler at .* is gone"), quiet():
+                    crane.study(FOUR_BAR, MASSES, measures=["mass"], scheduler=address,
+                                checkpoint=file, progress=end)  # fmt: skip
+            finally:
+                scheduler.kill()
+                process.kill()
+    rows = file.read_text().splitlines()[5:]
+    assert 24 * 0.2 <= len(rows) < 24
+    found = crane.study(FOUR_BAR, MASSES, measures=["mass"], checkpoint=file)
+    whole = crane.study(FOUR_BAR, MASSES, measures=["mass"])
+    assert as_text(found, tmp_path) == as_text(whole, tmp_path)
+
+
+def wait_for(address):
+    host, port = address.removeprefix("tcp://").split(":")
+    for _ in range(600):
+        with socket.socket() as one:
+            if one.connect_ex((host, int(port))) == 0:
+                return
+        time.sleep(0.1)
+
+
+def free_port():
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
 
 
 def cluster_workers():

@@ -327,6 +327,59 @@ def test_interrupt_is_one_line_and_leaves_nothing(tmp_path, delay):
     assert all(other.startswith("warning: ") for other in before_it)
 
 
+DRAWN = """
+import os, time
+import crane.view.plots.figure_style as figure_style
+
+
+class Object:
+    def __del__(self):  # where Python ignores what is raised
+        os.kill(os.getpid(), {number})
+        for _ in range(1000):
+            pass
+
+
+def ignored():
+    Object()
+    time.sleep(30)
+
+
+def replaced():
+    try:
+        os.kill(os.getpid(), {number})
+        time.sleep(30)
+    except BaseException as error:
+        raise RuntimeError("something of a library's own") from error
+
+
+def write_figure(path, draw):
+    path.write_bytes(b"half")
+    {what}()
+
+
+figure_style.write_figure = write_figure
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["ignored", "replaced"])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_while_figures_are_drawn_is_one_line_and_leaves_no_parts(tmp_path, what, number):
+    out = tmp_path / "new" / "run"
+    code = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n{DRAWN}"
+    command = [sys.executable, "-c", code.format(number=int(number), what=what) + MAIN, "study"]
+    command += ["mini_forwarder", "--vary", "payload.mass=0:0.3:2", "--measure", "mass"]
+    command += ["--processes", "1", "--out", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (128 + number, "")
+    assert done.stderr.splitlines() == [
+        f"what is finished is kept in {out / 'unfinished.csv'}: add --resume to go on",
+        "error: interrupted, no result was written",
+    ]
+    left = [path.relative_to(tmp_path) for path in tmp_path.rglob("*")]
+    assert sorted(map(str, left)) == ["new", "new/run", "new/run/unfinished.csv"]
+
+
 CUT = """
 import contextlib
 import crane.cli.simulate

@@ -62,5 +62,5 @@ def test_errors_escape_the_bytes(tmp_path):
     with pytest.raises(crane.CraneError, match="is not text, give a file in UTF-8"):
         Recording.read(table)
     table.write_bytes(b"# machine: \xe9\ntime [s],q [m],q_force [N]\n0,1,0\n1,\xe9,0\n")
-    with pytest.raises(crane.CraneError, match="line 4, column 'q': '.udce9' is not a finite"):
+    with pytest.raises(crane.CraneError, match="is not text, give a file in UTF-8"):
         Recording.read(table)

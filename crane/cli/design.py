@@ -54,13 +54,14 @@ def study(
     """Compute measures of variants, on a grid or at random."""
     axes = parse_grids(vary) if draws is None else parse_ranges(vary)
     loaded = options.load(machine)
-    with output.checkpoint() as checkpoint, progress_bar("computing variants") as progress:
-        result = crane.study(
-            loaded, axes, task, measure, require=require or (),
-            user_measures=measures, frame=frame, rule=rule, draws=draws, seed=seed,
-            checkpoint=checkpoint, progress=progress, **parallel.arguments(),
-        )  # fmt: skip
-    output.write(result)
+    with output.checkpoint() as checkpoint:
+        with progress_bar("computing variants") as progress:
+            result = crane.study(
+                loaded, axes, task, measure, require=require or (),
+                user_measures=measures, frame=frame, rule=rule, draws=draws, seed=seed,
+                checkpoint=checkpoint, progress=progress, **parallel.arguments(),
+            )  # fmt: skip
+        output.write(result)
 
 
 @command()
@@ -94,11 +95,12 @@ def design(
 ) -> None:
     """Optimize parameters for objectives and constraints."""
     loaded = options.load(machine)
-    with output.checkpoint() as checkpoint, progress_bar("searching") as progress:
-        result = crane.design(
-            loaded, parse_ranges(vary), minimise=minimise or (), maximise=maximise or (),
-            require=require or (), measures=measures, frame=frame, rule=rule, tasks=task,
-            starts=starts, points=points, seed=seed, checkpoint=checkpoint, progress=progress,
-            **parallel.arguments(),
-        )  # fmt: skip
-    output.write(result)
+    with output.checkpoint() as checkpoint:
+        with progress_bar("searching") as progress:
+            result = crane.design(
+                loaded, parse_ranges(vary), minimise=minimise or (), maximise=maximise or (),
+                require=require or (), measures=measures, frame=frame, rule=rule, tasks=task,
+                starts=starts, points=points, seed=seed, checkpoint=checkpoint, progress=progress,
+                **parallel.arguments(),
+            )  # fmt: skip
+        output.write(result)

@@ -439,10 +439,11 @@ def calibrate(
     paths, held_out = (
         [recording_file(x) for x in given or ()] for given in (recording, validation)
     )
-    with output.checkpoint() as checkpoint, progress_bar("simulating") as progress:
-        result = crane.calibrate(
-            loaded, paths, fits, train=window, validation=held_out,
-            columns=reading.columns, span=reading.span, sensors=parse_names(sensors),
-            checkpoint=checkpoint, progress=progress,
-        )  # fmt: skip
-    output.write(result, f"; see {output.out}/report.html")
+    with output.checkpoint() as checkpoint:
+        with progress_bar("simulating") as progress:
+            result = crane.calibrate(
+                loaded, paths, fits, train=window, validation=held_out,
+                columns=reading.columns, span=reading.span, sensors=parse_names(sensors),
+                checkpoint=checkpoint, progress=progress,
+            )  # fmt: skip
+        output.write(result, f"; see {output.out}/report.html")

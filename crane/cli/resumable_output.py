@@ -12,7 +12,7 @@ from crane.cli.command import refuse_options
 from crane.cli.options import OptionalOutputFolder, OutputFolder
 from crane.cli.terminal import print_message
 from crane.common.atomic_output import check_folder_is_writable
-from crane.common.errors import LostWorkError, OutputError
+from crane.common.errors import InputError, OutputError
 from crane.common.result import UNFINISHED
 
 
@@ -49,8 +49,9 @@ class OptionalResumableFolder(OptionalOutputFolder):
             file.unlink(missing_ok=True)
         try:
             yield file
-        except (KeyboardInterrupt, LostWorkError):
-            if file.is_file():
+        except (Exception, KeyboardInterrupt) as error:
+            # not of another computation
+            if file.is_file() and not isinstance(error, InputError):
                 print_message(f"what is finished is kept in {file}: add --resume to go on")
             raise
 

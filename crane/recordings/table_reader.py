@@ -397,6 +397,7 @@ def _raise_first_fault(path: Path, header: int, units: Mapping[str, str]) -> Non
         for line, text in enumerate(file, start=1):
             if line <= header or not text.strip():
                 continue
+            text.encode()  # only notes may hold paths that are no text
             cells = text.rstrip("\n").split(",")
             if len(cells) != len(names):
                 raise RecordingError(
