@@ -9,6 +9,8 @@ import threading
 import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, TypeVar
 
@@ -130,7 +132,8 @@ class _WorkerProcess:
         self.job: int | None = None
         self.is_ready = False
         self._process = context.Process(target=_work, args=(function, other_end), daemon=True)
-        self._process.start()
+        with _interrupts_blocked():
+            self._process.start()
         other_end.close()
 
     def begin(self, index: int, job: Any) -> None:
@@ -166,10 +169,26 @@ class _WorkerProcess:
         self.exit_status()
 
 
+@contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Block SIGINT, also in processes that are started: the terminal sends it to all of a group.
+
+    It reaches this process after the block, which then ends the others.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    resource_tracker.ensure_running()  # it unblocks SIGINT as it starts
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _work(function: Callable[[Any], Any], connection: Connection) -> None:
     """Compute jobs, in a process of its own, until its parent ends."""
     _exit_with_parent()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it as well, and ends this
     connection.send(None)
     while True:
         job = connection.recv()
