@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from crane.closure.coordinates import Coordinates, Indices
 from crane.common.errors import MechanismError
@@ -253,6 +254,16 @@ class LoopEquations:
         return phi / self.residual_units, jacobian / self.residual_units[
             :, None
         ] * self.coordinate_units
+
+    def displace(self, q: Array, columns: NDArray[Any], step: NDArray[Any]) -> Array:
+        """Configuration (nq,) after a displacement of some columns, scaled by their units.
+
+        Displacements are integrals of velocities: those of a rotation vector are rotations about
+        the axes of the child, see `Coordinates.rate_matrix`.
+        """
+        displacement = np.zeros(len(q))
+        displacement[columns] = step * self.coordinate_units[columns]
+        return q + self.coordinates.coordinate_derivatives(q, displacement)
 
     def name_of_row(self, row: int) -> str:
         """Name of the loop or coupling that an equation belongs to."""

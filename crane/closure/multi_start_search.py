@@ -123,12 +123,10 @@ class ClosureResidual:
 
 
 def periodic_coordinates(equations: LoopEquations) -> NDArray[np.bool_]:
-    """(nv,) joints that a full revolution leaves unchanged: revolute, in no coupling or base."""
+    """(nv,) joints that a full revolution leaves unchanged: revolute, in no coupling."""
     coordinates = equations.coordinates
-    periodic = ~coordinates.is_translation & ~(equations.coupling_factors != 0).any(axis=0)
-    for column in coordinates.floating_base_columns:
-        periodic[column : column + 6] = False
-    return np.asarray(periodic)
+    is_angle = ~coordinates.is_translation & ~coordinates.is_rotation_vector
+    return np.asarray(is_angle & ~(equations.coupling_factors != 0).any(axis=0))
 
 
 def remove_revolutions(
@@ -366,6 +364,7 @@ class MultiStartSearch:
         q = remove_revolutions(
             q, self.initial_guess, periodic, self._coordinates.lower, self._coordinates.upper
         )
+        q = self._coordinates.wrap_rotations(q, movable)
         return q, float(np.abs(residual).max(initial=0.0))
 
     def _line_search(

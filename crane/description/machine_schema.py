@@ -2,7 +2,6 @@
 
 from crane.description.circuit_schema import HYDRAULICS
 from crane.description.external_force_schema import CONTACT, CUTTER, GROUND, LOAD, SOIL, TASK_LOAD
-from crane.description.floating_bases import FLOATING_FREEDOMS
 from crane.description.force_elements import EndStop, ForceElement, Friction, GasSpring, Rope
 from crane.description.key_types import (
     REQUIRED,
@@ -18,6 +17,7 @@ from crane.description.key_types import (
     VariantKey,
     section_schema,
 )
+from crane.description.rotation_vectors import FLOATING_FREEDOMS
 from crane.description.sensors import Sensor
 from crane.description.specification import DEFAULT_RAMP_TIME, LOOP_TYPES, TIP_COORDINATES, PIGains
 

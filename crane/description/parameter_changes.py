@@ -12,7 +12,6 @@ from crane.common.errors import CraneWarning, InputError, suggest_names
 from crane.common.plausible_ranges import implausible_value_text
 from crane.common.samples import MAX_COORDINATE, as_number
 from crane.description.external_forces import ExternalForce
-from crane.description.floating_bases import convert_locked_rotations
 from crane.description.force_elements import (
     AnyForceElement,
     Friction,
@@ -28,6 +27,7 @@ from crane.description.machine_parameters import (
     unknown_parameter_text,
     value_at,
 )
+from crane.description.rotation_vectors import convert_locked_rotations
 from crane.description.sensors import (
     SENSOR_PREFIX,
     parse_sensor_parameter,

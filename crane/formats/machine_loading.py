@@ -20,7 +20,6 @@ from crane.common.package_search import (
     use_load_options,
 )
 from crane.common.samples import read_only_copy
-from crane.description.floating_bases import add_floating_base, check_freedoms
 from crane.description.machine_lookup import CHANGES_SEPARATOR, find_machine_file
 from crane.description.machine_parameters import parameters
 from crane.description.parameter_changes import (
@@ -28,6 +27,7 @@ from crane.description.parameter_changes import (
     lock_joints,
     set_active_joints,
 )
+from crane.description.rotation_vectors import add_floating_base, check_freedoms
 from crane.description.specification import Coupling, LoopSpec, MachineSpec
 from crane.formats.assembly_warnings import add_remedy, check_home, warn_about_assembly_modes
 from crane.formats.machine_file.machine_reader import read_machine_spec
@@ -68,7 +68,7 @@ def load(
             without an active joint are free anyway, with a warning.
         floating: Whether the root floats instead of being fixed to the ground: a vehicle, a
             humanoid. Its six joints, base_x to base_rz, are free, see
-            `crane.description.floating_bases`. For some of these freedoms give their names, such
+            `crane.description.rotation_vectors`. For some of these freedoms give their names, such
             as ("z", "ry") for heave and pitch.
         packages: Folders of the packages that files name by `package://`, `model://` and
             `$(find ...)`, or folders that contain such packages, see

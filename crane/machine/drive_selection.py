@@ -16,7 +16,7 @@ from crane.closure.coordinates import Coordinates
 from crane.closure.loop_equations import LoopEquations
 from crane.common.one_line_repr import format_count
 from crane.common.samples import Array
-from crane.description.floating_bases import floating_series
+from crane.description.rotation_vectors import floating_series
 from crane.description.specification import Drive, MachineSpec
 
 _SECTIONS_OF_ACTIVE_JOINTS = {

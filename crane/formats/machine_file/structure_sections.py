@@ -14,10 +14,10 @@ import pinocchio as pin
 
 from crane.common.errors import CraneError, CraneWarning, DescriptionError, suggest_names
 from crane.description.findings import FollowUpError, error_recovery, report_error
-from crane.description.floating_bases import add_base_joints, check_freedoms
 from crane.description.force_elements import ForceElement, Friction
 from crane.description.kinematic_tree import Joint, Link, Tree, body_of
 from crane.description.pinocchio_conversion import se3_from_xyz_rpy
+from crane.description.rotation_vectors import add_base_joints, check_freedoms
 from crane.description.specification import (
     AXISLESS_TYPES,
     LOOP_TYPES,

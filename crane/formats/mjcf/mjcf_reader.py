@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
+from crane.closure.coordinates import cardan_angles
 from crane.common.errors import DescriptionError
-from crane.description.floating_bases import with_rotation_vectors
 from crane.description.kinematic_tree import (
     Joint,
     Limits,
@@ -20,11 +20,11 @@ from crane.description.kinematic_tree import (
     with_rotor_inertias,
 )
 from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
+from crane.description.rotation_vectors import with_rotation_vectors
 from crane.description.specification import Chain, MachineSpec, source_locations
 from crane.formats.machine_file.structure_sections import TreeBuilder
 from crane.formats.mjcf.equality_constraints import MjcfFrames, read_equality_constraints
 from crane.formats.mjcf.model_features import (
-    isotropic_rotor_inertia,
     note_unsupported_features,
     read_drives,
     read_joint_effects,
@@ -36,8 +36,8 @@ from crane.formats.urdf.urdf_reader import UrdfModel
 def read_mjcf(path: Path) -> MachineSpec:
     """Read a machine from a MJCF file.
 
-    The coordinate of a hinge or slide is its `qpos`. A ball joint has the Cardan angles of its
-    body relative to the reference pose, a free joint position and Cardan angles in the world.
+    The coordinate of a hinge or slide is its `qpos`. A ball joint has the rotation vector of its
+    body relative to the reference pose, a free joint position and rotation vector in the world.
 
     Raises:
         DescriptionError: The file is wrong or has an element that no machine has; the message has
@@ -163,7 +163,6 @@ class _MjcfReader:
         series_joints: list[Joint] = []
         previous_anchor = np.zeros(3)  # anchor of the previous joint, in the body's frame
         for joint in range(first, first + model.body_jntnum[body]):
-            tensor = tensor + isotropic_rotor_inertia(self.mjcf, joint) * np.eye(3)
             if model.jnt_type[joint] == 0:
                 placement = pin.SE3.Identity()
             offset = pin.SE3(np.eye(3), model.jnt_pos[joint] - previous_anchor)
@@ -245,7 +244,7 @@ class _MjcfReader:
             values = list(qpos[first : first + translation_count])
             if kind in ("BALL", "FREE"):
                 quaternion = qpos[first + translation_count : first + translation_count + 4]
-                values += _cardan_angles(pose(quaternion, np.zeros(3)).rotation)
+                values += cardan_angles(pose(quaternion, np.zeros(3)).rotation)
             home |= {x: float(y) for x, y in zip(joint_names, values, strict=True) if y}
         for name, value in home.items():
             limits = self.joints[name].limits
@@ -271,12 +270,3 @@ class _MjcfReader:
             return tip
         self.mjcf.note_unsupported(f"the text 'tip', which names no moving body or site '{tip}'")
         return None
-
-
-def _cardan_angles(rotation: np.ndarray) -> list[float]:
-    """Return the angles a, b, c with rotation = R_x(a) R_y(b) R_z(c)."""
-    first = np.arctan2(-rotation[1, 2], rotation[2, 2])
-    sine, cosine = np.sin(first), np.cos(first)
-    second = np.arctan2(rotation[0, 2], cosine * rotation[2, 2] - sine * rotation[1, 2])
-    x, y = cosine * rotation[1, :2] + sine * rotation[2, :2]
-    return [float(first), float(second), float(np.arctan2(x, y))]

@@ -11,6 +11,8 @@ from lxml import etree
 from crane.common.atomic_output import replace_file
 from crane.common.errors import CraneWarning, InputError
 from crane.description.force_elements import ForceElement, Friction, Rope, element_name
+from crane.description.kinematic_tree import ROTATIONS
+from crane.description.rotation_vectors import ROTATION_COUNT
 from crane.description.specification import Coupling, LoopSpec
 from crane.formats.urdf.urdf_writer import (
     format_document,
@@ -48,13 +50,7 @@ def write_mjcf(machine: Machine, path: str | Path) -> None:
     writer = _MjcfWriter(machine)
     with replace_file(path) as temporary_file:
         temporary_file.write_bytes(writer.build_content())
-    floating = [
-        machine.joints[column + i]
-        for column in machine.coordinates.floating_base_columns
-        for i in range(6)
-    ]
-    unsupported = [f"the friction of {joint}" for joint in floating if joint in machine.friction]
-    unsupported += [
+    unsupported = [
         f"the constant force on {x.joint}" for x in machine.forces if x.force and x.joint
     ]
     unsupported += writer.unsupported
@@ -118,7 +114,15 @@ class _MjcfWriter:
             self._add_coupling(equality, tendons, coupling)
         for drive in self.machine.drives:
             target = {"joint": drive.name}
-            if dict(drive.factors) != {drive.name: 1.0}:
+            joints = {
+                self.model.names[int(self.machine.coordinates.joints[self.machine.column(joint)])]
+                for joint in drive.factors
+            }
+            if len(joints) == 1 and joints != set(drive.factors):  # about an axis of a ball
+                (ball,) = joints
+                gear = [drive.factors.get(f"{ball}_{part}", 0.0) for part, _, _ in ROTATIONS]
+                target = {"joint": ball, "gear": format_numbers(gear)}
+            elif dict(drive.factors) != {drive.name: 1.0}:
                 target = {"tendon": _add_fixed_tendon(tendons, drive.name, drive.factors)}
             add(actuator, "motor", {"name": drive.name, **target})
         force_elements: list[ForceElement | Rope] = [*self.machine.forces, *self.machine.ropes]
@@ -180,15 +184,9 @@ class _MjcfWriter:
     def _add_joint(self, body: etree._Element, joint: int, placement: pin.SE3) -> None:
         """Add a joint at a placement in its body's frame at coordinate zero."""
         machine, name = self.machine, self.model.names[joint]
-        column = self.model.joints[joint].idx_v
-        if column in machine.coordinates.floating_base_columns:
-            etree.SubElement(body, "freejoint", name=name)
-            data = self.model.createData()
-            pin.forwardKinematics(
-                self.model, data, machine.coordinates.configuration(machine.home)
-            )
-            *position, x, y, z, w = pin.SE3ToXYZQUAT(data.oMi[joint])  # in the world
-            self.home_coordinates += [float(value) for value in (*position, w, x, y, z)]
+        column, count = self.model.joints[joint].idx_v, self.model.joints[joint].nv
+        if count > 1:
+            self._add_composite_joint(body, joint, placement)
             return
         tree_joint = self.tree.joints[name]
         values = {
@@ -199,21 +197,56 @@ class _MjcfWriter:
         }
         if (limits := finite_limits(tree_joint.limits)) is not None:
             values |= {"limited": "true", "range": format_numbers(limits)}
-        friction = machine.friction.get(name, Friction())
         joint_elements = [item for item in machine.forces if item.joint == name]
         stiffness = sum(item.stiffness for item in joint_elements)
-        effects = {
-            "armature": tree_joint.rotor_inertia,
-            "damping": sum(item.damping for item in joint_elements) + friction.viscous,
-            "frictionloss": friction.coulomb,
-            "stiffness": stiffness,
-        }
+        effects = self._joint_effects(name) | {"stiffness": stiffness}
         values |= {key: format_numbers([value]) for key, value in effects.items() if value}
         if stiffness:
             rest = sum(item.stiffness * item.rest for item in joint_elements) / stiffness
             values["springref"] = format_numbers([rest])
         etree.SubElement(body, "joint", values)
         self.home_coordinates.append(float(machine.home[column]))
+
+    def _joint_effects(self, name: str) -> dict[str, float]:
+        """Return rotor inertia and friction along a coordinate by attribute."""
+        friction = self.machine.friction.get(name, Friction())
+        damping = sum(item.damping for item in self.machine.forces if item.joint == name)
+        return {
+            "armature": self.tree.joints[name].rotor_inertia,
+            "damping": damping + friction.viscous,
+            "frictionloss": friction.coulomb,
+        }
+
+    def _add_composite_joint(self, body: etree._Element, joint: int, placement: pin.SE3) -> None:
+        """Add a ball joint, or the free joint of a floating base.
+
+        MuJoCo has one value of each effect for all axes.
+        """
+        machine, data = self.machine, self.model.createData()
+        configuration = machine.coordinates.configuration(machine.home)
+        pin.forwardKinematics(self.model, data, configuration)
+        first = self.model.joints[joint].idx_v
+        names = machine.joints[first : first + self.model.joints[joint].nv]
+        is_ball = len(names) == ROTATION_COUNT
+        values = {"name": self.model.names[joint], "type": "ball" if is_ball else "free"}
+        if is_ball:
+            values |= _placement_attributes(pin.SE3(np.eye(3), placement.translation))
+            # the rotation in the axes of the body
+            turn = placement.rotation @ data.joints[joint].M.rotation @ placement.rotation.T
+            *_, x, y, z, w = pin.SE3ToXYZQUAT(pin.SE3(turn, np.zeros(3)))
+            self.home_coordinates += [float(value) for value in (w, x, y, z)]
+        else:
+            *position, x, y, z, w = pin.SE3ToXYZQUAT(data.oMi[joint])  # in the world
+            self.home_coordinates += [float(value) for value in (*position, w, x, y, z)]
+        effects = [self._joint_effects(name) for name in names]
+        for key, value in effects[0].items():
+            if any(other[key] != value for other in effects):
+                self.unsupported.append(f"different {key} about the axes of {values['name']}")
+            elif value and key == "frictionloss" and not is_ball:
+                self.unsupported.append(f"the friction of {values['name']}")
+            elif value:
+                values[key] = format_numbers([value])
+        etree.SubElement(body, "joint", values)
 
     def _add_site(self, body: etree._Element, name: str, placement: pin.SE3) -> str:
         """Add a site under a unique name, and return the name."""

@@ -109,12 +109,18 @@ def read_joint_effects(
                 rest=float(model.qpos_spring[model.jnt_qposadr[joint]]),
             )
             continue
-        if damping.any() or friction.any() or stiffness:
+        translation_friction = friction[:-3].any()
+        if translation_friction or stiffness:
             mjcf.note_unsupported_elements(
-                "damping, friction and stiffness of ball and free joints", "JOINT", [joint]
+                "friction of free joints, stiffness of ball and free joints", "JOINT", [joint]
             )
-        for name in names[:-3]:  # translations; see also `isotropic_rotor_inertia`
-            effects.add_along(name, armature=armature)
+        for i, name in enumerate(names):
+            effects.add_along(
+                name,
+                damping=float(damping[i]),
+                friction=0.0 if translation_friction else float(friction[i]),
+                armature=armature,
+            )
     for tendon in range(model.ntendon):
         _add_tendon_effects(mjcf, tendon, series_joints, sites, effects)
     for actuator in range(len(model.actuator_trntype)):
@@ -144,24 +150,6 @@ def straight_tendon_sites(mjcf: MujocoFile, tendon: int) -> tuple[int, int] | No
         return None
     first_body, second_body = (int(model.body_weldid[model.site_bodyid[site]]) for site in sites)
     return None if first_body == second_body else (sites[0], sites[1])
-
-
-def isotropic_rotor_inertia(mjcf: MujocoFile, joint: int) -> float:
-    """Return the rotor inertia [kg m2] that a ball or free joint adds to its body, else 0.
-
-    Rotors turn with the body against its parent, so they belong to the body if the parent is
-    fixed.
-    """
-    model, dof = mjcf.model, int(mjcf.model.jnt_dofadr[joint])
-    if (kind := mjcf.joint_type(joint)) not in ("BALL", "FREE"):
-        return 0.0
-    rotor = float(model.dof_armature[dof + 3 * (kind == "FREE")])
-    if rotor and model.body_weldid[model.body_parentid[model.jnt_bodyid[joint]]]:
-        mjcf.note_unsupported_elements(
-            "armature of ball joints on moving bodies", "JOINT", [joint]
-        )
-        return 0.0
-    return rotor
 
 
 def _add_tendon_effects(
@@ -239,7 +227,7 @@ def read_drives(mjcf: MujocoFile, series_joints: Mapping[int, Sequence[str]]) ->
     """Read what the actuators act along: a hinge or slide, a fixed tendon, a part of a joint.
 
     The translations of a free joint are along axes of the world, as the forces of its actuators
-    are. A torque about an axis of a ball or free joint drives the Cardan angle about that axis.
+    are; torques of ball and free joints are about axes of the child in both.
 
     Args:
         mjcf: The file.
@@ -258,8 +246,7 @@ def read_drives(mjcf: MujocoFile, series_joints: Mapping[int, Sequence[str]]) ->
             name = mjcf.name("TENDON", target)
             factors = {series_joints[joint][0]: factor for joint, factor in tendon.items()}
         if kind == "JOINT" and len(series_joints[target]) > 1:
-            used_joints = {joint for drive in found.values() for joint in drive.factors}
-            factors = _multi_freedom_factors(mjcf, actuator, series_joints[target], used_joints)
+            factors = _multi_freedom_factors(mjcf, actuator, series_joints[target])
         if kind == "JOINT" and len(series_joints[target]) == 1:
             factors = dict.fromkeys(series_joints[target], 1.0)
         if kind == "JOINT" and len(factors) == 1:
@@ -275,23 +262,13 @@ def read_drives(mjcf: MujocoFile, series_joints: Mapping[int, Sequence[str]]) ->
 
 
 def _multi_freedom_factors(
-    mjcf: MujocoFile, actuator: int, joint_names: Sequence[str], used_joints: set[str]
+    mjcf: MujocoFile, actuator: int, joint_names: Sequence[str]
 ) -> dict[str, float]:
     """Return the factors of the parts of a ball or free joint, normalized to length 1."""
-    gear, translations = np.array(mjcf.model.actuator_gear[actuator]), joint_names[:-3]
-    force_direction, axis = (gear[:3], gear[3:6]) if translations else (np.zeros(3), gear[:3])
-    force_norm = float(np.linalg.norm(force_direction))
-    if axis.any():
-        mjcf.note_difference(
-            "actuators about axes of ball and free joints drive their angles",
-            mjcf.name("ACTUATOR", actuator),
-        )
-    if force_norm:
-        forces = zip(translations, force_direction, strict=True)
-        return {x: float(f) / force_norm for x, f in forces if f}
-    nearest = [joint_names[-3:][i] for i in np.argsort(-np.abs(axis), kind="stable") if axis[i]]
-    unused = [part for part in nearest if part not in used_joints]
-    return {part: 1.0 for part in (unused or nearest)[:1]}
+    gear = np.array(mjcf.model.actuator_gear[actuator])[: len(joint_names)]
+    return {
+        x: float(f) for x, f in zip(joint_names, gear / np.linalg.norm(gear), strict=True) if f
+    }
 
 
 def note_unsupported_features(mjcf: MujocoFile) -> None:

@@ -40,7 +40,8 @@ def actuator_markers(
     )
     markers = []
     for joint, force in forces.items():
-        index, shown_force = model.getJointId(joint) - 1, force[rows]
+        index = int(machine.coordinates.joints[machine.column(joint)]) - 1
+        shown_force = force[rows]
         pin_frames = (
             [frame for frame in loop_frames if frame["joint"] == index]
             if (machine.unit(joint) == "m")

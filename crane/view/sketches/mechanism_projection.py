@@ -41,15 +41,17 @@ class _MechanismProjection:
         self.machine, self.plane, self.q = machine, plane, q
         model = self.model = machine.model
         data = self.data = model.createData()
-        pin.framesForwardKinematics(model, data, q)
+        pin.framesForwardKinematics(model, data, machine.coordinates.configuration(q))
         self.origins = np.array([plane.project(placement.translation) for placement in data.oMi])
         axes = joint_axes(machine, data)
         self.axes, self.axis_cosines = plane.project(axes), np.abs(axes @ plane.normal)
+        self.axis_cosines[[joint.nv > 1 for joint in model.joints]] = 1.0  # ball joints
         self.parents = [int(parent) for parent in model.parents]
-        self.turns = [False] + [machine.unit(name) == "rad" for name in machine.joints]
+        names = [machine.joints[joint.idx_v] for joint in list(model.joints)[1:]]
+        self.turns = [False] + [machine.unit(name) == "rad" for name in names]
         self.chains = [-1] + [
             {x: i for i, chain in enumerate(machine.chains) for x in chain.joints}.get(name, 0)
-            for name in machine.joints
+            for name in names
         ]
         self.tip_body, self.tip = 0, None
         if machine.tip is not None:
