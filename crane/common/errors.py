@@ -22,16 +22,16 @@ def format_one_line(text: str) -> str:
     Characters that cannot be printed become spaces, bytes of paths that are no text are escaped;
     very long words and lines are shortened in the middle.
     """
-    text = escape_bytes(text)
+    text = text.encode(errors="backslashreplace").decode()
     text = "".join(c if c.isprintable() else " " for c in text)
     if len(text) > _MAX_WORD_LENGTH:
         text = " ".join(_shorten(word, _MAX_WORD_LENGTH) for word in text.split(" "))
     return _shorten(text, _MAX_LINE_LENGTH)
 
 
-def escape_bytes(text: str) -> str:
-    """Text in which bytes of a path that are no text are escaped by their surrogates."""
-    return text.encode(errors="backslashreplace").decode()
+def is_one_line(text: str) -> bool:
+    """Whether a text is one printable line; paths in it may have bytes that are no text."""
+    return text.encode(errors="backslashreplace").decode().isprintable()
 
 
 def prefix_location(location: str, error: Exception) -> str:
