@@ -37,7 +37,7 @@ def spectral_edge_frequency(x: Array, step: float, share: float = 0.995) -> floa
         share: Share of the power below it, 0 to 1.
     """
     edges = []
-    for column in x.T[np.ptp(x, axis=0) > 0]:
+    for column in filter(np.ptp, x.T):
         windowed = column - column.mean()
         windowed /= max(column.std(), 1e-300)
         phase = np.linspace(0.0, 2 * np.pi, len(column), endpoint=False)
