@@ -1,4 +1,4 @@
-"""Couplings of joints, and rotors behind gears, in every quantity, format and backend."""
+"""Couplings of joints, gears and cams, and rotors, in every quantity, format and backend."""
 
 import re
 import warnings
@@ -325,3 +325,98 @@ def test_bad_couplings_are_refused(tmp_path, coupling, line):
         crane.load(tmp_path / "train.yaml")
     assert line in str(caught.value)
     assert "train.yaml:" in str(caught.value)
+
+
+CAM = """<mujoco model="cam"><compiler angle="radian"/><worldbody>
+ <body><joint name="leader" axis="0 1 0" ref="0.2" damping="0.3"/>
+  <geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.03" mass="2"/>
+  <body pos="0.4 0 0"><joint name="follower" axis="0 1 0" ref="-0.1"/>
+   <geom type="capsule" fromto="0 0 0 0.3 0 0.1" size="0.02" mass="1"/>
+   <body name="tool" pos="0.3 0 0"><joint name="slide" type="slide" axis="1 0 0.2"/>
+    <geom size="0.05" mass="0.7"/></body></body></body>
+ <body pos="0.9 0 0.4"><joint name="a" axis="0 1 0"/>
+  <geom type="capsule" fromto="0 0 0 -0.4 0 -0.2" size="0.02" mass="1.5"/>
+  <body pos="-0.4 0 -0.2"><joint name="b" axis="0 1 0"/>
+   <geom type="capsule" fromto="0 0 0 0.4 0 -0.3" size="0.02" mass="0.8"/>
+   <body name="end" pos="0.4 0 -0.3"/></body></body></worldbody>
+<tendon><fixed name="double"><joint joint="leader" coef="2"/></fixed>
+ <fixed name="one"><joint joint="slide" coef="1"/></fixed></tendon>
+<equality><joint name="cam" joint1="follower" joint2="leader" polycoef="0 0.3 -0.4 0.2 0.15"/>
+ <tendon name="hump" tendon1="one" tendon2="double" polycoef="0.02 0 0.05 -0.01 0.03"/>
+ <connect name="eye" body1="tool" body2="end" anchor="0.05 0 0"/></equality>
+<actuator><motor joint="leader"/></actuator></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def cam(tmp_path_factory):
+    pytest.importorskip("mujoco")
+    path = tmp_path_factory.mktemp("cam") / "cam.xml"
+    path.write_text(CAM)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)
+        return crane.load(path)
+
+
+def cam_states(cam, count=6):
+    random = np.random.default_rng(4)
+    for part in random.uniform(-1, 1, (count, 3)):
+        yield cam.home[cam.closure.active] + 0.3 * part[:1], 2 * part[1:2], 5 * part[2:]
+
+
+def test_polynomial_couplings_move_as_in_mujoco(cam):
+    """Of joints and of tendons of one joint, about their references; by both backends."""
+    from mujoco_oracle import Oracle
+
+    oracle, dynamics = Oracle(cam.path, cam), crane.Dynamics(cam)
+    plain = crane.Dynamics(cam, backend="pinocchio")
+    for q_a, v_a, tau in cam_states(cam):
+        q = cam.closure.solve(q_a)
+        gamma = cam.closure.gamma(q)
+        oracle.place(q, gamma @ v_a)
+        assert oracle.gap < 1e-14
+        along = np.zeros(len(cam.joints))
+        along[cam.closure.active] = tau
+        wanted = oracle.accelerations(oracle.forces(q, along))
+        drift = cam.closure.drift(q, gamma @ v_a)
+        for backend in (dynamics, plain):
+            a_a = backend.forward(q_a, v_a, tau, friction=True)
+            found = oracle.motion(q, gamma @ v_a, gamma @ a_a + drift)
+            np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12 * np.abs(wanted).max())
+
+
+def test_derivatives_with_polynomial_couplings(cam):
+    """Of inverse dynamics by coordinates, against central differences of sixth order."""
+    dynamics = crane.Dynamics(cam)
+    for q_a, v_a, a_a in cam_states(cam, 3):
+        h, wanted = 2e-3, 0.0
+        for count, weight in ((1, 45.0), (2, -9.0), (3, 1.0)):
+            ahead, back = (dynamics.inverse(q_a + x * count * h, v_a, a_a) for x in (1, -1))
+            wanted = wanted + weight / (60 * h) * (ahead - back)
+        found = dynamics.derivatives("inverse", q_a, v_a, a_a)["q_a"]
+        np.testing.assert_allclose(found[:, 0], wanted, rtol=1e-9)
+
+
+def test_files_and_locks_of_polynomial_couplings(cam, tmp_path):
+    crane.formats.write_mjcf(cam, tmp_path / "again.xml")
+    file = crane.write_machine(cam, tmp_path / "folder")
+    q_a = cam.home[cam.closure.active] + [[-0.2], [0.3]]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)
+        for path in (tmp_path / "again.xml", file):
+            again = crane.load(path)
+            order = [again.column(joint) for joint in cam.joints]
+            found, wanted = again.closure.solve(q_a)[:, order], cam.closure.solve(q_a)
+            np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-14)
+        text = file.read_text()
+        for old, new, line in (
+            ("leader: [0.48", "leder: [0.48", "joint 'leder' is unknown, did you mean 'leader'"),
+            (", -0.15", "", r"'leader' has 2 coefficients, give 3: \[a, b, c\]"),
+        ):
+            assert old in text
+            file.write_text(text.replace(old, new))
+            with pytest.raises(CraneError, match=line):
+                crane.load(file)
+        with pytest.raises(CraneError, match="'cam' has powers, for which URDF. has no place"):
+            crane.formats.write_urdf_plus(cam, tmp_path / "cam.urdf")
+        with pytest.raises(CraneError, match="'cam' has powers of leader, lock that joint"):
+            crane.load(cam.path, lock={"follower": 0.1})

@@ -65,7 +65,7 @@ TEXT = [
         swap("  crank: 1.2", "  yes: 1.2"),
     ),
     case(
-        "four_bar.yaml:29: unknown key 'tip  [31m' in the machine file, the nearest of 31 "
+        "four_bar.yaml:29: unknown key 'tip  [31m' in the machine file, the nearest of 32 "
         "known ones are tip, active, floating, friction, end_stops, rotor_inertia, "
         "identification, home",
         swap("tip: coupler_pin", '"tip\\n\\e[31m": coupler_pin'),
@@ -80,10 +80,10 @@ TEXT = [
 # Keys that are unknown, missing or empty.
 KEYS = [
     case(
-        "four_bar.yaml:29: unknown key 'gravity' in the machine file, the nearest of 31 "
-        "known ones are friction, hydraulics, gas_springs, active, chains, drives, ground, "
-        "payload",
-        swap("tip: coupler_pin", "gravity: 9.81"),
+        "four_bar.yaml:29: unknown key 'weather' in the machine file, the nearest of 32 "
+        "known ones are active, cutters, extends, home, name, rotor_inertia, control, "
+        "identification",
+        swap("tip: coupler_pin", "weather: 9.81"),
         alone=False,
     ),
     case(

@@ -14,7 +14,7 @@ from warned import told, without_a_word
 import crane
 from crane.common.errors import CraneError, CraneWarning
 from crane.formats.checks import check
-from crane.formats.mjcf.model_features import colliding_geoms
+from crane.formats.mjcf.unsupported_features import colliding_geoms
 
 TREE = """<mujoco model="tree">
   <compiler angle="degree" eulerseq="zyx"/>
@@ -136,7 +136,13 @@ def test_equality_constraints(tmp_path):
 
 BAD_MJCF = [
     ("<connect ", "<connekt ", r"bad.xml:15: MuJoCo refuses it (Schema violation: unrecognized "),
-    ('polycoef="0.1 -2 0 0 0"', 'polycoef="0.1 -2 0.5 0 0"', "bad.xml:17: the constraint 'gear'"),
+    (
+        '<joint name="gear" joint1="wheel" joint2="rocker" polycoef="0.1 -2 0 0 0"/>',
+        '<tendon name="gear" tendon1="a" tendon2="b" polycoef="0 1 2"/></equality><tendon><fixed '
+        'name="a"><joint joint="wheel" coef="1"/></fixed><fixed name="b"><joint joint="crank" '
+        'coef="1"/><joint joint="rocker" coef="1"/></fixed></tendon><equality>',
+        "bad.xml:17: the constraint 'gear' has higher powers of a tendon of 2 joints",
+    ),
     ("<worldbody>", '<include file="parts.xml"/><worldbody>', "bad.xml:2: there is no file 'par"),
     ("<mujoco>", "<mujoko>", "bad.xml:22: not XML, Opening and ending tag mismatch"),
     ("anchor=\"0.5 0 0.1", "anchor=\"0.5 0 0,1", "bad.xml:15: MuJoCo refuses it (bad format in"),
@@ -169,7 +175,7 @@ TENDON = (
             '<connect name="side" active="false"',
             "constraints that are switched off (side)",
         ),
-        ("<mujoco>", f"<mujoco>{OFF.format('gravity')}", "gravity is 0 0 0 m/s2, a machine's is"),
+        ("<mujoco>", '<mujoco><option density="1"/>', "; forces of the air"),
         (
             "<mujoco>",
             f"<mujoco>{OFF.format('equality')}",
@@ -208,10 +214,8 @@ TENDON = (
         ),
         (
             "<actuator>",
-            '<worldbody><site name="roof" pos="0 0 9"/></worldbody><tendon><spatial name="cable">'
-            '<site site="top"/><site site="roof"/></spatial></tendon>'
-            '<actuator><motor name="winch" tendon="cable"/>',
-            "actuators by sites, bodies and tendons in space (winch); contacts of 5 geoms",
+            '<actuator><motor name="thruster" site="top"/>',
+            "tendons around geoms and cranks that break (thruster); contacts of 5 geoms",
         ),
         (
             'name="ball" type',
@@ -403,7 +407,7 @@ def test_what_is_left_out_is_told_in_three_lines(tmp_path):
     """Whatever the file has: what is lost, what is taken otherwise, what MuJoCo says."""
     pytest.importorskip("mujoco")
     more = (
-        '<mujoco><option gravity="0 0 -1.62" density="1"/><compiler settotalmass="9"/>'
+        '<mujoco><option density="1"/><compiler settotalmass="9"/>'
         '<visual/><sensor><jointpos joint="wheel"/><gyro site="top"/></sensor>'
     )
     text = LOOPED.replace("<mujoco>", more).replace("<motor", '<motor gear="3" ctrlrange="0 1"')
@@ -417,9 +421,8 @@ def test_what_is_left_out_is_told_in_three_lines(tmp_path):
     for what in ("limits of tendons (rope)", "contacts of 6 geoms (floor", "the air", "2 sensors"):
         assert what in lines[1]
     assert lines[2] == (
-        "some.xml: otherwise than in MuJoCo: gravity is 0 0 -1.62 m/s2, a machine's is 0 0 -9.81; "
-        "drives take forces in N and N m, without gains, gears, dynamics and limits of the "
-        "actuators (drive)"
+        "some.xml: otherwise than in MuJoCo: drives take forces in N and N m, without gains, "
+        "dynamics and limits of the actuators (drive)"
     )
 
 

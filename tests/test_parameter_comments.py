@@ -77,9 +77,17 @@ def test_notes_of_whatever_number(tmp_path):
     head = [line for line in file.read_text().splitlines() if line.startswith("# ")]
     rubbed = tuple(f"friction.{joint}." for joint in machine.friction)
     none = [x for x in every if x.startswith("friction.") and not x.startswith(rubbed)]
-    assert head == [f"# {name}: <{name}>" for name in (*none, "payload.mass")]
+    gravity = [
+        f"# gravity.{x} = {y}: <gravity.{x}>"
+        for x, y in zip("xyz", (0.0, 0.0, -9.81), strict=True)
+    ]
+    plain = [f"# {name}: <{name}>" for name in (*none, "payload.mass")]
+    assert head == [*plain[:-1], *gravity, plain[-1]]
     again = crane.load(file)
     assert numbers(again) == numbers(crane.load(crane.write_machine(machine, tmp_path / "plain")))
+    moon = crane.load("patu655", gravity=(0, 0, -1.62))
+    file = crane.write_machine(moon, tmp_path / "moon", {"gravity.z": "of the moon"})
+    assert file.read_text().startswith("# gravity.z = -1.62: of the moon\n")
 
 
 def test_a_number_that_a_lock_moved_is_said_at_the_head(tmp_path):
@@ -111,8 +119,8 @@ def test_text_with_notes_reads_as_without():
             "list": [{"k": 1.0, "deep": {"z": 0.1}}]}  # fmt: skip
     notes = {("a", "x y"): "one", ("a", "it's: #"): "two\nlines", ("list", 0, "k"): "#3",
              ("list", 0, "deep", "z"): "ß"}  # fmt: skip
-    text = format_yaml(data, notes)
-    assert yaml.safe_load(text) == data == yaml.safe_load(format_yaml(data))
+    text = format_yaml(data, notes, {})
+    assert yaml.safe_load(text) == data == yaml.safe_load(format_yaml(data, {}, {}))
     assert "x y: 1.0  # one\n" in text and "# two lines\n" in text and "k: 1.0  # #3\n" in text
 
 

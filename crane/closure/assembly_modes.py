@@ -182,7 +182,7 @@ class _AssemblyModeSearch:
     def independent_rows_of(self, columns: Indices) -> Indices:
         """Independent rows of the loops that contain some joints."""
         involved = (
-            np.vstack([self.equations.sign, self.equations.coupling_factors])[:, columns] != 0
+            np.vstack([self.equations.sign, self.equations.is_coupled])[:, columns] != 0
         ).any(1)
         rows = self.closure.structure.independent_rows
         return rows[involved[self.equations.loop_of_row[rows]]]

@@ -1,8 +1,10 @@
 """Loop equations, gamma and velocity kinematics of one machine as symbolic formulas."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
+
+import numpy as np
 
 from crane.closure.constraint_structure import ConstraintStructure
 from crane.closure.constraint_tolerances import CLOSED_TOLERANCE
@@ -42,6 +44,8 @@ class LoopEquationFormula:
         wrench: Wrench w of the row, phi' = w . (V_2 - V_1).
         phi: Residual.
         jacobian: dphi/dq by joint.
+        curvatures: Second and third derivatives of phi by the coordinates of joints, of a coupling
+            with higher powers.
     """
 
     bodies: tuple[int, int]
@@ -52,6 +56,7 @@ class LoopEquationFormula:
     wrench: SpatialVector
     phi: Scalar
     jacobian: dict[int, Scalar]
+    curvatures: Mapping[int, tuple[Scalar, Scalar]] = field(default_factory=dict)
 
     def axis_and_arm_rates(
         self, first_motion: SpatialVector, second_motion: SpatialVector
@@ -123,9 +128,18 @@ class LoopFormulas:
             factors = [float(x) for x in equations.coupling_factors[coupling]]
             derivatives: dict[int, Scalar] = {i: x for i, x in enumerate(factors, start=1) if x}
             phi = dot(factors, kinematics.q) - float(equations.coupling_offsets[coupling])
+            curvatures: dict[int, tuple[Scalar, Scalar]] = {}
+            powers = equations.coupling_powers[:, coupling]
+            for column in np.flatnonzero(powers.any(axis=0)).tolist():
+                a, b, c = powers[:, column].tolist()
+                x, joint = kinematics.q[column], column + 1
+                phi = phi + x * x * (a + x * (b + x * c))
+                slope = x * (2 * a + x * (3 * b + x * (4 * c)))
+                derivatives[joint] = derivatives.get(joint, 0.0) + slope
+                curvatures[joint] = 2 * a + x * (6 * b + x * (12 * c)), 6 * b + x * (24 * c)
             zero: Vector = [0.0] * 3
             return LoopEquationFormula(
-                (0, 0), False, False, zero, zero, (zero, zero), phi, derivatives
+                (0, 0), False, False, zero, zero, (zero, zero), phi, derivatives, curvatures
             )
         one = 2 * int(equations.loop_of_row[row])
         (axes1, origin1), (axes2, origin2) = self._frames[one], self._frames[one + 1]
@@ -320,6 +334,7 @@ class VelocityKinematics:
         carriers: Sequence[int],
     ):
         self._kinematics, self._loops = kinematics, loops
+        self._joint_velocities = joint_velocities
         series_of_body = kinematics.geometry.series_of_body
         self.velocities: list[tuple[Vector, Vector]] = [([0.0] * 3, [0.0] * 3)]
         self.bias_accelerations: list[tuple[Vector, Vector]] = [([-g for g in gravity], [0.0] * 3)]
@@ -351,6 +366,9 @@ class VelocityKinematics:
         one, two = row.bodies
         first, second = self.velocities[one], self.velocities[two]
         turned = spatial_dot(row.wrench_rate(first, second), subtract_spatial(second, first))
+        for joint, (curvature, _) in row.curvatures.items():
+            rate = self._joint_velocities[joint]
+            turned = turned + curvature * rate * rate
         return turned + spatial_dot(
             row.wrench,
             subtract_spatial(self.bias_accelerations[two], self.bias_accelerations[one]),

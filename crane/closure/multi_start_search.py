@@ -95,10 +95,9 @@ class ClosureResidual:
         joint_jacobians = pin.computeJointJacobians(
             model, data, equations.coordinates.configuration(q)
         ).reshape(6, -1)
-        residuals = [
-            (equations.coupling_factors @ q - equations.coupling_offsets) / self._coupling_units
-        ]
-        jacobians = [equations.coupling_factors / self._coupling_units[:, None]]
+        coupling_residuals, coupling_jacobian, _ = equations.evaluate_couplings(q)
+        residuals = [coupling_residuals / self._coupling_units]
+        jacobians = [coupling_jacobian / self._coupling_units[:, None]]
         for index, locked in enumerate(self._locked_components):
             one, two = (
                 data.oMi[joint] * place for joint, place in equations.frames[2 * index :][:2]
@@ -126,7 +125,7 @@ def periodic_coordinates(equations: LoopEquations) -> NDArray[np.bool_]:
     """(nv,) joints that a full revolution leaves unchanged: revolute, in no coupling."""
     coordinates = equations.coordinates
     is_angle = ~coordinates.is_translation & ~coordinates.is_rotation_vector
-    return np.asarray(is_angle & ~(equations.coupling_factors != 0).any(axis=0))
+    return np.asarray(is_angle & ~equations.is_coupled.any(axis=0))
 
 
 def remove_revolutions(

@@ -141,23 +141,27 @@ def _csv_line(cells: Iterable[object]) -> str:
 
 
 def _digest(value: Any) -> str:
-    return hashlib.sha256(json.dumps(value, default=_plain).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(_plain(value)).encode()).hexdigest()
 
 
 def _plain(value: Any) -> Any:
-    """What determines a value that JSON does not know."""
+    """What determines a value, as JSON knows it."""
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
     if isinstance(value, np.ndarray):
         return [value.dtype.str, value.shape, hashlib.sha256(value.tobytes()).hexdigest()]
-    if isinstance(value, np.generic):
-        return value.item()
     if isinstance(value, Mapping):
-        return dict(value)
+        return [[_plain(key), _plain(item)] for key, item in value.items()]
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
     if isinstance(value, frozenset):
         return sorted(map(repr, value))
     if isinstance(value, FunctionType):
-        return value.__code__
+        return _plain(value.__code__)
     if isinstance(value, CodeType):
-        return [value.co_name, value.co_code.hex(), value.co_names, value.co_consts]
+        return _plain((value.co_name, value.co_code.hex(), value.co_names, value.co_consts))
     if is_dataclass(value):
-        return {field.name: getattr(value, field.name) for field in fields(value)}
-    return [type(value).__name__, vars(value)] if hasattr(value, "__dict__") else repr(value)
+        return [_plain(getattr(value, field.name)) for field in fields(value)]
+    return (
+        [type(value).__name__, _plain(vars(value))] if hasattr(value, "__dict__") else repr(value)
+    )

@@ -24,7 +24,7 @@ from crane.description.force_elements import Friction
 from crane.description.key_types import NumberKey
 from crane.description.kinematic_tree import Joint, Link, Tree
 from crane.description.machine_lookup import bundled_machines, command_line_arguments
-from crane.description.machine_schema import END_STOP, FORCE, FRICTION, GAS_SPRING, ROPE
+from crane.description.machine_schema import CONTROL, END_STOP, FORCE, FRICTION, GAS_SPRING, ROPE
 from crane.description.sensors import (
     PRESSURE_PREFIX,
     SENSOR_PREFIX,
@@ -42,6 +42,7 @@ from crane.hydraulics.hydraulic_circuit import Hydraulics
 
 PAYLOAD_MASS = "payload.mass"
 PINS_PREFIX = "pins."
+GRAVITY_PREFIX = "gravity."
 SPOOL_B = "spool_b"  # second spool of a valve; its parameters are named `valve.JOINT.spool_b.NAME`
 CIRCUIT_FIELDS = {  # field of `Hydraulics` by the prefix of parameter names
     "supply.": "supplies", "line.": "lines", "accumulator.": "accumulators",
@@ -126,6 +127,7 @@ def parameter_paths(spec: Any) -> dict[str, FieldPath]:
             for name in parameter_names(type(value_at(spec.hydraulics, path)))
             if not (prefix.startswith("supply.") and name == "tank")
         }
+    paths |= {f"{GRAVITY_PREFIX}{axis}": ("gravity", i) for i, axis in enumerate("xyz")}
     return paths | {
         f"{PINS_PREFIX}{name}": ("pin_capacities", name) for name in spec.pin_capacities
     }
@@ -144,6 +146,7 @@ def parameters(spec: MachineSpec) -> dict[str, float]:
     - `payload.mass`: a point mass at the tip, or the payload of the machine file, scaled to that
       mass.
     - `pins.JOINT`: the largest force that a pin bears.
+    - `gravity.x`, `.y`, `.z`: the acceleration of gravity, in the axes of the world.
     - Of sensors: `sensor.QUANTITY.zero`, `.scale`, `.delay`, `.noise`. They may be set for any
       quantity.
 
@@ -198,7 +201,8 @@ _JOINT_UNITS = {  # of a sliding and of a turning joint
 }  # fmt: skip
 _SECTIONS = {
     "friction": FRICTION, "spring": FORCE, "gas_spring": GAS_SPRING, "end_stop": END_STOP,
-    "rope": ROPE, "cylinder": CYLINDER, "valve": VALVE, "valve_control": VALVE_CONTROL,
+    "rope": ROPE, "control": CONTROL, "cylinder": CYLINDER, "valve": VALVE,
+    "valve_control": VALVE_CONTROL,
     "supply": FIRST_PUMP, "oil": OIL, "engine": ENGINE, "line": LINE, "accumulator": ACCUMULATOR,
     "element": ELEMENT,
 }  # fmt: skip
@@ -221,8 +225,8 @@ def parameter_unit(tree: Tree, name: str) -> str:
     owner = rest.rpartition(".")[0]
     if name.startswith(PINS_PREFIX):
         return "N"
-    if prefix == "control":  # gains of two kinds of controllers
-        return ""
+    if name.startswith(GRAVITY_PREFIX):
+        return "m/s2"
     if prefix not in _SECTIONS:
         kind = part.rpartition(".")[2]
         if kind in _INERTIAL_UNITS and part not in tree.links:
@@ -230,6 +234,7 @@ def parameter_unit(tree: Tree, name: str) -> str:
         if part in tree.joints and key in _JOINT_UNITS:
             return _JOINT_UNITS[key][tree.joints[part].kind == "revolute"]
         return _LINK_UNITS.get(key, "")
+    owner = owner.partition("#")[0]  # of several elements of a joint
     is_rotary = owner in tree.joints and tree.joints[owner].kind == "revolute"
     value = _SECTIONS[prefix].keys.get(key)
     value = next(iter(getattr(value, "types", ())), value)  # an edge, which may be a curve

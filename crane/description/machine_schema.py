@@ -4,6 +4,7 @@ from crane.description.circuit_schema import HYDRAULICS
 from crane.description.external_force_schema import CONTACT, CUTTER, GROUND, LOAD, SOIL, TASK_LOAD
 from crane.description.force_elements import EndStop, ForceElement, Friction, GasSpring, Rope
 from crane.description.key_types import (
+    QUANTITY_UNIT,
     REQUIRED,
     FileKey,
     FlagKey,
@@ -19,7 +20,13 @@ from crane.description.key_types import (
 )
 from crane.description.rotation_vectors import FLOATING_FREEDOMS
 from crane.description.sensors import Sensor
-from crane.description.specification import DEFAULT_RAMP_TIME, LOOP_TYPES, TIP_COORDINATES, PIGains
+from crane.description.specification import (
+    DEFAULT_RAMP_TIME,
+    LOOP_TYPES,
+    STANDARD_GRAVITY,
+    TIP_COORDINATES,
+    PIGains,
+)
 
 ALL_ITEM = "all"  # an item whose keys hold for all items beside it
 EXTENDS_KEY = "extends"  # the key that names the file a machine file is a variant of
@@ -64,6 +71,11 @@ COUPLING = section_schema(
             "joint",
             default=REQUIRED,
             attribute="factors",
+        ),
+        "powers": MapKey(
+            "coefficients of the square, cube and fourth power of joints, added to the sum",
+            NumberListKey("", size=3),
+            "joint",
         ),
         "offset": NumberKey("value of the weighted sum", *_COORDINATE, default=0.0),
     },
@@ -168,7 +180,7 @@ PAYLOAD = section_schema(
         )
     },
 )
-_POLYNOMIAL = NumberListKey("", "m", "rad")
+_POLYNOMIAL = NumberListKey("", *_COORDINATE, is_polynomial=True)
 _JOINT_VALUE = NumberKey("", *_COORDINATE)
 _RATE = NumberKey("", "m/s", "rad/s")
 VIA_POINT = section_schema(
@@ -215,7 +227,7 @@ TASK = section_schema(
         ),
         "joystick": MapKey(
             "lever positions of the valves, as pairs of time and position",
-            NumberListKey("", ""), "joint",
+            NumberListKey("", column_units=("s", "")), "joint",
         ),
         "phases": ListKey(
             "lever positions of the valves, each constant until joints reach given positions",
@@ -289,12 +301,13 @@ SENSOR = section_schema(
             default_text="name of the quantity",
         ),
         "unit": TextKey("unit of that column", default_text="SI unit"),
-        "zero": NumberKey("offset, in the unit of the quantity"),
+        "zero": NumberKey("offset", QUANTITY_UNIT),
         "scale": NumberKey("scale factor, not 0"),
         "delay": NumberKey("delay of the sensor", "s"),
         "noise": NumberKey(
             "standard deviation of the noise, which sets the weight of the channel in a "
             "calibration",
+            QUANTITY_UNIT,
             default_text="derived from the recording",
         ),
     },
@@ -312,13 +325,17 @@ MACHINE = section_schema(
         ),
         "name": TextKey("name of the machine", default=REQUIRED),
         "source": TextKey("source of the parameters", default=""),
+        "gravity": NumberListKey(
+            "acceleration of gravity, in the axes of the world; 0, 0, 0 for none", "m/s2", size=3,
+            default=STANDARD_GRAVITY, default_text="0, 0, -9.81, or that of the files of `chains`",
+        ),
         "chains": ListKey("open sub-chains", SectionKey(section=CHAIN), default=REQUIRED),
         "floating": NameListKey(
             "degrees of freedom of the root of the first chain",
             choices=FLOATING_FREEDOMS, default_text="none: fixed to the world",
         ),
         "loops": ListKey("joints that close the chains into loops", SectionKey(section=LOOP)),
-        "couplings": ListKey("linear constraints between joints", SectionKey(section=COUPLING)),
+        "couplings": ListKey("constraints between joints", SectionKey(section=COUPLING)),
         "active": NameListKey(
             "driven joints, in the order of $q_A$; redundant ones share the load",
             default_text="the set with the best condition number, with a warning",

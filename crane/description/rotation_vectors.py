@@ -93,7 +93,7 @@ def _constrained_joints(spec: MachineSpec) -> set[str]:
     """Joints whose coordinates springs, end stops or couplings act on."""
     joints = {part.joint for part in spec.force_elements if part.between is None}
     joints |= {part.joint for part in spec.end_stops}
-    return joints | {joint for coupling in spec.couplings for joint in coupling.factors}
+    return joints | {joint for coupling in spec.couplings for joint in coupling.joints}
 
 
 def _is_unconstrained(spec: MachineSpec, series: list[Joint]) -> bool:

@@ -77,7 +77,7 @@ def build_closure(
     loops = spec.loops if loops is None else loops
     # while findings are collected, joints that close loops are missing in the tree
     known_names = set(Coordinates(model).names)
-    present_couplings = tuple(x for x in spec.couplings if known_names >= x.factors.keys())
+    present_couplings = tuple(x for x in spec.couplings if known_names.issuperset(x.joints))
     spec = dataclasses.replace(spec, couplings=present_couplings)
     names = specified_active_joints(spec, model)
     try:
@@ -195,6 +195,7 @@ def assemble_tree(spec: MachineSpec) -> pin.Model:
         )
     model = pin.Model()
     model.name = spec.name
+    model.gravity.linear = np.array(spec.gravity)
     root = tree.root_link
     frame = pin.Frame(
         root,

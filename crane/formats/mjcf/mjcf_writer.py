@@ -1,7 +1,5 @@
 """Write a machine as a MJCF file for MuJoCo."""
 
-import warnings
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +7,19 @@ import pinocchio as pin
 from lxml import etree
 
 from crane.common.atomic_output import replace_file
-from crane.common.errors import CraneWarning, InputError
+from crane.common.errors import InputError
 from crane.description.force_elements import ForceElement, Friction, Rope, element_name
 from crane.description.kinematic_tree import ROTATIONS
 from crane.description.rotation_vectors import ROTATION_COUNT
-from crane.description.specification import Coupling, LoopSpec
+from crane.description.specification import Coupling, Drive, LoopSpec
+from crane.formats.mjcf.massless_struts import find_massless_struts
+from crane.formats.mjcf.mjcf_elements import (
+    add_fixed_tendon,
+    add_inertial,
+    add_tendon,
+    placement_attributes,
+    solve_polynomial,
+)
 from crane.formats.urdf.urdf_writer import (
     format_document,
     origin_text,
@@ -24,8 +30,6 @@ from crane.formats.xml_file import finite_limits, format_numbers
 from crane.machine.machine import Machine
 
 _HINGE_POINT_DISTANCE = 0.1  # [m] between the two points that define a hinge
-_ROUNDING_TOLERANCE = 1e-9  # relative to the largest moment
-_MIN_MOMENT = 1e-14  # [kg m2] smallest moment of inertia that MuJoCo accepts
 
 
 def write_mjcf(machine: Machine, path: str | Path) -> None:
@@ -35,9 +39,10 @@ def write_mjcf(machine: Machine, path: str | Path) -> None:
     the axis; couplings become `joint`, or `tendon` if they have more than two joints. Each drive
     has a motor, with a fixed tendon if it acts along several joints; if the drives are not the
     active joints, a text lists these. Frames are sites, the home configuration is the key "home".
-    Coulomb and viscous friction, springs and rotor inertias are written; damping of force elements
-    along joints becomes viscous friction; force elements and ropes between frames become spatial
-    tendons. A warning lists what is left out. Shapes are not written, so there are no contacts.
+    Gravity, Coulomb and viscous friction, springs and rotor inertias are written; damping of force
+    elements along joints becomes viscous friction; force elements and ropes between frames become
+    spatial tendons. Cylinders without mass, as they are read, become spatial tendons or cranks of
+    actuators. A warning lists what is left out. Shapes are not written, so there are no contacts.
 
     Args:
         machine: The machine with its parameter changes, locked joints and payload.
@@ -82,6 +87,11 @@ class _MjcfWriter:
             and frame.name not in self.moved_links
             and self.tree.links[frame.name].composite_joint is None
         ]
+        struts = find_massless_struts(machine)
+        driven = [x for drive in machine.drives if drive.factors.keys() <= struts.keys()
+                  for x in drive.factors]  # fmt: skip
+        self.struts = {joint: strut for joint, strut in struts.items() if joint in driven}
+        self._strut_joints = {joint for strut in self.struts.values() for joint in strut.joints}
         self.root = etree.Element("mujoco", model=machine.name)
         self.bodies: dict[int, etree._Element] = {}  # by index of the joint
         self.home_coordinates: list[float] = []
@@ -92,7 +102,8 @@ class _MjcfWriter:
         """Return the file's content."""
         add = etree.SubElement
         add(self.root, "compiler", angle="radian", autolimits="false", inertiafromgeom="false")
-        add(self.root, "option", timestep="0.001", gravity="0 0 -9.81", integrator="implicitfast")
+        gravity = format_numbers(self.machine.gravity)
+        add(self.root, "option", timestep="0.001", gravity=gravity, integrator="implicitfast")
         self._add_texts()
         self.bodies[0] = add(self.root, "worldbody")
         pending = [(joint, self.bodies[0]) for joint in reversed(self._child_joints(0))]
@@ -109,10 +120,14 @@ class _MjcfWriter:
         equations = self.machine.closure.equations
         tendons, equality, actuator = map(etree.Element, ("tendon", "equality", "actuator"))
         for loop in equations.loops:
-            self._add_loop(equality, loop)
+            if all(strut.loop is not loop for strut in self.struts.values()):
+                self._add_loop(equality, loop)
         for coupling in equations.couplings:
             self._add_coupling(equality, tendons, coupling)
         for drive in self.machine.drives:
+            if drive.factors.keys() <= self.struts.keys():
+                self._add_strut_drive(actuator, tendons, drive)
+                continue
             target = {"joint": drive.name}
             joints = {
                 self.model.names[int(self.machine.coordinates.joints[self.machine.column(joint)])]
@@ -122,8 +137,10 @@ class _MjcfWriter:
                 (ball,) = joints
                 gear = [drive.factors.get(f"{ball}_{part}", 0.0) for part, _, _ in ROTATIONS]
                 target = {"joint": ball, "gear": format_numbers(gear)}
-            elif dict(drive.factors) != {drive.name: 1.0}:
-                target = {"tendon": _add_fixed_tendon(tendons, drive.name, drive.factors)}
+            elif drive.factors.keys() != {drive.name}:
+                target = {"tendon": add_fixed_tendon(tendons, drive.name, drive.factors)}
+            elif (factor := drive.factors[drive.name]) != 1.0:
+                target["gear"] = format_numbers([factor])
             add(actuator, "motor", {"name": drive.name, **target})
         force_elements: list[ForceElement | Rope] = [*self.machine.forces, *self.machine.ropes]
         for item in force_elements:
@@ -154,7 +171,8 @@ class _MjcfWriter:
 
     def _child_joints(self, joint: int) -> list[int]:
         """Return the joints on the link that a joint moves."""
-        return [i for i in self.joints if self.model.parents[i] == joint]
+        joints = (i for i in self.joints if i not in self._strut_joints)
+        return [i for i in joints if self.model.parents[i] == joint]
 
     def _joints_of_body(self, joint: int) -> list[int]:
         """Return the joints of one body: a joint and those after it up to a link with mass."""
@@ -174,9 +192,9 @@ class _MjcfWriter:
         placements = [pin.SE3.Identity()]
         for i in series:
             placements.append(placements[-1] * self.model.jointPlacements[i])
-        attributes = {"name": self.moved_links[series[-1]]} | _placement_attributes(placements[-1])
+        attributes = {"name": self.moved_links[series[-1]]} | placement_attributes(placements[-1])
         body = etree.SubElement(parent, "body", attributes)
-        _add_inertial(body, self.model.inertias[series[-1]])
+        add_inertial(body, self.model.inertias[series[-1]])
         for i, placement in zip(series, placements[1:], strict=True):
             self._add_joint(body, i, placements[-1].actInv(placement))
         return body
@@ -192,20 +210,74 @@ class _MjcfWriter:
         values = {
             "name": name,
             "type": "hinge" if tree_joint.kind == "revolute" else "slide",
-            **_placement_attributes(pin.SE3(np.eye(3), placement.translation)),
+            **placement_attributes(pin.SE3(np.eye(3), placement.translation)),
             "axis": format_numbers(placement.rotation @ np.array(tree_joint.axis)),
         }
         if (limits := finite_limits(tree_joint.limits)) is not None:
             values |= {"limited": "true", "range": format_numbers(limits)}
-        joint_elements = [item for item in machine.forces if item.joint == name]
-        stiffness = sum(item.stiffness for item in joint_elements)
-        effects = self._joint_effects(name) | {"stiffness": stiffness}
-        values |= {key: format_numbers([value]) for key, value in effects.items() if value}
-        if stiffness:
-            rest = sum(item.stiffness * item.rest for item in joint_elements) / stiffness
-            values["springref"] = format_numbers([rest])
+        values |= self._joint_attributes(name, "springref")
         etree.SubElement(body, "joint", values)
         self.home_coordinates.append(float(machine.home[column]))
+
+    def _joint_attributes(self, name: str, rest_attribute: str) -> dict[str, str]:
+        """Return the attributes for rotor inertia, friction and springs of a joint."""
+        joint_elements = [item for item in self.machine.forces if item.joint == name]
+        stiffness = sum(item.stiffness for item in joint_elements)
+        effects = self._joint_effects(name) | {"stiffness": stiffness}
+        if stiffness:
+            rest = sum(item.stiffness * item.rest for item in joint_elements) / stiffness
+            effects[rest_attribute] = rest
+        return {
+            key: format_numbers([value])
+            for key, value in effects.items()
+            if value or key == rest_attribute
+        }
+
+    def _add_strut_drive(
+        self, actuator: etree._Element, tendons: etree._Element, drive: Drive
+    ) -> None:
+        """Add the motor of struts along a spatial tendon, or of a slider-crank.
+
+        The parts of the tendon are its branches, whose divisors are gear / factor.
+        """
+        gear = max(drive.factors.values(), key=abs)
+        motor = {"name": drive.name, "gear": format_numbers([gear])}
+        struts = [self.struts[joint] for joint in drive.factors]
+        effects = self._joint_attributes(struts[0].joint, "springlength")
+        if any(gear * factor < 0 for factor in drive.factors.values()) or (
+            len(struts) > 1 and any(strut.rod_length for strut in struts)
+        ):
+            self.unsupported.append(f"the drive {drive.name}")
+            return
+        sites = [
+            tuple(self._frame_site(link)[2] for link in (strut.base, strut.loop.successor))
+            for strut in struts
+        ]
+        if struts[0].rod_length:
+            crank = {"slidersite": sites[0][0], "cranksite": sites[0][1]}
+            crank["cranklength"] = format_numbers([struts[0].rod_length])
+            etree.SubElement(actuator, "motor", motor | crank)
+            self.unsupported += [f"{key} of {drive.name}" for key in effects]
+            return
+        tendon = add_tendon(tendons, "spatial", drive.name)
+        for ends, factor in zip(sites, drive.factors.values(), strict=True):
+            if len(sites) > 1:
+                etree.SubElement(tendon, "pulley", divisor=format_numbers([gear / factor]))
+            for site in ends:
+                etree.SubElement(tendon, "site", site=site)
+        if len(struts) == 1:
+            if (limits := finite_limits(self.tree.joints[struts[0].joint].limits)) is not None:
+                effects |= {"limited": "true", "range": format_numbers(limits)}
+            tendon.attrib.update(effects)
+        else:
+            alone = {tuple(x.factors) for x in self.machine.drives}  # written with their tendon
+            parts = (x.joint for x in struts if (x.joint,) not in alone)
+            self.unsupported += [
+                f"friction, springs and rotors of {joint}"
+                for joint in parts
+                if self._joint_attributes(joint, "springlength")
+            ]
+        etree.SubElement(actuator, "motor", motor | {"tendon": str(tendon.get("name"))})
 
     def _joint_effects(self, name: str) -> dict[str, float]:
         """Return rotor inertia and friction along a coordinate by attribute."""
@@ -230,7 +302,7 @@ class _MjcfWriter:
         is_ball = len(names) == ROTATION_COUNT
         values = {"name": self.model.names[joint], "type": "ball" if is_ball else "free"}
         if is_ball:
-            values |= _placement_attributes(pin.SE3(np.eye(3), placement.translation))
+            values |= placement_attributes(pin.SE3(np.eye(3), placement.translation))
             # the rotation in the axes of the body
             turn = placement.rotation @ data.joints[joint].M.rotation @ placement.rotation.T
             *_, x, y, z, w = pin.SE3ToXYZQUAT(pin.SE3(turn, np.zeros(3)))
@@ -253,7 +325,7 @@ class _MjcfWriter:
         while name in self.site_names:
             name += "_"
         self.site_names.add(name)
-        site = etree.Element("site", {"name": name} | _placement_attributes(placement))
+        site = etree.Element("site", {"name": name} | placement_attributes(placement))
         first = body.find("body")
         if first is None:
             body.append(site)
@@ -297,9 +369,11 @@ class _MjcfWriter:
         attributes = {"name": coupling.name, "solref": "0.002 1"}
         coefficients = [offset, *(derivatives or [0.0]), 0, 0, 0]
         tag = "joint"
+        if coupling.powers:
+            joints, coefficients = solve_polynomial(coupling)
         if len(joints) > 2:
             tag, coefficients = "tendon", [coupling.offset, 0, 0, 0, 0]
-            joints = [_add_fixed_tendon(tendons, coupling.name, coupling.factors)]
+            joints = [add_fixed_tendon(tendons, coupling.name, coupling.factors)]
         attributes |= {f"{tag}{i}": name for i, name in enumerate(joints, start=1)}
         attributes["polycoef"] = format_numbers(coefficients)
         etree.SubElement(equality, tag, attributes)
@@ -327,55 +401,8 @@ class _MjcfWriter:
                 values["damping"] = [item.damping]
         if not values:
             return
-        tendon = _add_tendon(tendons, "spatial", "_".join(links))
+        tendon = add_tendon(tendons, "spatial", "_".join(links))
         for key, numbers in values.items():
             tendon.set(key, format_numbers(numbers))
         for link in links:
             etree.SubElement(tendon, "site", site=self._frame_site(link)[2])
-
-
-def _add_tendon(tendons: etree._Element, tag: str, name: str) -> etree._Element:
-    """Add a tendon under a unique name."""
-    while any(tendon.get("name") == name for tendon in tendons):
-        name += "_"
-    return etree.SubElement(tendons, tag, name=name)
-
-
-def _add_fixed_tendon(tendons: etree._Element, name: str, factors: Mapping[str, float]) -> str:
-    """Add a fixed tendon, and return its name."""
-    tendon = _add_tendon(tendons, "fixed", name)
-    for joint, factor in factors.items():
-        etree.SubElement(tendon, "joint", joint=joint, coef=format_numbers([factor]))
-    return str(tendon.get("name"))
-
-
-def _placement_attributes(placement: pin.SE3) -> dict[str, str]:
-    """Return the attributes of a placement that differ from the default."""
-    found = {}
-    if placement.translation.any():
-        found["pos"] = format_numbers(placement.translation)
-    if not np.array_equal(placement.rotation, np.eye(3)):
-        x, y, z, w = pin.Quaternion(placement.rotation).normalize().coeffs()
-        found["quat"] = format_numbers([w, x, y, z])
-    return found
-
-
-def _add_inertial(body: etree._Element, inertia: pin.Inertia) -> None:
-    """Add principal moments and axes; MuJoCo requires positive, physically feasible moments."""
-    moments, axes = np.linalg.eigh(inertia.inertia)
-    if np.linalg.det(axes) < 0:
-        axes[:, 0] *= -1
-    moments = np.maximum(moments, _MIN_MOMENT)
-    violation = moments[2] - moments[0] - moments[1]
-    if violation > _ROUNDING_TOLERANCE * moments[2]:
-        warnings.warn(
-            f"the inertia of '{body.get('name')}' is of no possible body by {violation:.2g} kg "
-            "m2, which MuJoCo refuses: two moments are written larger",
-            CraneWarning,
-            stacklevel=5,
-        )
-    if violation > 0:
-        moments[:2] += (0.5 + 1e-15) * violation
-    values = {"pos": format_numbers(inertia.lever), "mass": format_numbers([inertia.mass])}
-    values |= _placement_attributes(pin.SE3(axes, np.zeros(3)))
-    etree.SubElement(body, "inertial", {**values, "diaginertia": format_numbers(moments)})

@@ -13,15 +13,17 @@ from lxml import etree
 from crane.common.atomic_output import replace_folder
 from crane.common.errors import CraneError, CraneWarning, InputError, OutputError
 from crane.common.samples import Array
+from crane.common.unit_conversions import KeyPath
 from crane.description.force_elements import Friction
 from crane.description.kinematic_tree import inertia_problem
+from crane.description.machine_parameters import GRAVITY_PREFIX
 from crane.description.machine_schema import END_STOP, FORCE, GAS_SPRING, LOOP, ROPE
 from crane.description.parameter_changes import lock_joints
 from crane.description.specification import Chain, MachineSpec
 from crane.dynamics.dynamics import Dynamics
 from crane.formats.machine_file.machine_reader import read_machine_spec, read_plain_data
 from crane.formats.machine_file.machine_writer import friction_data
-from crane.formats.machine_file.yaml_text import KeyPath, format_yaml
+from crane.formats.machine_file.yaml_text import format_yaml
 from crane.formats.machine_loading import load
 from crane.formats.parallel_robots import is_parallel_robot
 from crane.identification.mechanics.base_parameters import random_samples
@@ -125,7 +127,8 @@ def check_rewritable(machine: Machine) -> None:
     """Check that the files of a machine can be written with other parameters.
 
     Raises:
-        InputError: The format is not supported, or the machine has parameter changes.
+        InputError: The format is not supported, or the machine has parameter changes other than
+            its gravity.
     """
     if any(chain.urdf.suffix.lower() != ".urdf" for chain in machine.chains) or (
         not (machine.path.suffix.lower() == ".urdf") and is_parallel_robot(machine.path)
@@ -134,7 +137,7 @@ def check_rewritable(machine: Machine) -> None:
             f"{machine.path.name}: an identified machine needs a machine file or URDF, make "
             f"one: crane convert {machine.command_line_arguments} FOLDER"
         )
-    if machine.parameter_changes:
+    if not all(name.startswith(GRAVITY_PREFIX) for name in machine.parameter_changes):
         raise InputError(
             f"'{machine.name}' was loaded with parameter changes, identify it as its files "
             "describe it"
@@ -193,6 +196,8 @@ def _machine_file_content(
             data["tip"] = machine.tip
     else:
         data = read_plain_data(machine.path)
+    if machine.gravity != spec.gravity:
+        data["gravity"] = list(machine.gravity)
     data["source"] = f"{origin_text}; else {machine.source or machine.path.name}"
     for chain in data["chains"]:
         chain["urdf"] = names[chain["name"]]
@@ -235,7 +240,8 @@ def _machine_file_content(
     for key in ("loops", "forces", "gas_springs", "ropes", "end_stops", "rotor_inertia"):
         if not data.get(key):
             data.pop(key, None)
-    return format_yaml(data, _uncertainty_notes(result, data)), motor_urdfs
+    notes = _uncertainty_notes(result, data)
+    return format_yaml(data, notes, spec.written_numbers), motor_urdfs
 
 
 def _uncertainty_notes(result: Identification, data: Mapping[str, Any]) -> dict[KeyPath, str]:

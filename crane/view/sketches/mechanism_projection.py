@@ -9,7 +9,7 @@ import pinocchio as pin
 
 from crane.common.samples import Array
 from crane.machine.machine import Machine
-from crane.motion.workspaces.workspace_section import WorkspaceSection, up_direction
+from crane.motion.workspaces.workspace_section import WorkspaceSection
 from crane.view.sketches.sketch_canvas import convex_hull
 from crane.view.sketches.sketch_elements import (
     DrawingPlane,
@@ -347,7 +347,7 @@ def _forward_direction(
         length = float(np.linalg.norm(offset))
         if length > 0:
             return np.asarray(offset / length)
-        lateral = np.cross(section.second_direction, up_direction(machine))
+        lateral = np.cross(section.second_direction, machine.up_direction)
         return np.asarray(lateral if lateral.any() else np.eye(3)[0])
     if section.slewing_joint is None:
         return section.first_direction
