@@ -312,9 +312,67 @@ def test_interrupt_is_one_line_and_leaves_nothing(tmp_path, delay):
         out, rest = process.communicate(timeout=300)
     assert (process.returncode, out) == (130, "")
     *before_it, line = rest.splitlines()
-    assert line == "error: interrupted, nothing was written"
+    assert line == "error: interrupted, no result was written"
+    left = set(tmp_path.rglob("*")) - before
+    if left:  # variants were finished
+        file = tmp_path / "new" / "run" / "unfinished.csv"
+        assert left == {file, *file.parents[:2]}
+        said = f"what is finished is kept in {file}: add --resume to go on"
+        assert before_it.pop() == said
     assert all(other.startswith("warning: ") for other in before_it)
-    assert set(tmp_path.rglob("*")) == before
+
+
+DRAWN = """
+import os, time
+import crane.view.plots.figure_style as figure_style
+
+
+class Object:
+    def __del__(self):  # where Python ignores what is raised
+        os.kill(os.getpid(), {number})
+        for _ in range(1000):
+            pass
+
+
+def ignored():
+    Object()
+    time.sleep(30)
+
+
+def replaced():
+    try:
+        os.kill(os.getpid(), {number})
+        time.sleep(30)
+    except BaseException as error:
+        raise RuntimeError("something of a library's own") from error
+
+
+def write_figure(path, draw):
+    path.write_bytes(b"half")
+    {what}()
+
+
+figure_style.write_figure = write_figure
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["ignored", "replaced"])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_while_figures_are_drawn_is_one_line_and_leaves_no_parts(tmp_path, what, number):
+    out = tmp_path / "new" / "run"
+    code = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n{DRAWN}"
+    command = [sys.executable, "-c", code.format(number=int(number), what=what) + MAIN, "study"]
+    command += ["mini_forwarder", "--vary", "payload.mass=0:0.3:2", "--measure", "mass"]
+    command += ["--processes", "1", "--out", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (128 + number, "")
+    assert done.stderr.splitlines() == [
+        f"what is finished is kept in {out / 'unfinished.csv'}: add --resume to go on",
+        "error: interrupted, no result was written",
+    ]
+    left = [path.relative_to(tmp_path) for path in tmp_path.rglob("*")]
+    assert sorted(map(str, left)) == ["new", "new/run", "new/run/unfinished.csv"]
 
 
 CUT = """

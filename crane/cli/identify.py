@@ -38,6 +38,7 @@ from crane.cli.parsing import (
     parse_values,
     parse_window,
 )
+from crane.cli.resumable_output import OptionalResumableFolder
 from crane.cli.terminal import progress_bar, status
 from crane.common.errors import CraneWarning, InputError, RecordingError, check_name
 from crane.common.result import Result
@@ -421,7 +422,7 @@ def calibrate(
     recording: RecordingFiles,
     options: ParameterOptions,
     reading: RecordingOptions,
-    output: OptionalOutputFolder,
+    output: OptionalResumableFolder,
     fit: Fit,
     train: TrainingWindow = None,
     validation: Validation = None,
@@ -435,10 +436,11 @@ def calibrate(
     paths, held_out = (
         [recording_file(x) for x in given or ()] for given in (recording, validation)
     )
-    with progress_bar("simulating") as progress:
-        result = crane.calibrate(
-            loaded, paths, fits, train=window, validation=held_out,
-            columns=reading.columns, span=reading.span, sensors=parse_names(sensors),
-            progress=progress,
-        )  # fmt: skip
-    output.write(result, f"; see {output.out}/report.html")
+    with output.checkpoint() as checkpoint:
+        with progress_bar("simulating") as progress:
+            result = crane.calibrate(
+                loaded, paths, fits, train=window, validation=held_out,
+                columns=reading.columns, span=reading.span, sensors=parse_names(sensors),
+                checkpoint=checkpoint, progress=progress,
+            )  # fmt: skip
+        output.write(result, f"; see {output.out}/report.html")

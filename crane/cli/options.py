@@ -15,7 +15,7 @@ from crane.cli.parsing import parse_arguments, parse_changes, parse_names
 from crane.cli.terminal import status
 from crane.common.atomic_output import check_file_is_writable, check_folder_is_writable
 from crane.common.errors import OutputError
-from crane.common.result import Result
+from crane.common.result import UNFINISHED, Result
 
 # Arguments and options of several commands that are not part of a block.
 MachineName = Annotated[
@@ -349,8 +349,9 @@ class OptionalOutputFolder(OptionBlock):
         if self.out is None:
             print(result_summary(result, **options).rstrip())
             return
+        overwrite = self.force or (self.out / UNFINISHED).is_file()  # which the result replaces
         with status("writing the results"):
-            text = result.write(self.out, self.force, **options)
+            text = result.write(self.out, overwrite, **options)
         print(f"{text.rstrip()}\n\nwritten to {self.out}{note}")
 
 

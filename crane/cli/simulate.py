@@ -97,7 +97,7 @@ def write_demo(folder: Path, progress: Callable[[float], None]) -> str:
         texts.append(recording.write(folder / task, views=True))
     progress(1.0)
     text = "\n".join(texts)
-    (folder / SUMMARY).write_text(text, encoding="utf-8")
+    (folder / SUMMARY).write_text(text, encoding="utf-8", errors="backslashreplace")
     return text
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from lxml import etree
 
 from crane.common.errors import CraneWarning
+from crane.common.number_text import parse_float
 from crane.common.plausible_ranges import LONGEST
 from crane.common.samples import Array
 from crane.description.kinematic_tree import inertia_problem
@@ -47,7 +48,7 @@ def read_numbers(element: etree._Element | None, key: str, count: int) -> Array 
     """Return the finite numbers of an attribute, None if it has others."""
     text = None if element is None else element.get(key)
     try:
-        found = np.array([float(word) for word in (text or "").split()])
+        found = np.array([parse_float(word) for word in (text or "").split()])
     except ValueError:
         return None
     return found if found.shape == (count,) and np.isfinite(found).all() else None
