@@ -309,8 +309,8 @@ INERTIAS = [
     seen(
         [
             "ground.urdf:21: warning: link 'crank_arm' has a radius of gyration of 63.2 m, "
-            "and its joints and its centre of mass are at most 0.2 m from its origin, correct the "
-            "inertia (kg m2, about the centre of mass) or the mass (kg)"
+            "and its joints and its centre of mass are at most 0.2 m from its origin, correct "
+            "the inertia (kg m2, about the centre of mass) or the mass (kg)"
         ],
         swap(
             CRANK_INERTIA,
@@ -321,8 +321,8 @@ INERTIAS = [
     seen(
         [
             "ground.urdf:21: warning: link 'crank_arm' has a radius of gyration of 8.16e-05"
-            " m, and its joints and its centre of mass are at most 0.2 m from its origin, correct the "
-            "inertia (kg m2, about the centre of mass) or the mass (kg)"
+            " m, and its joints and its centre of mass are at most 0.2 m from its origin, correct "
+            "the inertia (kg m2, about the centre of mass) or the mass (kg)"
         ],
         swap(
             CRANK_INERTIA,
@@ -442,7 +442,8 @@ MECHANISM = [
     seen(
         [
             "four_bar.yaml:10: error: loop 'pin' cannot be closed from the home guess "
-            "(crank = 1.2): its smallest gap is 10 mm and 5.73 deg, correct the frames or the guess"
+            "(crank = 1.2): its smallest gap is 10 mm and 5.73 deg, correct the frames or "
+            "the guess"
         ],
         swap('<origin xyz="0.3 0 0"/>', '<origin xyz="0.3 0 0.01" rpy="0.1 0 0"/>', ROCKER),
     ),
