@@ -51,7 +51,7 @@ def study(
     draws: Annotated[int | None, typer.Option(help="Number of random variants.")] = None,
     seed: Seed = 0,
 ) -> None:
-    """Evaluate measures for many parameter values, on a grid or at random."""
+    """Evaluate measures for parameter values (grid, random)."""
     axes = parse_grids(vary) if draws is None else parse_ranges(vary)
     with progress_bar("computing variants") as progress:
         result = crane.study(

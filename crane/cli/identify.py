@@ -225,8 +225,8 @@ def identify(
 ) -> None:
     """Estimate inertial parameters and joint friction.
 
-    The recordings contain coordinates and forces. Validation data are those that --train leaves
-    out, or another file (--validation).
+    The recordings contain coordinates and forces. The estimate is validated
+    with the data that --train leaves out, or with another file (--validation).
     """
     from crane.common.samples import as_number
     from crane.identification.mechanics.cross_validation import format_trials, identify_options
@@ -381,7 +381,7 @@ def circuit(
     ] = None,
     validation: Validation = None,
 ) -> None:
-    """Estimate orifices, valve characteristic or friction of one cylinder.
+    """Estimate valve parameters or friction of one cylinder.
 
     The recordings contain valve signals and pressures. The model 'orifices' also
     estimates the bulk modulus.

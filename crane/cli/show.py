@@ -90,8 +90,8 @@ def plot(
 ) -> None:
     """Plot coordinates, velocities and forces of a run.
 
-    The path of the tip is drawn beside them. The suffix of the file determines the format: png,
-    svg or pdf.
+    The path of the tip is drawn beside them. The suffix of the file
+    determines the format: png, svg or pdf.
     """
     from crane.view.result_files import FIGURE, plot_result
 

@@ -200,8 +200,9 @@ def simulate(
 ) -> None:
     """Simulate a task, a path, or measured valve signals.
 
-    Without --task, --path and --inputs, the machine starts at home and is held there
-    (--controller) or moves freely. --from, --until and --columns apply to --inputs.
+    Without --task, --path and --inputs, the machine starts at home and is held
+    there (--controller) or moves freely. --from, --until and --columns apply to
+    --inputs.
     """
     loaded = add_task_loads(options.load(machine), motion.task)
     loaded = loaded.with_external_forces(*map(parse_load, load or ()))
