@@ -32,7 +32,7 @@ from crane.cli.terminal import status
 from crane.common.errors import CraneWarning, InputError
 from crane.common.result import Result
 
-ChartStep = Annotated[float | None, number_option("m", "Distance of grid points in m.", "--step")]
+ChartStep = Annotated[float | None, number_option("m", "Grid spacing in m.", "--step")]
 
 
 @command()

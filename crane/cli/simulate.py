@@ -240,7 +240,7 @@ def _write_stopped_run(output: OutputFolder, npz: bool) -> Iterator[None]:
         if recording is None:
             raise
         recording.write(output.out, output.force, npz=npz)
-        text = f"{stop}; the run until t = {recording.time[-1]:.6g} s is in {output.out}"
+        text = f"{stop}; results until t = {recording.time[-1]:.6g} s are written to {output.out}"
         if isinstance(stop, CraneError):
             raise SimulationError(text) from stop
         print_message(text)
