@@ -98,7 +98,7 @@ def test_info_says_what_the_machine_is():
     assert "4: 8 independent equations, 12 redundant" in result.stdout
     assert "q4+q9, then q10+q2, then q6+q11, then q7+q3" in result.stdout
     assert "task        lift, 10 s: lifts along a straight line" in result.stdout
-    assert "condition number of the active coordinates: 2.71 at home\n" in result.stdout
+    assert "coordinates condition number of the active ones 2.71 at home\n" in result.stdout
     assert re.search(r"^  driven ", result.stdout, re.M) is None  # free ones are among them
 
 

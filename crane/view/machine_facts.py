@@ -123,7 +123,7 @@ def _loop_facts(machine: Machine) -> Iterator[MachineFact]:
             "+".join(machine.joints[closure.passive[i]] for i in columns)
             for _, columns in structure.blocks
         ]
-        yield MachineFact("loop order", f"solved in the order {', then '.join(order)}")
+        yield MachineFact("loop order", f"solved for {', then '.join(order)}")
 
 
 def _drive_facts(machine: Machine) -> Iterator[MachineFact]:
@@ -149,8 +149,8 @@ def _drive_facts(machine: Machine) -> Iterator[MachineFact]:
         ]
         hint = f"; better with {better_selections[0]}" if better_selections else ""
         yield MachineFact(
-            "condition",
-            f"condition number of the active coordinates: {condition_number:.3g} at home{hint}",
+            "coordinates",
+            f"condition number of the active ones {condition_number:.3g} at home{hint}",
         )
     if any(inertia.mass for inertia in list(machine.model.inertias)[1:]):
         backend = Dynamics(machine).backend_of("forward")
