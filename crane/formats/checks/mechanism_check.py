@@ -70,15 +70,13 @@ def check_mechanism(spec: MachineSpec, findings: Findings) -> Closure | None:
 def _report_with_gaps(
     spec: MachineSpec, model: pin.Model, initial_guess: Array, error: MechanismError
 ) -> None:
-    gaps = {}
+    text, gaps = str(error), {}
     if isinstance(error, OpenLoopError):
-        gaps, error = (
-            _loop_gaps(spec, model, initial_guess),
-            add_remedy(spec, model, initial_guess, error),
-        )
-    text, reason = str(error), error.reason.rpartition("' ")[2]
-    if own_gap := gaps.pop(error.subject, ""):  # instead of the largest residual
-        text = text.replace(f"it {reason}", f"its smallest gap is {own_gap}")
+        gaps = _loop_gaps(spec, model, initial_guess)
+        text = str(add_remedy(spec, model, initial_guess, error))
+        if own_gap := gaps.pop(error.subject, ""):  # instead of the largest residual
+            residual_text = error.reason.rpartition("' ")[2]
+            text = text.replace(f"it {residual_text}", f"its smallest gap is {own_gap}")
     report_error(MechanismError(text, error.subject))
     for subject, gap in gaps.items():
         problem = (
