@@ -180,8 +180,9 @@ class ModelOptions(OptionBlock):
         list[str] | None,
         typer.Option(
             metavar="[NAME=]STD",
-            help="Prior standard deviation, relative of all parameters, e.g. 0.3; or by name, "
-            "e.g. bodies=10%, q1.viscous=200+-50; none: no prior; may be repeated.",
+            help="Prior standard deviation: one relative value for all parameters, e.g. 0.3, or "
+            "by name, e.g. bodies=10% or q1.viscous=200+-50 (value +- std). none: without the "
+            "prior of the machine file. May be repeated.",
         ),
     ] = None
     feasible: Annotated[
@@ -217,16 +218,16 @@ def identify(
         typer.Option(
             "--try",
             metavar="NAME=VALUES",
-            help="Values from which cross-validation of the training data selects one, e.g. "
-            "bandwidth=5,10 or, for a prior, bodies=1%,10%; may be repeated.",
+            help="Candidate values, e.g. bandwidth=5,10 or, for a prior, bodies=1%,10%; the best "
+            "is selected by cross-validation on the training data. May be repeated.",
         ),
     ] = None,
     trust: Trust = False,
 ) -> None:
     """Estimate inertial parameters and joint friction.
 
-    The recordings contain coordinates and forces. --train or --validation select held-out data,
-    which validate the estimate.
+    The recordings contain coordinates and forces. The estimate is validated
+    with the data that --train leaves out, or with another file (--validation).
     """
     from crane.common.samples import as_number
     from crane.identification.mechanics.cross_validation import format_trials, identify_options
@@ -378,7 +379,7 @@ def circuit(
     ] = None,
     validation: Validation = None,
 ) -> None:
-    """Estimate orifices, valve or friction of a cylinder.
+    """Estimate valve parameters or friction of one cylinder.
 
     The recordings contain valve signals and pressures. The model 'orifices' also
     estimates the bulk modulus.

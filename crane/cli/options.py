@@ -113,12 +113,14 @@ TrainingWindow = Annotated[
     typer.Option(
         "--train",
         metavar="FROM:TO",
-        help="Start and end of the training data in s; the rest is used for validation.",
+        help="Start and end of the training data in s; the rest validates the estimate.",
     ),
 ]
 Validation = Annotated[
     list[Path] | None,
-    typer.Option(metavar="FILE", help="A held-out recording for validation; may be repeated."),
+    typer.Option(
+        metavar="FILE", help="Another recording that validates the estimate; may be repeated."
+    ),
 ]
 Trust = Annotated[
     bool,
@@ -197,7 +199,8 @@ class PackageOptions(OptionBlock):
     packages: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="FOLDER", help="A folder of packages to which files refer; may be repeated."
+            metavar="FOLDER",
+            help="A folder with ROS packages (package:// paths); may be repeated.",
         ),
     ] = None
     argument: Annotated[
@@ -229,7 +232,8 @@ class AssemblyOptions(PackageOptions):
     floating: Annotated[
         bool,
         typer.Option(
-            "--floating", help="Give the root a floating base, e.g. of a vehicle or humanoid."
+            "--floating",
+            help="Connect the root to the world by a 6-DOF joint (vehicle, humanoid).",
         ),
     ] = False
 
