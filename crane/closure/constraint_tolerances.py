@@ -208,13 +208,14 @@ class ExactConstraints:
 
     def _reduce_residual(self, q: Array, movable: Indices, tolerance: float) -> Array:
         """Damped Gauss-Newton steps towards a scaled residual."""
-        q = q.copy()
+        q, units = q.copy(), self._equations.step_units[movable]
         for _ in range(200):
-            phi, jacobian = self._equations.evaluate_scaled(q)
+            phi, jacobian = self._equations.evaluate(q)
+            phi = phi / self._residual_units
             if np.abs(phi).max(initial=0.0) < tolerance:
                 break
-            step = least_squares_step(jacobian[:, movable], phi)
-            q[movable] += step * self._coordinate_units[movable]
+            scaled_jacobian = jacobian[:, movable] / self._residual_units[:, None] * units
+            q[movable] += least_squares_step(scaled_jacobian, phi) * units
         return q
 
     def intended_jacobian(self, q: Array) -> Array:
