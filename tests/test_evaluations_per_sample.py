@@ -7,7 +7,8 @@ from forwarder_motions import motion
 
 import crane
 from crane.dynamics import Dynamics
-from crane.identification.mechanics import force_comparison
+from crane.identification.mechanics import force_delays
+from crane.identification.mechanics.force_delays import ForceDelays
 from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.identify_payload import identify_payload
 from crane.recordings import Recording
@@ -32,7 +33,7 @@ def recording(mini):
 @pytest.fixture
 def undelayed(monkeypatch):
     """Without the search for delays, which looks at samples of its own."""
-    nothing = np.full(3, np.nan), np.full(3, np.nan), 0
+    nothing = ForceDelays(("q1", "X1", "X2"), *np.full((3, 3), np.nan), 0)
     monkeypatch.setattr("crane.identification.mechanics.identify.force_delays", lambda *_: nothing)
 
 
@@ -51,7 +52,7 @@ def test_delays_are_looked_for_in_few_samples(mini, recording, monkeypatch):
     N = len(recording.time)
     with passes(monkeypatch) as count:
         identify(mini, recording)
-    assert count["closed"] <= N + min(force_comparison._MAX_SAMPLES, N) + ASIDE
+    assert count["closed"] <= N + min(force_delays._MAX_SAMPLES, N) + ASIDE
 
 
 def test_a_sample_is_closed_once_on_its_way_to_the_payload(mini, recording, monkeypatch):

@@ -24,6 +24,7 @@ from crane.cli.options import (
     RecordingFiles,
     RecordingOptions,
     Seed,
+    ShiftedRecordingOptions,
     TrainingWindow,
     Trust,
     Validation,
@@ -192,7 +193,7 @@ def identify(
     recording: RecordingFiles,
     model: ModelOptions,
     options: ParameterOptions,
-    reading: RecordingOptions,
+    reading: ShiftedRecordingOptions,
     output: OutputFolder,
     train: TrainingWindow = None,
     validation: Validation = None,
@@ -247,7 +248,7 @@ def identify(
             stacklevel=1,
         )
     names = _recording_names(recording, validation, train, bool(judges))
-    judges += _read(validation or [], loaded, RecordingOptions(columns=reading.columns))
+    judges += _read(validation or [], loaded, replace(reading, since=None, until=None))
     if bandwidth is not None:
         shortest = max(min(float(x.time[-1] - x.time[0]) for x in inside), 1e-3)
         as_number(bandwidth, "the bandwidth", "Hz", greater_than=5 / shortest)
@@ -329,7 +330,7 @@ def payload(
     machine: MachineName,
     recording: RecordingFile,
     options: ParameterOptions,
-    reading: RecordingOptions,
+    reading: ShiftedRecordingOptions,
     frame: Frame = None,
     method: Method = "wls",
     trust: Trust = False,

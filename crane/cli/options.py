@@ -287,6 +287,29 @@ class RecordingOptions(TimeOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ShiftedRecordingOptions(RecordingOptions):
+    """Which part and which columns of a recording are read, without their delays."""
+
+    shift: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="COLUMN=SECONDS",
+            help="Delay of a column that is taken out, negative if it is ahead of the others, "
+            "e.g. *_force=0.03; may be repeated.",
+        ),
+    ] = None
+
+    def read(
+        self, path: Path, machine: "crane.Machine | None" = None, needs: Any = ()
+    ) -> "crane.Recording":
+        """Read a recording, and shift its columns."""
+        recording = super().read(path, machine, needs)
+        if not self.shift:
+            return recording
+        return crane.recordings.shift_columns(recording, parse_values("--shift", self.shift))
+
+
+@dataclass(frozen=True, kw_only=True)
 class ParallelOptions(OptionBlock):
     """Where variants are computed."""
 

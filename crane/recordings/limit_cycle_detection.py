@@ -1,6 +1,6 @@
 """Limit cycles: sustained oscillations that are not commanded, of a circuit or controller."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +12,11 @@ from crane.recordings.recording import REFERENCE_PREFIX, Recording
 
 _MIN_PERIODS = 8  # least number of periods
 _MIN_DECAY_RATIO = 0.85  # ratio of the last to the first swings: a damping ratio below 0.003
-_MAX_PERIOD_SPREAD = 0.15  # standard deviation of the periods over their mean
-_MAX_SWING_SPREAD = 0.25  # standard deviation of the half swings over their mean
+_MIN_TIME_SHARE = 0.5  # of the time without a change of command, least duration
+_MANY_PERIODS = 60  # number of periods that counts as sustained in any case
+_MIN_EVEN_SHARE = 0.75  # of the swings of a side and of the periods, which are even
+_MAX_PERIOD_RANGE = 0.33  # range of the even periods over their median
+_MAX_SWING_RANGE = 0.5  # range of the even half swings of one side over their median
 _MIN_RELATIVE_AMPLITUDE = 0.01  # of the largest value of a channel, least amplitude
 _MIN_PRESSURE_AMPLITUDE = 1e5  # least amplitude of a pressure [Pa]
 _MIN_PERIOD_SAMPLES = 4  # least number of samples per period
@@ -41,14 +44,16 @@ class LimitCycle:
 
 
 def sustained_oscillation(
-    time: Array, values: Array, least: float, commands: Iterable[Array] = (), name: str = ""
+    time: Array, values: Array, least: float, commands: Sequence[Array] = (), name: str = ""
 ) -> LimitCycle | None:
     """Largest oscillation of samples that lasts eight even periods without decay.
 
     Moving means of doubling widths are subtracted from the samples; the difference crosses zero
     twice per period. Widths of one to two and a half periods are used. An oscillation decays if
-    the swings of its last quarter of eight periods are below 0.85 of those of the first; it is
-    commanded if a command reverses in at least half of the periods.
+    the swings of its last quarter of eight periods are below 0.85 of those of the first. One that
+    begins and ends while commands do not change is a transient, or noise, unless it lasts half of
+    that time or sixty periods. It is commanded if a command reverses in at least half of the
+    periods.
 
     Args:
         time: Equidistant instants (N,) [s].
@@ -59,6 +64,7 @@ def sustained_oscillation(
     """
     least = max(least, _MIN_RELATIVE_AMPLITUDE * float(np.abs(values).max(initial=0.0)))
     found: LimitCycle | None = None
+    changes = np.concatenate([[0, len(values)], *map(_command_changes, commands)])
     width = _MIN_PERIOD_SAMPLES
     while width * _MIN_PERIODS <= 2.5 * len(values):
         for first, last, period in _oscillation_spans(
@@ -68,6 +74,10 @@ def sustained_oscillation(
             if amplitude < max(least, 0.0 if found is None else found.amplitude):
                 continue
             cycles = (last - first) / period
+            since = changes[changes <= first + period].max()
+            until = changes[changes >= last - period].min()
+            if cycles < _MANY_PERIODS and last - first < _MIN_TIME_SHARE * (until - since):
+                continue
             if any(2 * _reversal_count(command[first:last]) >= cycles for command in commands):
                 continue
             length = period * float(time[last - 1] - time[first]) / (last - 1 - first)
@@ -80,7 +90,8 @@ def sustained_oscillation(
 def limit_cycles(recording: Recording) -> list[LimitCycle]:
     """Limit cycles of pressures, the largest first.
 
-    Commands are the references, without these the valve signals, and external loads.
+    Commands are the references, without these the valve signals, external loads, and revolutions
+    of joints that turn on.
     """
     channels, units = recording.channels, recording.channel_units
     names = [x for x in channels if x.startswith("pressure_") and units.get(x) == "Pa"]
@@ -92,7 +103,7 @@ def limit_cycles(recording: Recording) -> list[LimitCycle]:
     ]
     prefixes = _COMMAND_PREFIXES[:1] if references else _COMMAND_PREFIXES
     references += [x for x in channels if x.startswith(prefixes)]
-    commands = [channels[x] for x in references]
+    commands = [channels[x] for x in references] + _revolutions(recording) + _arrivals(recording)
     found = []
     for name in names:
         release_pages()
@@ -102,6 +113,27 @@ def limit_cycles(recording: Recording) -> list[LimitCycle]:
             )
         )
     return sorted((x for x in found if x is not None), key=lambda one: -one.amplitude)
+
+
+def _revolutions(recording: Recording) -> list[Array]:
+    """Cosines (N,) of how far joints have turned, of those that turn by more than a revolution."""
+    units, columns = recording.units | recording.channel_units, recording.columns()
+    turned = [columns[x] - columns[x][0] for x, unit in units.items() if unit == "rad"]
+    return [
+        np.cos(np.maximum.accumulate(np.sign(angle[-1]) * angle))
+        for angle in turned
+        if abs(angle[-1]) > 2 * np.pi
+    ]
+
+
+def _arrivals(recording: Recording) -> list[Array]:
+    """Steps (N,) from 1 to 0 where a joint arrives at the end of its motion, as at an end stop."""
+    return [
+        np.maximum.accumulate(np.abs(x - x[-1])[::-1] > _MIN_RELATIVE_AMPLITUDE * np.ptp(x))[
+            ::-1
+        ].astype(float)
+        for x in recording.q.T
+    ]
 
 
 def limit_cycle_message(recording: Recording) -> str:
@@ -133,6 +165,8 @@ def _oscillation_spans(
     deviation: Array, width: int, least: float
 ) -> Sequence[tuple[int, int, float]]:
     """Start, end and median period, in samples, of sustained oscillations."""
+    from scipy.ndimage import binary_closing
+
     up = deviation > 0
     edges = np.flatnonzero(up[1:] != up[:-1]) + 1  # starts of half periods
     count = 2 * _MIN_PERIODS
@@ -144,18 +178,29 @@ def _oscillation_spans(
     periods = exact[2:] - exact[:-2]
     rows = np.lib.stride_tricks.sliding_window_view(sizes, count)
     lengths = np.lib.stride_tricks.sliding_window_view(periods, count - 1)[: len(rows)]
-    mean = lengths.mean(axis=1)
+    length = np.median(lengths, axis=1)
     quarter = count // 4
-    good = rows.min(axis=1) >= least
-    good &= rows[:, -quarter:].mean(axis=1) >= _MIN_DECAY_RATIO * rows[:, :quarter].mean(axis=1)
-    good &= rows.std(axis=1) <= _MAX_SWING_SPREAD * rows.mean(axis=1)
-    good &= lengths.std(axis=1) <= _MAX_PERIOD_SPREAD * mean
-    good &= (mean >= _MIN_PERIOD_SAMPLES) & (mean <= width) & (width <= 2.5 * mean)
+    good = np.median(rows[:, -quarter:], axis=1) >= _MIN_DECAY_RATIO * np.median(
+        rows[:, :quarter], axis=1
+    )
+    for side in (rows[:, ::2], rows[:, 1::2]):  # above and below, which may differ
+        good &= _are_even(side, _MAX_SWING_RANGE) & (np.median(side, axis=1) >= least)
+    good &= _are_even(lengths, _MAX_PERIOD_RANGE)
+    good &= (length >= _MIN_PERIOD_SAMPLES) & (length <= width) & (width <= 2.5 * length)
+    good = binary_closing(np.pad(good, count), np.ones(count + 1))[count:-count]  # single jolts
     marks = np.flatnonzero(np.diff(good.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
     return [
         (int(edges[a]), int(edges[b - 1 + count]), float(np.median(periods[a : b + count - 2])))
         for a, b in marks.tolist()
     ]
+
+
+def _are_even(values: Array, max_range: float) -> np.ndarray:
+    """Mask (n,) of rows (n, k) of which most values are close together."""
+    values, count = np.sort(values, axis=1), values.shape[1]
+    even = int(_MIN_EVEN_SHARE * count)
+    ranges = values[:, even - 1 :] - values[:, : count - even + 1]
+    return np.asarray(ranges.min(axis=1) <= max_range * np.median(values, axis=1))
 
 
 def _peak_to_peak(values: Array, first: int, last: int, period: float) -> Array:
@@ -168,6 +213,15 @@ def _peak_to_peak(values: Array, first: int, last: int, period: float) -> Array:
 
 
 def _reversal_count(command: Array) -> int:
+    return int(np.count_nonzero(np.diff(_directions(command)[np.nonzero(_directions(command))])))
+
+
+def _command_changes(command: Array) -> Array:
+    """Indices of samples where a command starts, stops or reverses."""
+    return np.flatnonzero(np.diff(_directions(command))) + 1
+
+
+def _directions(command: Array) -> Array:
+    """Signs (N - 1,) of the steps of a command, 0 without a step."""
     steps = np.diff(command)
-    steps = steps[np.abs(steps) > 1e-9 * max(float(np.ptp(command)), 1e-300)]
-    return int(np.count_nonzero(np.signbit(steps[1:]) != np.signbit(steps[:-1])))
+    return np.sign(np.where(np.abs(steps) > 1e-9 * max(float(np.ptp(command)), 1e-300), steps, 0))

@@ -53,6 +53,7 @@ from crane.recordings.recording_reader import (
     read_quantities,
     read_sensor_readings,
 )
+from crane.recordings.angle_unwrapping import unwrap_table
 from crane.recordings.sensor_discrepancy import noise_std, warn_discrepancies
 from crane.recordings.timeseries import (
     TIME,
@@ -132,7 +133,7 @@ def read_run(
     name = table.notes.get("machine", "")
     if name and is_measured(table):
         machine = recorded_machine(path, name)
-        table = quantities_from_readings(table, path, machine, span)
+        table = quantities_from_readings(unwrap_table(machine, table), path, machine, span)
         return complete_recording(machine, table, path)
     return Recording.from_table(quantities_from_readings(table, path, None, span), path)
 

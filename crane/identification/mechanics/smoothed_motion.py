@@ -28,6 +28,7 @@ from crane.identification.signals.signal_quality import (
 from crane.machine.machine import Machine
 from crane.recordings.measured_recordings import locked_joint_conflicts
 from crane.recordings.recording import FORCE_SUFFIX, VELOCITY_SUFFIX, VELOCITY_UNITS, Recording
+from crane.recordings.angle_unwrapping import unwrap_angles
 from crane.recordings.timeseries import time_derivative
 
 _MOTION_FACTOR = 3.0  # standard deviations of a velocity, above which a joint moves
@@ -68,7 +69,8 @@ def smoothed_motion(
     Raises:
         RecordingError: The recording is not suitable; the message names column and time.
     """
-    original, recording = recording, _select_active_joints(machine, recording)
+    unwrapped = unwrap_angles(machine, recording.time, recording.columns())
+    original, recording = recording, _select_active_joints(machine, recording, unwrapped)
     locked_columns = {
         x: column for x, column in original.columns().items() if x in machine.locked_joints
     }
@@ -82,6 +84,11 @@ def smoothed_motion(
     recorded = None
     if np.any(recording.v):  # for comparison only, without outliers
         recorded = np.column_stack([replace_outliers(x, outlier_mask(x)) for x in recording.v.T])
+        is_derived = [
+            np.array_equal(v, time_derivative(q, time))
+            for q, v in zip(recording.q.T, recording.v.T, strict=True)
+        ]
+        recorded[:, is_derived] = np.nan  # no column of the file
     limits = np.column_stack([machine.lower, machine.upper])
     check_recording(
         time,
@@ -119,15 +126,24 @@ def smoothed_motion(
     return Motion(time, found.q, v, a, columns[:, n:], passband)
 
 
-def _select_active_joints(machine: Machine, recording: Recording) -> Recording:
+def _select_active_joints(
+    machine: Machine, recording: Recording, unwrapped: Mapping[str, Array]
+) -> Recording:
     """Select the active joints of a machine from a recording, in their order.
 
-    Free joints may be among the channels; their forces are zero.
+    Free joints may be among the channels; their forces are zero. Coordinates are taken from
+    `unwrapped` where they jump by revolutions, with velocities that are their derivatives there.
 
     Raises:
         RecordingError: A joint is missing or has another unit, or a free joint has a force.
     """
     recorded_columns, units = recording.columns(), recording.units | recording.channel_units
+    for joint in unwrapped.keys() & set(machine.active):
+        name, jumps = joint + VELOCITY_SUFFIX, recorded_columns[joint] - unwrapped[joint]
+        near = np.convolve(np.abs(np.diff(jumps, prepend=jumps[0])) > 1, np.ones(5), "same") > 0
+        rate = time_derivative(unwrapped[joint], recording.time)
+        recorded_columns[name] = np.where(near, rate, recorded_columns.get(name, rate))
+    recorded_columns |= unwrapped
     available = {*recording.joints, *(x for x in machine.free if x in recorded_columns)}
     missing = [joint for joint in machine.active if joint not in available]
     if missing:
@@ -256,14 +272,16 @@ def signal_delay(time: Array, one: Array, other: Array) -> float:
     return float((at - reach + shift) * step)
 
 
-def reject_unless_trusted(text: str, trust: bool) -> None:
+def reject_unless_trusted(
+    text: str, trust: bool, remedy: str = "if the recording is right, trust it (trust)"
+) -> None:
     """Reject a recording that is probably wrong, or warn if it is trusted.
 
     Raises:
         RecordingError: It is not trusted.
     """
     if not trust:
-        raise RecordingError(f"{text}; if the recording is right, trust it (trust)")
+        raise RecordingError(f"{text}; {remedy}")
     warnings.warn(f"{text}: trusted", CraneWarning, stacklevel=3)
 
 
@@ -337,7 +355,7 @@ def check_recording(
         tau: Generalized forces (N, n).
         joints: Names (n,).
         units: "rad" or "m" of each coordinate.
-        v: Recorded velocities (N, n), compared with the derivatives of q.
+        v: Recorded velocities (N, n), compared with the derivatives of q; nan for none.
         limits: Lower and upper limits (n, 2).
         longest_delay: Largest delay [s] between recorded velocity and q, for filters of sensors.
         free: Names of free joints.
@@ -360,7 +378,8 @@ def check_recording(
             )
         if limits is not None:
             _check_range(q[:, i], limits[i], joint, units[joint], trust)
-        if v is not None and np.var(np.diff(q[:, i])) < np.var(q[:, i]):
+        has_rate = v is not None and np.isfinite(v[:, i]).all()
+        if has_rate and np.var(np.diff(q[:, i])) < np.var(q[:, i]):
             _check_velocity(time, q[:, i], v[:, i], joint, units[joint], longest_delay, trust)
 
 
@@ -417,11 +436,25 @@ def _check_velocity(
             trust,
         )
     if abs(delay) > longest_delay:
-        reject_unless_trusted(delay_message(f"{joint}_velocity", delay, f"'{joint}'"), trust)
+        reject_delay(f"{joint}_velocity", delay, f"'{joint}'", trust)
     return None
 
 
-def delay_message(name: str, delay: float, reference: str) -> str:
-    """Message about the delay [s] of a column with respect to another."""
+def reject_delay(name: str, delay: float, reference: str, trust: bool) -> None:
+    """Reject a column with a delay [s] with respect to another, or warn if it is trusted.
+
+    Raises:
+        RecordingError: It is not trusted.
+    """
     side = "behind" if delay > 0 else "ahead of"
-    return f"'{name}' is {abs(delay) * 1e3:.0f} ms {side} {reference}, record them with one clock"
+    reject_unless_trusted(
+        f"'{name}' is {abs(delay) * 1e3:.0f} ms {side} {reference}, record them with one clock",
+        trust,
+        f"or {shift_remedy({name: delay})}",
+    )
+
+
+def shift_remedy(delays: Mapping[str, float]) -> str:
+    """Text that offers to take delays [s] out of columns."""
+    options = " ".join(f"--shift '{name}={delay:.3g}'" for name, delay in delays.items())
+    return f"take that out ({options}, in Python crane.recordings.shift_columns)"
