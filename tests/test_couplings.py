@@ -1,12 +1,15 @@
 """Linear constraints between joints: gears and mimic joints."""
 
 import re
+import warnings
 
 import numpy as np
 import pinocchio as pin
 import pytest
+from broken_machines import DATA
 
 import crane
+from crane.common.errors import CraneWarning
 
 LINK = (
     '<link name="{name}"><inertial><origin xyz="{com} 0 0"/><mass value="{mass}"/>'
@@ -153,3 +156,50 @@ def test_bad_couplings_are_refused(tmp_path, coupling, line):
         crane.load(tmp_path / "train.yaml")
     assert line in str(caught.value)
     assert "train.yaml:" in str(caught.value)
+
+
+ROTOR = """<robot name="rotor"><link name="base"/>
+  <joint name="rotor" type="continuous"><parent link="base"/><child link="disc"/>
+    <axis xyz="0 0 1"/></joint>
+  <link name="disc"><inertial><mass value="0.5"/>
+    <inertia ixx="3e-3" iyy="3e-3" izz="5e-3" ixy="0" ixz="0" iyz="0"/></inertial></link>
+</robot>"""
+
+
+@pytest.mark.parametrize("ratio", [-2.0, 26.9, 300.0])
+@pytest.mark.parametrize("active", ["crank", "rotor"])
+def test_a_geared_rotor_does_not_disturb_home(tmp_path, edited, ratio, active):
+    """The rotor follows the crank of the file by any number of turns, without a search."""
+    (tmp_path / "rotor.urdf").write_text(ROTOR)
+    chain = f"\n  - {{name: gear, urdf: {tmp_path}/rotor.urdf, parent: pin_B}}\n\nloops:"
+    gear = f"couplings: [{{name: gear, joints: {{rotor: 1, crank: {-ratio}}}}}]"
+    end = re.search("tasks:.*", (DATA / "four_bar.yaml").read_text(), re.DOTALL)[0]
+    plain = crane.load(DATA / "four_bar.yaml")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        machine = edited(
+            "four_bar.yaml", "\n\nloops:", chain, end, "", "tip: coupler_pin",
+            f"{gear}\ntip: coupler_pin", "active: [crank]", f"active: [{active}]",
+        )  # fmt: skip
+    assert machine.closure.home_search is None
+    home = dict(zip(machine.joints, machine.home, strict=True))
+    assert home["rotor"] == pytest.approx(ratio * 1.2, rel=1e-12)
+    for joint, value in zip(plain.joints, plain.home, strict=True):
+        assert home[joint] == pytest.approx(value, abs=1e-10)
+
+
+@pytest.mark.parametrize("ratio", [50.0, 300.0])
+def test_a_search_of_home_looks_past_the_rotor(tmp_path, edited, ratio):
+    """The crank is not in the file: the rotor neither hinders the search nor is it named."""
+    (tmp_path / "rotor.urdf").write_text(ROTOR)
+    chain = f"\n  - {{name: gear, urdf: {tmp_path}/rotor.urdf, parent: pin_B}}\n\nloops:"
+    gear = f"couplings: [{{name: gear, joints: {{rotor: 1, crank: {-ratio}}}}}]"
+    with pytest.warns(CraneWarning, match=r"home was searched for, .* has crank [\d.]+ rad off"):
+        machine = edited(
+            "four_bar.yaml", "\n\nloops:", chain, "  crank: 1.2\n", "", "tip: coupler_pin",
+            f"{gear}\ntip: coupler_pin",
+        )  # fmt: skip
+    home = dict(zip(machine.joints, machine.home, strict=True))
+    assert home["rotor"] == pytest.approx(ratio * home["crank"], rel=1e-12)
+    # nearest to what the file says, as without the rotor
+    assert abs(home["coupler"] + 1.0) < 0.5 and abs(home["rocker"] - 1.5) < 0.5

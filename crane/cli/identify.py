@@ -11,6 +11,7 @@ import typer
 import crane
 from crane.cli.command import OptionBlock, command, refuse_options
 from crane.cli.options import (
+    CentreOfMass,
     ComparedColumns,
     Fit,
     Frame,
@@ -32,6 +33,7 @@ from crane.cli.options import (
 from crane.cli.parsing import (
     parse_fits,
     parse_names,
+    parse_numbers,
     parse_priors,
     parse_terms,
     parse_trials,
@@ -332,15 +334,17 @@ def payload(
     options: ParameterOptions,
     reading: ShiftedRecordingOptions,
     frame: Frame = None,
+    centre: CentreOfMass = None,
     method: Method = "wls",
     trust: Trust = False,
 ) -> None:
     """Estimate mass and centre of mass of the payload."""
+    com = None if centre is None else parse_numbers(centre.split(","), "--centre takes X,Y,Z in m")
     loaded = options.load(machine)
     (carried,) = _read([recording], loaded, reading)
     with progress_bar("estimating") as progress:
         estimate = crane.identification.identify_payload(
-            loaded, carried, frame, method, trust=trust, progress=progress
+            loaded, carried, frame, method, trust=trust, progress=progress, com=com
         )
     print(estimate.to_text(), end="")
 

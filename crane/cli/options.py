@@ -53,6 +53,13 @@ Frame = Annotated[
         help="Link that carries the load or represents the tool; the tip by default.",
     ),
 ]
+CentreOfMass = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y,Z",
+        help="Known centre of mass of the load in the frame, in m; estimated by default.",
+    ),
+]
 Bucket = Annotated[
     str | None, typer.Option(metavar="JOINT", help="The joint whose drive curls the bucket.")
 ]

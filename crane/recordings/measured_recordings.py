@@ -26,6 +26,7 @@ from crane.description.machine_lookup import find_machine_file, without_changes
 from crane.description.sensors import PRESSURE_PREFIX, SENSOR_PREFIX, Sensor
 from crane.formats.machine_loading import load_from_expression
 from crane.machine.machine import Machine
+from crane.recordings.angle_unwrapping import unwrap_table
 from crane.recordings.measured_configurations import (
     HELD_JOINT_TOLERANCE,
     MissingMeasurementError,
@@ -53,7 +54,6 @@ from crane.recordings.recording_reader import (
     read_quantities,
     read_sensor_readings,
 )
-from crane.recordings.angle_unwrapping import unwrap_table
 from crane.recordings.sensor_discrepancy import noise_std, warn_discrepancies
 from crane.recordings.timeseries import (
     TIME,

@@ -36,8 +36,8 @@ from crane.description.sensors import (
 )
 from crane.machine.machine import Machine
 from crane.recordings import logs, table_reader
-from crane.recordings.recording import IDEAL_SENSORS, SENSORS_NOTE
 from crane.recordings.angle_unwrapping import unwrap_table
+from crane.recordings.recording import IDEAL_SENSORS, SENSORS_NOTE
 from crane.recordings.timeseries import Table, located_errors, table_column
 
 _ALIKE = 0.7  # similarity from which a name counts as a misspelling

@@ -320,6 +320,7 @@ def energy_imbalance_text(
     if gap <= _tolerated_imbalance(machine, rows):
         return ""
     return (
-        f"work, energy and dissipation differ by {gap:.2g} J of {_energy_throughput(rows):.2g} J, so the "
+        f"work, energy and dissipation differ by {gap:.2g} J of "
+        f"{_energy_throughput(rows):.2g} J, so the "
         f"step of {step:g} s is too long: shorten it, or let method DOP853 choose it"
     )

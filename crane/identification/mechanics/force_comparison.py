@@ -11,11 +11,8 @@ import numpy as np
 from crane.common.errors import CraneWarning
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
-from crane.identification.mechanics.smoothed_motion import (
-    reject_delay,
-    reject_unless_trusted,
-    signal_delay,
-)
+from crane.identification.mechanics.recording_rejection import reject_delay, reject_unless_trusted
+from crane.identification.mechanics.smoothed_motion import signal_delay
 from crane.identification.signals.signal_processing import (
     Motion,
     sampling_step,

@@ -8,7 +8,7 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.smoothed_motion import shift_remedy
+from crane.identification.mechanics.recording_rejection import shift_remedy
 from crane.identification.signals.signal_processing import Motion, low_pass
 from crane.identification.signals.signal_quality import spectral_edge_frequency
 from crane.recordings.recording import FORCE_SUFFIX
@@ -66,8 +66,9 @@ class ForceDelays(OneLineRepr):
     def text(self) -> str:
         """Text about significant delays, "" without any."""
         return ", ".join(
-            f"'{self.joints[i]}{FORCE_SUFFIX}' is {1e3 * abs(self.seconds[i]):.3g} ms (+- "
-            f"{1e3 * self.std[i]:.1g}) {'behind' if self.seconds[i] > 0 else 'ahead of'} its motion"
+            f"'{self.joints[i]}{FORCE_SUFFIX}' is {1e3 * abs(self.seconds[i]):.3g} ms "
+            f"(+- {1e3 * self.std[i]:.1g}) "
+            f"{'behind' if self.seconds[i] > 0 else 'ahead of'} its motion"
             for i in np.flatnonzero(self.is_significant)
         )
 

@@ -42,12 +42,13 @@ from crane.identification.mechanics.identifiability import (
 from crane.identification.mechanics.identification_model import IdentificationModel, TermChanges
 from crane.identification.mechanics.identification_result import Identification
 from crane.identification.mechanics.model_terms import FrictionTerm, ModelTerm, body_names
+from crane.identification.mechanics.recording_rejection import reject_unless_trusted
 from crane.identification.mechanics.regression_equations import (
     CombinedRegressor,
     RegressionEquations,
     is_long_enough,
 )
-from crane.identification.mechanics.smoothed_motion import reject_unless_trusted, smoothed_motion
+from crane.identification.mechanics.smoothed_motion import smoothed_motion
 from crane.identification.signals.signal_processing import Motion, Progress
 from crane.identification.signals.signal_quality import spectral_edge_frequency
 from crane.machine.machine import Machine

@@ -10,6 +10,7 @@ from crane.common.errors import CraneWarning, RecordingError, check_name, sugges
 from crane.common.samples import Array
 from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.dynamics.dynamics import Dynamics
+from crane.identification.mechanics.recording_rejection import reject_delay, reject_unless_trusted
 from crane.identification.signals.signal_processing import (
     Motion,
     Progress,
@@ -26,9 +27,9 @@ from crane.identification.signals.signal_quality import (
     strongest_spectral_line,
 )
 from crane.machine.machine import Machine
+from crane.recordings.angle_unwrapping import unwrap_angles
 from crane.recordings.measured_recordings import locked_joint_conflicts
 from crane.recordings.recording import FORCE_SUFFIX, VELOCITY_SUFFIX, VELOCITY_UNITS, Recording
-from crane.recordings.angle_unwrapping import unwrap_angles
 from crane.recordings.timeseries import time_derivative
 
 _MOTION_FACTOR = 3.0  # standard deviations of a velocity, above which a joint moves
@@ -272,19 +273,6 @@ def signal_delay(time: Array, one: Array, other: Array) -> float:
     return float((at - reach + shift) * step)
 
 
-def reject_unless_trusted(
-    text: str, trust: bool, remedy: str = "if the recording is right, trust it (trust)"
-) -> None:
-    """Reject a recording that is probably wrong, or warn if it is trusted.
-
-    Raises:
-        RecordingError: It is not trusted.
-    """
-    if not trust:
-        raise RecordingError(f"{text}; {remedy}")
-    warnings.warn(f"{text}: trusted", CraneWarning, stacklevel=3)
-
-
 def remove_outliers(
     time: Array, names: Sequence[str], columns: Array, trust: bool = False
 ) -> Array:
@@ -438,23 +426,3 @@ def _check_velocity(
     if abs(delay) > longest_delay:
         reject_delay(f"{joint}_velocity", delay, f"'{joint}'", trust)
     return None
-
-
-def reject_delay(name: str, delay: float, reference: str, trust: bool) -> None:
-    """Reject a column with a delay [s] with respect to another, or warn if it is trusted.
-
-    Raises:
-        RecordingError: It is not trusted.
-    """
-    side = "behind" if delay > 0 else "ahead of"
-    reject_unless_trusted(
-        f"'{name}' is {abs(delay) * 1e3:.0f} ms {side} {reference}, record them with one clock",
-        trust,
-        f"or {shift_remedy({name: delay})}",
-    )
-
-
-def shift_remedy(delays: Mapping[str, float]) -> str:
-    """Text that offers to take delays [s] out of columns."""
-    options = " ".join(f"--shift '{name}={delay:.3g}'" for name, delay in delays.items())
-    return f"take that out ({options}, in Python crane.recordings.shift_columns)"
