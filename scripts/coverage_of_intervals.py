@@ -34,7 +34,7 @@ def main() -> None:
     warnings.simplefilter("ignore", crane.CraneWarning)
     machine = crane.load("mini_forwarder")
     given = terms if options.tuned else default_terms
-    settings = {"slow": SLOW, "bandwidth": BANDWIDTH} if options.tuned else {}
+    settings = {"min_speed": SLOW, "bandwidth": BANDWIDTH} if options.tuned else {}
     path = excite(machine, IdentificationModel(machine, terms(machine)), seed=0).trajectory
     found: dict[str, list[tuple[float, bool]]] = {}
     shares = []

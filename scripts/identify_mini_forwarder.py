@@ -75,7 +75,7 @@ def main() -> None:
     for seed in range(1, options.rigs + 1):
         virtual = rig(machine, seed)
         one, other = (virtual.run(reference.trajectory) for reference in (learn, judge))
-        settings = {"terms": terms(machine), "slow": SLOW, "bandwidth": BANDWIDTH}
+        settings = {"terms": terms(machine), "min_speed": SLOW, "bandwidth": BANDWIDTH}
         result = identify(machine, one, **settings)
         truth = result.base.values(
             IdentificationModel(virtual.plant, terms(virtual.plant)).nominal
@@ -84,8 +84,8 @@ def main() -> None:
         covered.append(float(np.mean((low <= truth) & (truth <= high))))
         model = identify(machine, one, other, prior=PRIOR, **settings)
         # the floor: what the true parameters leave of the same recording
-        exact = identify(virtual.plant, other, terms=terms(virtual.plant), prior=1e-6, slow=SLOW,
-                         bandwidth=BANDWIDTH)  # fmt: skip
+        exact = identify(virtual.plant, other, terms=terms(virtual.plant), prior=1e-6,
+                         min_speed=SLOW, bandwidth=BANDWIDTH)  # fmt: skip
         ratio = model.validation.rmse / exact.training.rmse
         floors.append(ratio)
         shares = [" ".join(f"{100 * x:5.2f}" for x in fit.relative_error)

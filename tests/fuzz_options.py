@@ -153,7 +153,7 @@ REPORTED = (
     "identify slider.yaml motion.csv --out o --prior 1e308",
     "identify slider.yaml motion.csv --out o --prior nan",
     "identify slider.yaml motion.csv --out o --bandwidth 1e308",
-    "identify slider.yaml motion.csv --out o --slow theta=-1e308",
+    "identify slider.yaml motion.csv --out o --min-speed theta=-1e308",
     "simulate slider.yaml --task swing --out o --step 1e-300",
     "simulate slider.yaml --duration 1e308 --out o",
     "study slider.yaml --out o --vary crank.mass=0.7:0.9:3 --processes 2147483648",

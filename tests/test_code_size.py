@@ -6,7 +6,7 @@ from package_source import PACKAGE, nodes
 
 MAX_FUNCTION_LINES = 80  # without the docstring
 MAX_FILE_LINES = 450
-MAX_DEEP_SHARE = 0.03  # of functions with three levels of nesting or more; `elif` is none
+MAX_DEEP_SHARE = 0.03  # of functions with three levels of nesting or more; `elif` is one
 MAX_STATEMENTS = 45_380
 _BLOCKS = ast.If | ast.For | ast.While | ast.With | ast.Try | ast.Match
 
@@ -28,14 +28,12 @@ def length(function):
 
 
 def depth(node):
-    """Levels of blocks in a node, functions in it aside; `elif` is no level."""
+    """Levels of blocks in a node, functions in it aside; each `elif` is a level."""
     deepest = 0
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.FunctionDef | ast.ClassDef | ast.Lambda):
             continue
-        is_elif = isinstance(node, ast.If) and isinstance(child, ast.If) and child in node.orelse
-        level = isinstance(child, _BLOCKS) and not is_elif
-        deepest = max(deepest, level + depth(child))
+        deepest = max(deepest, isinstance(child, _BLOCKS) + depth(child))
     return deepest
 
 

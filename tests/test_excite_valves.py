@@ -43,7 +43,11 @@ def found(machine):
 def test_a_notebook_shows_signals_and_what_they_tell(found):
     html = found._repr_html_()
     assert repr(found).startswith("SignalExcitation of 'rig', 5 s: ") and len(repr(found)) <= 200
-    assert html.count("<img ") == 1 and "std, designed" in html and "largest pressure" in html
+    assert (
+        html.count("<img ") == 1
+        and "std, optimized signals" in html
+        and "largest pressure" in html
+    )
 
 
 def strokes(machine, signals, time):
@@ -141,9 +145,9 @@ def test_the_information_is_that_of_derivatives_by_hand(machine, found):
             ends.append(np.column_stack([run[x] / s for x, s in NOISE.items()]).ravel())
         columns.append((ends[0] - ends[1]) / 2e-3)
     J = np.column_stack(columns)
-    rows = told.information_root(found.run, estimate_start=False)
+    rows = told.information_factor(found.run, estimate_start=False)
     assert rows.T @ rows == pytest.approx(J.T @ J, rel=0.05)
-    alone, whole = (np.linalg.inv(x.T @ x) for x in (rows, told.information_root(found.run)))
+    alone, whole = (np.linalg.inv(x.T @ x) for x in (rows, told.information_factor(found.run)))
     assert (np.diag(whole) > np.diag(alone)).all()  # of a start that has to be found, too
 
 
@@ -153,7 +157,7 @@ def test_they_tell_more_than_plain_ones_and_what_is_not_told(found):
     assert found.std["oil.gas_exponent"] == np.inf
     text = found.to_text()
     assert "not determined by these sensors in this time: oil.gas_exponent" in text
-    assert "load_x.mass" in text and "std, designed" in text
+    assert "load_x.mass" in text and "std, optimized signals" in text
 
 
 def test_a_start_that_is_given_is_what_the_machine_has(machine):
@@ -272,7 +276,7 @@ def test_the_command_writes_signals_that_can_be_played(machine, tmp_path):
     words = ("excite", machine.path, "--fit", "load_x.mass", "--duration", 4, "--out", out)
     done = typed(*words)
     assert done.returncode == 0, done.stderr
-    assert "std, designed" in done.stdout and f"--inputs {out}/signals.csv" in done.stdout
+    assert "std, optimized signals" in done.stdout and f"--inputs {out}/signals.csv" in done.stdout
     assert sorted(x.name for x in out.iterdir()) == ["signals.csv", "signals.png"]
     played = typed(
         "simulate", machine.path, "--inputs", out / "signals.csv", "--out", tmp_path / "run"

@@ -451,7 +451,7 @@ def test_one_speed_each_way_tells_friction_and_a_load_as_a_point(mini):
     assert np.isnan(estimate.com).all() and low < 0.2 < high and high - low < 0.05
     wanted = 2 * mini.friction["X1"].coulomb
     assert estimate.friction_corrections["X1"] == pytest.approx(wanted, rel=0.1)
-    assert "load on link7_tip, taken as a point there" in estimate.to_text()
+    assert "load on link7_tip, modelled as a point mass at this frame" in estimate.to_text()
 
 
 @pytest.mark.skipif(not RAW.is_file(), reason="the recording, ../shared/data, is not there")

@@ -111,7 +111,7 @@ def test_what_friction_does_near_standstill_is_in_no_row_that_counts(mini):
     assert stuck.mean() < 0.2
     wrong = given.tau + np.where(stuck, 40 * NOISE, 0.0) * np.sign(given.v)
     result = identify(
-        mini, dataclasses.replace(given, tau=wrong), bandwidth=5.0, slow=slow, method="ols"
+        mini, dataclasses.replace(given, tau=wrong), bandwidth=5.0, min_speed=slow, method="ols"
     )
     found = result.predict(given.q, given.v, given.a)
     assert np.abs(found - given.tau).max() < 1e-6 * np.abs(given.tau).max()
@@ -209,7 +209,7 @@ def test_recordings_of_simulations_serve(mini):
     path = crane.motion.Trajectory(CubicSpline(given.time, given.q))
     recording = crane.simulate(mini, crane.ComputedTorque(mini, path), path(0.0)[:2])
     slow = [0.03, 5e-4, 5e-4]
-    result = identify(mini, recording, prior=0.1, slow=slow)
+    result = identify(mini, recording, prior=0.1, min_speed=slow)
     assert result.training.overall_relative_error < 5e-3
 
 
@@ -234,9 +234,9 @@ def test_what_cannot_be_identified(mini):
         (lambda: identify(mini, given, prior=1e300), InputError, f"{PRIOR} is 1e+300, give"),
         (lambda: identify(mini, given, bandwidth=np.nan), InputError, "the bandwidth is nan Hz"),
         (
-            lambda: identify(mini, given, slow={"X1": -1.0}),
+            lambda: identify(mini, given, min_speed={"X1": -1.0}),
             InputError,
-            "slow of 'X1' is -1, it must",
+            "min_speed of 'X1' is -1, it must",
         ),
         (lambda: identify(other, recording), RecordingError, "'shoulder_pan_joint', 'sho"),
         (
@@ -245,7 +245,7 @@ def test_what_cannot_be_identified(mini):
             "the model has no bodies",
         ),
         (
-            lambda: identify(mini, given, slow=[1e3, 1e3, 1e3], terms=[InertialTerm(mini)]),
+            lambda: identify(mini, given, min_speed=[1e3, 1e3, 1e3], terms=[InertialTerm(mini)]),
             RecordingError,
             "no joint moves faster than",
         ),
@@ -269,7 +269,7 @@ def test_a_joint_of_one_row_is_refused(mini):
     given.v[:, 1] = 0.0
     given.v[100, 1] = 1.0
     with pytest.raises(RecordingError, match="^'X1' is in one sample only faster than"):
-        identify(mini, given, bandwidth=1e3, slow={"X1": 0.5}, trust=True)
+        identify(mini, given, bandwidth=1e3, min_speed={"X1": 0.5}, trust=True)
 
 
 def test_a_constant_recording_is_refused(mini):

@@ -331,7 +331,7 @@ def test_the_tx40_predicts_the_part_it_has_not_seen(tx40):
     rotors = {"q*.rotor_inertia": (), "q*.viscous_offset": None, "q5+q6.rotor_inertia": (),
               "q5+q6.coulomb": (), "q5+q6.viscous": ()}  # fmt: skip
     least = crane.identify(
-        plain, log, method="ols", terms=rotors, bandwidth=20.0, slow={"q*": 0.05}
+        plain, log, method="ols", terms=rotors, bandwidth=20.0, min_speed={"q*": 0.05}
     )
     assert len(least.values) == 61
     assert least.training.overall_relative_error <= 0.051

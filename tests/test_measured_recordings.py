@@ -406,10 +406,10 @@ def test_sensors_that_disagree_are_told(machine, columns, truth, tmp_path, full)
         read_measured(machine, write(tmp_path, columns))
     (line,) = [str(one.message) for one in caught if "disagree" in str(one.message)]
     assert line.startswith(
-        f"sensors disagree: 'q3' is {off.mean():+.3g} deg off on the mean ({off.min():+.3g} to "
-        f"{off.max():+.3g} over the motion) against X2: a constant offset leaves "
+        f"sensors disagree: 'q3' is {off.mean():+.3g} deg off on average ({off.min():+.3g} to "
+        f"{off.max():+.3g} over the motion) against X2: residual "
     )
-    (numbers,) = re.findall(r"a delay besides .* deg \((.*?)\)", line)
+    (numbers,) = re.findall(r"an offset and a delay \((.*?)\)", line)
     told = dict(part.split(" = ") for part in numbers.split(", "))
     assert float(told["sensor.q3.zero"]) == pytest.approx(np.deg2rad(3.0), abs=np.deg2rad(0.1))
     assert float(told["sensor.q3.delay"]) == pytest.approx(0.1, abs=0.01)

@@ -232,7 +232,7 @@ def test_numbers_that_yaml_reads_as_text_are_numbers(edited):
         ("{terms: {q1.root: }}", "'q1.root' of 'terms' is empty, give its value"),
         ("{prior: {q1.viscous: about 5}}", "'q1.viscous' of 'prior': 'about 5' says no standard"),
         ("{bandwidth: 0}", "'bandwidth' is 0, give one in Hz"),
-        ("{slow: {q1: -1}}", "'q1' of 'slow' is -1, give at least 0"),
+        ("{min_speed: {q1: -1}}", "'q1' of 'min_speed' is -1, give at least 0"),
     ],
 )
 def test_a_section_that_is_wrong(edited, text, message):
@@ -303,9 +303,12 @@ def test_friction_without_a_place_is_written_as_the_nearest_law(arm):
         (["--prior", "a=b"], "--prior is 'a=b', write NAME=STD, as in bodies=10%"),
         (["--prior", "0.3", "--prior", "0.1"], "--prior says two things of '*', give one"),
         (["--prior", "q8.m=1"], "prior 'q8.m' is unknown, known: "),
-        (["--slow", "crank=1e3"], "no joint moves faster than what counts as standstill"),
-        (["--slow", "crank=1e3", "--try", "bandwidth=8,12"], "no joint moves faster than what "),
-        (["--slow", "crank=1e3", "--feasible"], "no joint moves faster than what counts as"),
+        (["--min-speed", "crank=1e3"], "no joint moves faster than what counts as standstill"),
+        (
+            ["--min-speed", "crank=1e3", "--try", "bandwidth=8,12"],
+            "no joint moves faster than what ",
+        ),
+        (["--min-speed", "crank=1e3", "--feasible"], "no joint moves faster than what counts as"),
         (["--train", "5"], "--train is '5', write FROM:TO in seconds, as 0:13.5"),
         (["--train", "90:99"], "nothing lies between 90 and 99 s, the recording goes from 0 to "),
         (["--try", "bandwidth=x"], "--try is 'bandwidth=x', write each NAME=VALUES once"),
@@ -342,7 +345,7 @@ def test_a_window_is_trained_on_and_the_rest_judges(tmp_path, crank):
             "1 of 1 held-out recordings are too short for a low-pass of 10 Hz and are not used",
         ),
         (
-            ["--train", "0:6", "--slow", "crank=1.03", "--bandwidth", "40"],  # else 4 rows
+            ["--train", "0:6", "--min-speed", "crank=1.03", "--bandwidth", "40"],  # else 4 rows
             "no held-out recording moves faster than",
         ),
     ],
@@ -444,7 +447,7 @@ def test_a_part_at_rest_judges_nothing(arm):
     held["q"][rest] = held["q"][640]
     held["v"][rest] = held["a"][rest] = 0.0
     (trial,) = cross_validate(
-        arm, Motion(**held), {"bodies": ["1 %"]}, bandwidth=5.0, slow={"q*": 0.01}
+        arm, Motion(**held), {"bodies": ["1 %"]}, bandwidth=5.0, min_speed={"q*": 0.01}
     )
     assert np.isnan(trial.errors).tolist() == [False, False, True, False, False]
     assert trial.mean_error < 0.1 and " - " in format_trials([trial])
@@ -557,14 +560,14 @@ def test_which_of_several_cannot_serve_is_said(arm):
 @pytest.mark.parametrize(
     ("slow", "message"),
     [
-        ([0.1, 0.2], "slow has the shape (2,), give (6,)"),
-        ([0.1] * 5 + [np.nan], "slow is nan at q6"),
-        (-0.1, "slow of 'q1' is -0.1, it must not be negative"),
+        ([0.1, 0.2], "min_speed has the shape (2,), give (6,)"),
+        ([0.1] * 5 + [np.nan], "min_speed is nan at q6"),
+        (-0.1, "min_speed of 'q1' is -0.1, it must not be negative"),
     ],
 )
 def test_velocities_of_standstill_that_are_none(arm, slow, message):
     with pytest.raises(InputError) as caught:
-        identify(arm, moved(arm), slow=slow, bandwidth=5.0)
+        identify(arm, moved(arm), min_speed=slow, bandwidth=5.0)
     assert str(caught.value).startswith(message)
 
 

@@ -42,7 +42,7 @@ def test_ends_that_nothing_joins(tmp_path):
         assert crane.load(tmp_path / "bars.urdf").closure.degrees_of_freedom == 4
     (line,) = (str(one.message) for one in told)
     assert line.startswith(
-        "bars.urdf:6: nothing closes what looks like 1 loop, closing_foot_1 and closing_foot_2 "
+        "bars.urdf:6: no joint closes what looks like 1 loop, closing_foot_1 and closing_foot_2 "
         "(300 mm and 0 deg apart at zero): close them by crane add loops, paste what crane check "
     )
     assert line.isprintable()

@@ -434,19 +434,22 @@ def test_the_command_compares(patu, tmp_path):
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
         patu[1].to_csv(tmp_path / name / "recording.csv")
-    paths = tmp_path / "one", "--beside", tmp_path / "two"
-    done = typed("power", "patu655", *paths, "--moved", "211", "--out", tmp_path / "out")
+    paths = tmp_path / "one", "--compare", tmp_path / "two"
+    done = typed("power", "patu655", *paths, "--moved-mass", "211", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert sorted(x.name for x in (tmp_path / "out").iterdir()) == [
         "comparison.md", "comparison.png",
     ]  # fmt: skip
     assert "| one | two |" in done.stdout
     for options, line in (
-        (("--moved", "211"), "--moved is for a comparison, name the other runs with --beside"),
-        (("--beside", tmp_path / "one"), "is given twice, leave one out"),
-        (("--beside", tmp_path / "no"), "no"),
         (
-            ("--beside", tmp_path / "two", "--moved", "0"),
+            ("--moved-mass", "211"),
+            "--moved-mass is for a comparison, name the other runs with --compare",
+        ),
+        (("--compare", tmp_path / "one"), "is given twice, leave one out"),
+        (("--compare", tmp_path / "no"), "no"),
+        (
+            ("--compare", tmp_path / "two", "--moved-mass", "0"),
             "the moved mass is 0.0 kg, give a number above 0",
         ),
     ):

@@ -290,11 +290,11 @@ def test_how_far_apart_is_told(machine, motion, tmp_path):
     bend = 0.02 * np.sin(7 * columns["time"])
     (line,) = told(machine, written(tmp_path, motion, ["q2"], q2=lambda x: x + 0.04 + bend))
     found = re.search(
-        r"'q2' is (\S+) deg off on the mean \((\S+) to (\S+) over.*against X_lift:", line
+        r"'q2' is (\S+) deg off on average \((\S+) to (\S+) over.*against X_lift:", line
     )
     wanted = np.rad2deg([0.04 + bend.mean(), 0.04 + bend.min(), 0.04 + bend.max()])
     np.testing.assert_allclose([float(x) for x in found.groups()], wanted, rtol=5e-3)
-    assert "a constant offset leaves 0.81 deg of it (sensor.q2.zero = 0.04" in line
+    assert "residual 0.81 deg with a constant offset (sensor.q2.zero = 0.04" in line
     assert line.endswith(", and no delay, scale or pin explains the rest")
 
 
@@ -302,11 +302,11 @@ def test_delays_and_scales_are_told_apart(machine, motion, tmp_path):
     columns, _ = motion
     late = lambda x: np.interp(columns["time"] - 0.3, columns["time"], x)  # noqa: E731
     (line,) = told(machine, written(tmp_path, motion, ["q3"], q3=late))
-    assert "a delay besides" in line
-    assert number(line.split("besides")[1], "sensor.q3.delay") == pytest.approx(0.3, abs=1e-3)
+    assert "an offset and a delay" in line
+    assert number(line.split("and a delay")[1], "sensor.q3.delay") == pytest.approx(0.3, abs=1e-3)
     (line,) = told(machine, written(tmp_path, motion, ["q2"], q2=lambda x: 1.1 * x + 0.02))
-    assert "a scale besides" in line
-    line = line.split("a scale besides")[1]
+    assert "an offset and a scale" in line
+    line = line.split("an offset and a scale")[1]
     assert number(line, "sensor.q2.scale") == pytest.approx(1.1, abs=1e-3)
     assert number(line, "sensor.q2.zero") == pytest.approx(0.02, abs=1e-3)
     (line,) = told(machine, written(tmp_path, motion, ["q2"], q2=lambda x: 0 * x))
@@ -324,8 +324,8 @@ def test_a_pin_elsewhere_is_named(machine, motion, tmp_path, name, at):
     moved = columns | {x: q[:, other.column(x)] for x in ("q2", "q3")}
     (line,) = told(machine, written(tmp_path, (moved, units), ["q2", "q3"]))
     assert told(other, tmp_path / "run.csv") == []
-    assert "'q2'" in line and "a constant offset leaves" in line
-    assert "a pin elsewhere alone" in line
+    assert "'q2'" in line and "deg with a constant offset" in line
+    assert "another pin position" in line
     drawn = MachineVariants(machine).values[name]  # found to first order of how far it is off
     assert number(line, name) == pytest.approx(at, abs=0.06 * abs(at - drawn))
 
@@ -481,7 +481,7 @@ def test_commands_take_windows(tmp_path, motion, machine):
         "plot", path, "--machine", "patu655", *LOCKS, "--from", "2", "--until", "4", "--out", out
     )
     assert done.returncode == 0 and out.exists()
-    assert done.stderr.count("sensors disagree: 'q2' is +2.86 deg off on the mean") == 1
+    assert done.stderr.count("sensors disagree: 'q2' is +2.86 deg off on average") == 1
     for words, said in (
         (("plot", path, "--from", "4", "--until", "2"), "nothing lies from 4 to 2 s"),
         (("view", "patu655", "--from", "1"), "--from is for runs, and 'patu655' is none"),
@@ -555,8 +555,8 @@ def test_a_raw_log_s_disagreement_is_told(machine, tmp_path):
     columns = tmp_path / "columns.txt"
     columns.write_text(COLUMNS)
     lift, tilt = told(machine, LIFTING, columns=columns)
-    assert "'inclination_lift_boom' is -1.37 deg off on the mean (-2.69 to +0.201" in lift
-    assert "'inclination_tilt_boom' is -4.87 deg off on the mean" in tilt
+    assert "'inclination_lift_boom' is -1.37 deg off on average (-2.69 to +0.201" in lift
+    assert "'inclination_tilt_boom' is -4.87 deg off on average" in tilt
     assert "against X_lift, X_tilt" in tilt
     places = [number(line, "lift_boom_rod.x") for line in (lift, tilt)]  # both say the same pin
     np.testing.assert_allclose(places, 0.316, atol=1e-3)

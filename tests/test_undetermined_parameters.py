@@ -106,7 +106,9 @@ def test_a_combination_of_what_is_determined_is_named_without_a_warning(plain):
     assert found.warning.startswith("this motion does not determine 1 of 75 base parameters, ")
     assert "75 base parameters, 1 not determined, " in repr(found)
     # a motion last: excite may have found the best that the limits allow
-    assert re.search(": give a prior, ask for feasible bodies, or record one that ", found.warning)
+    assert re.search(
+        ": give a prior, require physically feasible bodies, or record one that ", found.warning
+    )
 
 
 def test_what_cannot_be_is_called_impossible(plain):

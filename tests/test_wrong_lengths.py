@@ -117,10 +117,10 @@ def test_the_line_names_the_gap_and_the_length(tmp_path):
     assert report.status == 2
     assert line == (
         "the loops close only far from the home of the file: lift is 2.88 rad off, loop 'lift' "
-        "the other way round; at the home of the file loop 'link' is 236 mm open, and would close "
-        "with bell.x 1.573 m (now 1.337); correct home or the frames; if what was found is meant, "
-        "keep it with crane check --write-home, or take it with --arg nearest_assembly:=true "
-        "(arguments={'nearest_assembly': True} in Python)"
+        "in its other assembly mode; at the home of the file loop 'link' is 236 mm open, and "
+        "would close with bell.x 1.573 m (now 1.337); correct home or the frames; if what was "
+        "found is meant, keep it with crane check --write-home, or take it with "
+        "--arg nearest_assembly:=true (arguments={'nearest_assembly': True} in Python)"
     )
     assert 0.15 * value == pytest.approx(0.236, abs=5e-4)
     run = ("simulate", path, "--duration", 0.1, "--out", tmp_path / "run")

@@ -51,11 +51,11 @@ def convert(
     check = check_folder_is_writable if kind == "machine" else check_file_is_writable
     check(out, output.force)
     loaded, written = options.load(machine), out
-    if kind == "machine":
-        written = crane.write_machine(loaded, out, overwrite=output.force)
-    elif kind == "urdf":
+    if kind == "urdf":
         with replace_file(out) as temporary_file:
             temporary_file.write_text(crane.formats.robot_description(loaded), encoding="utf-8")
+    elif kind == "machine":
+        written = crane.write_machine(loaded, out, overwrite=output.force)
     else:
         write = crane.formats.write_urdf_plus if kind == "urdf+" else crane.formats.write_mjcf
         write(loaded, out)

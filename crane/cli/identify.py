@@ -11,6 +11,7 @@ import typer
 import crane
 from crane.cli.command import OptionBlock, command, refuse_options
 from crane.cli.options import (
+    Bandwidth,
     CentreOfMass,
     ComparedColumns,
     Fit,
@@ -200,13 +201,8 @@ def identify(
     train: TrainingWindow = None,
     validation: Validation = None,
     method: Method = "wls",
-    bandwidth: Annotated[
-        float | None,
-        typer.Option(
-            metavar="HZ", help="Passband of the filter; derived from the motion by default."
-        ),
-    ] = None,
-    slow: Annotated[
+    bandwidth: Bandwidth = None,
+    min_speed: Annotated[
         list[str] | None,
         typer.Option(
             metavar="JOINT=VALUE",
@@ -235,7 +231,7 @@ def identify(
     from crane.identification.mechanics.write_identified import check_rewritable
 
     window, terms, priors = parse_window(train), parse_terms(model.term), parse_priors(model.prior)
-    slowest, trials = parse_values("--slow", slow), parse_trials(tried)
+    min_speeds, trials = parse_values("--min-speed", min_speed), parse_trials(tried)
     loaded = options.load(machine)
     if priors is None:
         loaded = loaded.replace(estimation=replace(loaded.estimation, prior={}))
@@ -256,7 +252,7 @@ def identify(
         as_number(bandwidth, "the bandwidth", "Hz", greater_than=5 / shortest)
     settings: dict[str, Any] = {
         "method": method, "prior": priors, "feasible": model.feasible, "terms": terms,
-        "bandwidth": bandwidth, "slow": slowest, "trust": trust,
+        "bandwidth": bandwidth, "min_speed": min_speeds, "trust": trust,
     }  # fmt: skip
     if trials:
         with progress_bar("cross-validating") as progress:
@@ -402,9 +398,10 @@ def circuit(
             raise InputError(f"--model {model} takes one recording, {len(recording)} are given")
     loaded = options.load(machine)
     check_name(joint, loaded.active, f"'{joint}' is not an active joint")
-    needs = required_channels(joint) if model == "orifices" else []
-    if model == "valve":
-        needs.append((f"voltage_{joint}",))
+    needs_by_model: dict[str, list[tuple[str, ...]]] = {
+        "orifices": required_channels(joint), "valve": [(f"voltage_{joint}",)], "friction": [],
+    }  # fmt: skip
+    needs = needs_by_model[model]
     runs = _read(recording, loaded, reading, needs)
     held_out = _read(validation or [], loaded, RecordingOptions(columns=reading.columns), needs)
     result: Result
@@ -412,9 +409,9 @@ def circuit(
     with status("identifying"):
         if model == "valve":
             result = crane.identification.identify_valve(loaded, runs[0], joint)
-        elif model == "friction":
+        if model == "friction":
             result = crane.identification.identify_cylinder_friction(loaded, runs[0], joint)
-        else:
+        if model == "orifices":
             result = crane.identification.identify_orifices(
                 loaded, runs, joint, method or "weak", period=period
             )

@@ -53,6 +53,10 @@ Frame = Annotated[
         help="Link that carries the load or represents the tool; the tip by default.",
     ),
 ]
+Bandwidth = Annotated[
+    float | None,
+    typer.Option(metavar="HZ", help="Passband of the filter; derived from the motion by default."),
+]
 CentreOfMass = Annotated[
     str | None,
     typer.Option(

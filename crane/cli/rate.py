@@ -99,17 +99,16 @@ def breakout(
     if direction is not None and arm is not None:
         raise InputError("--arm is for break-out forces, leave it out with --direction")
     loaded = options.load(machine)
+    vector: str | list[float] | None = direction
+    if direction is not None and "," in direction:
+        vector = parse_numbers(
+            direction.split(","), f"--direction {direction} is no X,Y,Z, give three numbers"
+        )
     result: Result
     with status("computing forces"):
-        if direction is None:
+        if vector is None:
             result = crane.ratings.breakout(loaded, frame, bucket=bucket, arm=arm, weights=weights)
         else:
-            vector: str | list[float] = direction
-            if "," in direction:
-                vector = parse_numbers(
-                    direction.split(","),
-                    f"--direction {direction} is no X,Y,Z, give three numbers",
-                )
             result = crane.ratings.tool_force(
                 loaded, vector, frame, joint=bucket, weights=weights, step=step
             )
@@ -271,14 +270,14 @@ def power(
     options: MachineOptions,
     reading: RecordingOptions,
     output: OutputFolder,
-    beside: Annotated[
+    compare: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="RECORDING",
             help="A run for comparison, with the machine recorded in it; may be repeated.",
         ),
     ] = None,
-    moved: Annotated[
+    moved_mass: Annotated[
         float | None,
         typer.Option(metavar="KG", help="Mass that each run moves, for the work per kg."),
     ] = None,
@@ -290,23 +289,25 @@ def power(
     from crane.control.valve_commands import require_circuit
     from crane.recordings.measured_recordings import recorded_machine
 
-    if not beside:
+    if not compare:
         refuse_options(
-            {"--moved": moved}, "is for a comparison, name the other runs with --beside"
+            {"--moved-mass": moved_mass}, "is for a comparison, name the other runs with --compare"
         )
-    names = _run_names([recording, *(beside or ())])
+    names = _run_names([recording, *(compare or ())])
     loaded = options.load(machine)
     require_circuit(loaded)  # before anything is read
     run = reading.read(recording, loaded)
     with status("adding up"):
         balances = {names[0]: crane.power_balance(loaded, run)}
-    for name, path in zip(names[1:], beside or (), strict=True):
+    for name, path in zip(names[1:], compare or (), strict=True):
         other = reading.read(path)
         other_machine = recorded_machine(path, other.machine)
         require_circuit(other_machine)
         with status("adding up"):
             balances[name] = crane.power_balance(other_machine, other)
-    output.write(crane.studies.PowerComparison(balances, moved) if beside else balances[names[0]])
+    output.write(
+        crane.studies.PowerComparison(balances, moved_mass) if compare else balances[names[0]]
+    )
 
 
 def _run_names(paths: Sequence[Path]) -> list[str]:

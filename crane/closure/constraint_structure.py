@@ -223,24 +223,34 @@ class _ConstraintAnalysis:
             == rank
         ):
             return
-        undetermined, found = self._undetermined_joints(jacobians), self._propose(jacobians[0])
+        found = self._propose(jacobians[0])
+        raise ActiveJointError(
+            self._active_joints_problem(mobility, jacobians, found),
+            q if mobility else None,
+            jacobians[0],
+            found,
+        )
+
+    def _active_joints_problem(
+        self, mobility: int, jacobians: Sequence[Array], found: Sequence[ActiveJointSelection]
+    ) -> str:
+        active, undetermined = self._active, self._undetermined_joints(jacobians)
         if mobility == len(active):
-            text = (
+            return (
                 f"the active joints {self._format_names(active)} cannot drive "
                 f"{self._format_names(undetermined)}: "
                 f"choose others{_format_proposals(', such as ', found)}"
             )
-        elif not len(active) and mobility:
-            text = _missing_active_joints_text(mobility) + _format_proposals("try ", found)
-        else:
-            text = self._wrong_count_text(undetermined, mobility)
-            given, proposals = active.tolist(), list[ActiveJointSelection]()
-            if 0 < mobility < len(active):
-                proposals = self._propose(jacobians[0], candidates=given)
-            elif mobility - len(active) < len(undetermined):
-                proposals = self._propose(jacobians[0], required=given)
-            text += _format_proposals(", such as ", proposals)
-        raise ActiveJointError(text, q if mobility else None, jacobians[0], found)
+        if not len(active) and mobility:
+            return _missing_active_joints_text(mobility) + _format_proposals("try ", found)
+        given, proposals = active.tolist(), list[ActiveJointSelection]()
+        if 0 < mobility < len(active):
+            proposals = self._propose(jacobians[0], candidates=given)
+        elif mobility - len(active) < len(undetermined):
+            proposals = self._propose(jacobians[0], required=given)
+        return self._wrong_count_text(undetermined, mobility) + _format_proposals(
+            ", such as ", proposals
+        )
 
     def _close_home(self) -> Array:
         """Home with the active joints as in the guess."""

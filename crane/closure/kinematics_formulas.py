@@ -296,20 +296,19 @@ class PositionKinematics:
             if i in geometry.floating_bodies - set(geometry.floating_bases):
                 rotation, origin = self.rotation[parent], self.origin[parent]
             else:
-                is_floating = i in geometry.floating_bases
                 rotation, arm = (
                     self._floating_base_placement(i)
-                    if is_floating
+                    if i in geometry.floating_bases
                     else self._joint_placement(i, q[i - 1])
                 )
                 origin = add_vectors(self.origin[parent], arm)
-                if geometry.reference_body and parent == 0:
-                    inverse_rotation = transpose(rotation)
-                    self.rotation[0], self.origin[0] = (
-                        inverse_rotation,
-                        scale_vector(-1.0, matvec(inverse_rotation, origin)),
-                    )
-                    rotation, origin = identity, [0.0] * 3
+            if geometry.reference_body and parent == 0:
+                inverse_rotation = transpose(rotation)
+                self.rotation[0], self.origin[0] = (
+                    inverse_rotation,
+                    scale_vector(-1.0, matvec(inverse_rotation, origin)),
+                )
+                rotation, origin = identity, [0.0] * 3
             self.offsets.append(scale_vector(float(parent > 0), arm))
             self.rotation.append(rotation)
             self.origin.append(origin)

@@ -104,7 +104,7 @@ class LoopEquations:
             free = [k for k in range(3) if not locked[3 + k]]
             if not free:
                 rows += [(index, False, 0, 1), (index, False, 1, 2), (index, False, 2, 0)]
-            elif len(free) == 1:
+            if len(free) == 1:
                 rows += [(index, False, i, free[0]) for i in range(3) if i != free[0]]
         table = np.ascontiguousarray(np.array(rows, dtype=np.intp).reshape(-1, 4).T)
         self._loop_index, is_loop_translation, self.axis_of_frame1, self.axis_of_frame2 = table

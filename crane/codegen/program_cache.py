@@ -98,7 +98,7 @@ def _module_tables(name: str, module: ModuleType) -> list[Mapping[str, Any]]:
     for word, value in list(vars(module).items()):
         if isinstance(value, dict) and word != "__builtins__":
             found.append(value)
-        elif isinstance(value, type) and value.__module__ == name:
+        if isinstance(value, type) and value.__module__ == name:
             found.append(vars(value))
     return found
 
@@ -106,8 +106,8 @@ def _module_tables(name: str, module: ModuleType) -> list[Mapping[str, Any]]:
 def _is_foreign(value: Any) -> bool:
     """Whether a value, or the function of a property or method, is code of another package."""
     if isinstance(value, property):
-        value = value.fget
-    elif isinstance(value, functools.cached_property):
+        return _is_foreign(value.fget)
+    if isinstance(value, functools.cached_property):
         value = value.func
     elif isinstance(value, _METHOD_TYPES):
         value = value.__func__

@@ -23,19 +23,21 @@ class OneLineRepr:
 
     def _one_line(self) -> str:
         """Class name and public fields: values, shapes of arrays, lengths of sequences."""
-        words = []
-        for name, value in vars(self).items():
-            if name.startswith("_"):
-                continue
-            if isinstance(value, str | int | float | bool) or value is None:
-                words.append(f"{name}={value!r}")
-            elif isinstance(shape := getattr(value, "shape", None), tuple):
-                words.append(f"{name}={shape}")
-            elif isinstance(title := getattr(value, "name", None), str):
-                words.append(f"{name}={title!r}")
-            elif isinstance(value, Sized) and not isinstance(value, OneLineRepr):
-                words.append(f"{name}: {len(value)}")
-        return f"{type(self).__name__}({', '.join(words)})"
+        words = [_field_text(k, x) for k, x in vars(self).items() if not k.startswith("_")]
+        return f"{type(self).__name__}({', '.join(filter(None, words))})"
+
+
+def _field_text(name: str, value: Any) -> str:
+    """A field by its value, shape, name or length; "" if it has none of them."""
+    if isinstance(value, str | int | float | bool) or value is None:
+        return f"{name}={value!r}"
+    if isinstance(shape := getattr(value, "shape", None), tuple):
+        return f"{name}={shape}"
+    if isinstance(title := getattr(value, "name", None), str):
+        return f"{name}={title!r}"
+    if isinstance(value, Sized) and not isinstance(value, OneLineRepr):
+        return f"{name}: {len(value)}"
+    return ""
 
 
 def shorten_to_line(text: str) -> str:

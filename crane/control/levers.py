@@ -114,9 +114,9 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
         """
         if not time:
             self._reset()
-        elif time == self._last_time:
+        if time == self._last_time:
             return  # called again in another chart
-        elif time < self._last_time:  # a run goes back before it crosses branches
+        if time < self._last_time:  # a run goes back before it crosses branches
             raise SimulationError(
                 f"at t = {time:.6g} s: the linkage comes to where it could go on in "
                 "several ways, and levers by positions do not go back: give levers over time"

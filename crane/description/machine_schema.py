@@ -273,7 +273,7 @@ IDENTIFICATION = section_schema(
             "bandwidth of the low-pass filter", "Hz", minimum=0.0,
             zero_error="'{key}' is 0, give one in Hz", default_text="derived from the motion",
         ),
-        "slow": MapKey(
+        "min_speed": MapKey(
             "velocity below which samples are excluded",
             NumberKey("", "m/s", "rad/s", minimum=0.0), _PATTERN,
             default_text="derived from friction and motion",

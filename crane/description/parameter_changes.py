@@ -64,7 +64,7 @@ def apply_parameter_changes(spec: MachineSpec, changes: Mapping[str, float]) -> 
             new_values[*path[:-1], "source_location"] = f"changed by {name}"
         new_values[path] = value
     changed_joints = [str(path[1]) for path in new_values if path[0] == "friction"]
-    changed = _replace_values(
+    changed: MachineSpec = _replace_values(
         dataclasses.replace(
             spec,
             friction={**spec.friction}
@@ -101,25 +101,21 @@ def _check_change(
     return value
 
 
-def _replace_values(owner: T, new_values: Mapping[FieldPath, Any]) -> T:
+def _replace_values(owner: Any, new_values: Mapping[FieldPath, Any]) -> Any:
     values_by_key: dict[str | int, dict[FieldPath, Any]] = {}
     for (key, *rest), value in new_values.items():
         values_by_key.setdefault(key, {})[tuple(rest)] = value
-    replaced: dict[Any, Any] = {}
-    container: Any = owner
-    for key, values in values_by_key.items():
-        replaced[key] = (
-            values[()] if () in values else _replace_values(value_at(owner, (key,)), values)
-        )
-    if isinstance(container, tuple):
-        container = tuple(replaced.get(i, item) for i, item in enumerate(container))
-    elif isinstance(container, dict):
-        container = container | replaced
-    elif isinstance(container, Mapping):
-        container = MappingProxyType({**container, **replaced})
-    elif replaced:
-        container = dataclasses.replace(container, **replaced)
-    return container
+    replaced: dict[Any, Any] = {
+        key: values[()] if () in values else _replace_values(value_at(owner, (key,)), values)
+        for key, values in values_by_key.items()
+    }
+    if isinstance(owner, tuple):
+        return tuple(replaced.get(i, item) for i, item in enumerate(owner))
+    if isinstance(owner, dict):
+        return owner | replaced
+    if isinstance(owner, Mapping):
+        return MappingProxyType({**owner, **replaced})
+    return dataclasses.replace(owner, **replaced) if replaced else owner
 
 
 def _warn_about_unit(spec: MachineSpec, name: str, value: float) -> None:
@@ -130,6 +126,14 @@ def _warn_about_unit(spec: MachineSpec, name: str, value: float) -> None:
         warnings.warn(f"parameter '{name}' {text}", CraneWarning, stacklevel=2)
 
 
+def _scale_inertial(part: Link | Joint, scale: float) -> Link | Joint:
+    if not isinstance(part, Link) or part.inertial is None:
+        return part
+    tensor = tuple(scale * x for x in part.inertial.tensor)
+    scaled = dataclasses.replace(part.inertial, mass=scale * part.inertial.mass, tensor=tensor)
+    return dataclasses.replace(part, inertial=scaled)
+
+
 def _add_payload(spec: MachineSpec, mass: float) -> MachineSpec:
     """Return a machine with its payload fixed to the tip, or else with a point mass there.
 
@@ -138,13 +142,7 @@ def _add_payload(spec: MachineSpec, mass: float) -> MachineSpec:
     tree = spec.tree
     if spec.payload is not None:
         scale = mass / spec.payload.tree.total_mass
-        parts: list[Link | Joint] = []
-        for part in spec.payload.tree:
-            if isinstance(part, Link) and (inertial := part.inertial) is not None:
-                tensor = tuple(scale * x for x in inertial.tensor)
-                scaled = dataclasses.replace(inertial, mass=scale * inertial.mass, tensor=tensor)
-                part = dataclasses.replace(part, inertial=scaled)
-            parts.append(part)
+        parts = [_scale_inertial(part, scale) for part in spec.payload.tree]
         return dataclasses.replace(
             spec, tree=tree.with_parts(*parts), chains=((*spec.chains, spec.payload.chain))
         )

@@ -85,13 +85,13 @@ class EstimationSettings:
         prior: Priors by name or pattern of parameters, such as "q1.viscous", or by link for all
             inertial parameters of a body.
         bandwidth: Cut-off frequency of the low-pass filter [Hz]; None: from the motion.
-        slow: Velocities [m/s], [rad/s] by joint or pattern below which rows are left out.
+        min_speed: Velocities [m/s], [rad/s] by joint or pattern below which rows are left out.
     """
 
     terms: Mapping[str, TermValues | None] = field(default_factory=dict)
     prior: Mapping[str, ParameterPrior] = field(default_factory=dict)
     bandwidth: float | None = None
-    slow: Mapping[str, float] = field(default_factory=dict)
+    min_speed: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -286,24 +286,37 @@ class Phase:
             label = f"the lever of '{joint}' in phase '{self.name}'"
             if joint not in valves:
                 yield "levers", joint, f"no valve for '{joint}', {suggest_names(valves, joint)}"
-            elif not 0 < abs(lever) <= 1:
+                continue
+            if not 0 < abs(lever) <= 1:
                 yield "levers", joint, f"{label} is {lever:g}, give it -1 to 1 and not 0"
-            elif joint not in self.until:
-                problem = "has no position that it is held until, add it under 'until'"
-                yield "levers", joint, f"{label} {problem}"
+                continue
+            if joint not in self.until:
+                yield (
+                    "levers",
+                    joint,
+                    f"{label} has no position that it is held until, add it under 'until'",
+                )
         for joint, position in self.until.items():
             label = f"phase '{self.name}' waits for '{joint}' at {position:g}"
             lower, upper = limits.get(joint, (position, position))
             start = start_positions.get(joint, position)
             if joint not in self.levers:
-                others = suggest_names(self.levers, joint)
-                problem = f"moves no lever of '{joint}' and waits for it, {others}"
-                yield "until", joint, f"phase '{self.name}' {problem}"
-            elif not lower <= position <= upper:
+                yield (
+                    "until",
+                    joint,
+                    f"phase '{self.name}' moves no lever of '{joint}' and waits for it, "
+                    f"{suggest_names(self.levers, joint)}",
+                )
+                continue
+            if not lower <= position <= upper:
                 yield "until", joint, f"{label}, beyond its limits {lower:g} to {upper:g}"
-            elif self.levers[joint] * (position - start) < 0:
-                problem = f"away from which its lever moves it from {start:g}: turn it"
-                yield "until", joint, f"{label}, {problem}"
+                continue
+            if self.levers[joint] * (position - start) < 0:
+                yield (
+                    "until",
+                    joint,
+                    f"{label}, away from which its lever moves it from {start:g}: turn it",
+                )
 
 
 DEFAULT_RAMP_TIME = 0.3  # [s] in which a hand moves a lever from neutral to its end

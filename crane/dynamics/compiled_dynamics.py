@@ -201,7 +201,7 @@ def _build_quantity(
     modes, base_quantity = quantity in STICK_SLIP_QUANTITIES, quantity.removeprefix(DERIVATIVES_OF)
     geometry = compiled_closure.geometry
     is_holonomic = (
-        not geometry.floating_bases and formula_structure.carrier_bodies == geometry.parents
+        not geometry.floating_bases and formula_structure.motion_parents == geometry.parents
     )
     frictionless_quantity = base_quantity.removesuffix(WITH_FRICTION)
     if (

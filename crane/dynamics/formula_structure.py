@@ -10,16 +10,16 @@ from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array
 from crane.dynamics.cluster_recursion import RecursionPlan, plan_recursion
 from crane.dynamics.frame_jacobians import frame_placement
-from crane.dynamics.joint_forces import LAW_SIZE, SLIP_INDEX, JointForces
+from crane.dynamics.joint_forces import PARAMETER_COUNT, SLIP_INDEX, JointForces
 from crane.machine.machine import Machine
 
 BODY_SIZE = 10  # inertia constants of a body
-DISTANCE_SIZE = LAW_SIZE + 6  # constants of a distance: law, attachment points
+DISTANCE_SIZE = PARAMETER_COUNT + 6  # constants of a distance: law, attachment points
 _UPPER_TRIANGLE = np.triu_indices(3)
 FORMULATIONS = ("exact", "decoupled")
 
 
-def carrier_bodies(machine: Machine, formulation: str) -> tuple[int, ...]:
+def motion_parents(machine: Machine, formulation: str) -> tuple[int, ...]:
     """The body whose motion each body shares.
 
     "exact": the parent in the tree. "decoupled": the same within a sub-chain, but every sub-chain
@@ -101,7 +101,7 @@ class FormulaStructure:
     """What the formulas of a machine depend on besides its loops and constants.
 
     Attributes:
-        carrier_bodies: See `carrier_bodies`.
+        motion_parents: See `motion_parents`.
         recursion_plan: How forward dynamics reduces the machine's clusters; see
             `crane.dynamics.cluster_recursion`.
         distance_bodies: Bodies of the two ends of each distance of `JointForces.lengths`; 0 is the
@@ -111,7 +111,7 @@ class FormulaStructure:
         tip_body: Body of the tip, if there is one.
     """
 
-    carrier_bodies: tuple[int, ...]
+    motion_parents: tuple[int, ...]
     recursion_plan: RecursionPlan
     distance_bodies: tuple[tuple[int, int], ...]
     stick_slip_columns: tuple[int, ...]
@@ -132,7 +132,7 @@ class FormulaStructure:
         plan = plan_recursion(machine) if formulation == "exact" else ()
         tip = None if machine.tip is None else bodies[frame_placement(machine, machine.tip)[0]]
         return cls(
-            carrier_bodies(machine, formulation),
+            motion_parents(machine, formulation),
             plan,
             tuple(spans),
             forces.stick_slip_columns,
@@ -143,9 +143,9 @@ class FormulaStructure:
     @property
     def constants_layout(self) -> Layout:
         """Layout of `dynamics_constants`."""
-        bodies, distances = len(self.carrier_bodies) - 1, len(self.distance_bodies)
+        bodies, distances = len(self.motion_parents) - 1, len(self.distance_bodies)
         return Layout(
-            inertias=BODY_SIZE * bodies, joint_laws=LAW_SIZE * bodies, gravity=3,
+            inertias=BODY_SIZE * bodies, joint_laws=PARAMETER_COUNT * bodies, gravity=3,
             rotor_inertias=bodies, distances=DISTANCE_SIZE * distances, moving_factor=1,
             circuit_friction=len(self.circuit_friction_columns), fixed_inertia=4,
             tip_point=0 if self.tip_body is None else 3,
@@ -156,5 +156,7 @@ class FormulaStructure:
         """Indices in `dynamics_constants` of the values of `JointForces.set_stick_slip_modes`."""
         layout = self.constants_layout
         first = layout.start_index("joint_laws") + SLIP_INDEX
-        modes = [first + LAW_SIZE * i + k for i in self.stick_slip_columns for k in range(3)]
+        modes = [
+            first + PARAMETER_COUNT * i + k for i in self.stick_slip_columns for k in range(3)
+        ]
         return [*modes, layout.start_index("moving_factor")]

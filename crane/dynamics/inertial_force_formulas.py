@@ -37,7 +37,7 @@ class InertialForceFormulas(JointForceFormulas):
         for i in range(1, self._body_count):
             linear, angular = self.kinematics.joint_axes[i]
             factors = [*self.gamma[i], self.drift[i]]
-            carried = columns[self.formula_structure.carrier_bodies[i]]
+            carried = columns[self.formula_structure.motion_parents[i]]
             columns.append(
                 [
                     (
@@ -114,7 +114,7 @@ class InertialForceFormulas(JointForceFormulas):
                 self.kinematics.joint_axis(i),
                 moment if self.kinematics.geometry.is_revolute[i] else force,
             )
-            carrier = self.formula_structure.carrier_bodies[i]
+            carrier = self.formula_structure.motion_parents[i]
             if carrier:
                 forces[carrier - 1] = add_vectors(forces[carrier - 1], force)
                 moments[carrier - 1] = add_vectors(
@@ -135,7 +135,7 @@ class InertialForceFormulas(JointForceFormulas):
                 scale_vector(joint_accelerations[i], part)
                 for part in self.kinematics.joint_axes[i]
             )
-            before = added_accelerations[self.formula_structure.carrier_bodies[i]]
+            before = added_accelerations[self.formula_structure.motion_parents[i]]
             added_accelerations.append(
                 (add_vectors(before[0], linear), add_vectors(before[1], angular))
             )

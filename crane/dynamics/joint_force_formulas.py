@@ -25,7 +25,12 @@ from crane.codegen.symbolic import (
 )  # fmt: skip
 from crane.dynamics.formula_structure import BODY_SIZE, DISTANCE_SIZE, FormulaStructure
 from crane.dynamics.frame_jacobians import MIN_LENGTH
-from crane.dynamics.joint_forces import END_STOP_INDEX, LAW_SIZE, SHARPNESS_INDEX, SLIP_INDEX
+from crane.dynamics.joint_forces import (
+    END_STOP_INDEX,
+    PARAMETER_COUNT,
+    SHARPNESS_INDEX,
+    SLIP_INDEX,
+)
 
 
 class ForceLawValues(NamedTuple):
@@ -153,7 +158,7 @@ class JointForceFormulas:
             return [values[i : i + size] for i in range(0, len(values), size)]
 
         self._inertia_constants = load_rows("inertias", BODY_SIZE)
-        self._joint_laws = load_rows("joint_laws", LAW_SIZE)
+        self._joint_laws = load_rows("joint_laws", PARAMETER_COUNT)
         self._gravity = matvec(kinematics.rotation[0], load("gravity"))
         self.rotor_inertias: Vector = [0.0, *load("rotor_inertias")]
         self._distance_constants = load_rows("distances", DISTANCE_SIZE)
@@ -168,7 +173,7 @@ class JointForceFormulas:
         # the drift of the loops is that of the whole machine in both formulations
         tree_velocities, carrier_velocities = (
             VelocityKinematics(kinematics, loops, self.joint_velocities, self._gravity, parents)
-            for parents in (kinematics.geometry.parents, formula_structure.carrier_bodies)
+            for parents in (kinematics.geometry.parents, formula_structure.motion_parents)
         )
         self.drift = tree_velocities.drift if drift is None else drift
         self._tree_velocities, self._carrier_velocities = tree_velocities, carrier_velocities
@@ -197,7 +202,7 @@ class JointForceFormulas:
         for bodies, numbers in zip(
             self.formula_structure.distance_bodies, self._distance_constants, strict=True
         ):
-            law, places = numbers[:LAW_SIZE], (numbers[LAW_SIZE:-3], numbers[-3:])
+            law, places = numbers[:PARAMETER_COUNT], (numbers[PARAMETER_COUNT:-3], numbers[-3:])
             one, two = (
                 add_vectors(kinematics.origin[body], matvec(kinematics.rotation[body], place))
                 for body, place in zip(bodies, places, strict=True)

@@ -13,21 +13,23 @@ from crane.description.force_elements import ForceElement, Friction, GasSpring, 
 from crane.dynamics.frame_jacobians import FrameDistances, FramePair
 from crane.machine.machine import Machine
 
-_LAW_FIELDS = (
+_PARAMETER_NAMES = (
     "coulomb", "coulomb_offset", "viscous", "viscous_offset", "sharpness", "stiction", "stribeck",
     "slip_sign", "is_held", "inverse_velocity",
     "stiffness", "damping", "constant", "energy_offset",
     "stop_stiffness", "stop_damping", "lower_limit", "upper_limit",
     "gas_force", "gas_area_per_volume", "gas_rest_position", "gas_exponent",
 )  # fmt: skip
-LAW_SIZE = len(_LAW_FIELDS)  # values of a law, see `JointForces.table`
-SHARPNESS_INDEX = _LAW_FIELDS.index("sharpness")
-SLIP_INDEX = _LAW_FIELDS.index("slip_sign")  # first of the stick-slip mode
-END_STOP_INDEX = _LAW_FIELDS.index("stop_stiffness")  # first of the end stop
-_MODE_FIELDS = slice(SLIP_INDEX, _LAW_FIELDS.index("inverse_velocity") + 1)
-_SPRING_FIELDS = slice(_LAW_FIELDS.index("stiffness"), _LAW_FIELDS.index("energy_offset") + 1)
-_END_STOP_FIELDS = slice(END_STOP_INDEX, _LAW_FIELDS.index("upper_limit") + 1)
-_GAS_FIELDS = slice(_LAW_FIELDS.index("gas_force"), LAW_SIZE)
+PARAMETER_COUNT = len(_PARAMETER_NAMES)  # values of a law, see `JointForces.table`
+SHARPNESS_INDEX = _PARAMETER_NAMES.index("sharpness")
+SLIP_INDEX = _PARAMETER_NAMES.index("slip_sign")  # first of the stick-slip mode
+END_STOP_INDEX = _PARAMETER_NAMES.index("stop_stiffness")  # first of the end stop
+_MODE_FIELDS = slice(SLIP_INDEX, _PARAMETER_NAMES.index("inverse_velocity") + 1)
+_SPRING_FIELDS = slice(
+    _PARAMETER_NAMES.index("stiffness"), _PARAMETER_NAMES.index("energy_offset") + 1
+)
+_END_STOP_FIELDS = slice(END_STOP_INDEX, _PARAMETER_NAMES.index("upper_limit") + 1)
+_GAS_FIELDS = slice(_PARAMETER_NAMES.index("gas_force"), PARAMETER_COUNT)
 # for joints with circuit friction only, so that friction is never zero
 MIN_COULOMB_FRICTION = 1e-6
 REST_VELOCITY = 5e-10  # scaled velocity that counts as rest
@@ -67,7 +69,7 @@ class JointForces:
     def __init__(self, machine: Machine):
         rows, pairs = _table_rows(machine)
         self._joint_count, self.lengths = machine.model.nv, FrameDistances(machine, pairs)
-        law_table = self.table = np.zeros((self._joint_count + len(pairs), LAW_SIZE))
+        law_table = self.table = np.zeros((self._joint_count + len(pairs), PARAMETER_COUNT))
         self.stick_slip_columns, self.moving_factor = find_stick_slip_columns(machine), 1.0
         self.circuit_friction_columns, self.circuit_friction = (
             find_circuit_friction_columns(machine),
@@ -143,13 +145,13 @@ class JointForces:
         """The same without circuit friction."""
         law = self.table[list(self.stick_slip_columns)]
         return np.asarray(
-            law[:, _LAW_FIELDS.index("coulomb")] + law[:, _LAW_FIELDS.index("stiction")]
+            law[:, _PARAMETER_NAMES.index("coulomb")] + law[:, _PARAMETER_NAMES.index("stiction")]
         )
 
     def friction_at_rest(self, limit_share: Array) -> Array:
         """(k,) friction of stick-slip joints at rest, from shares (k,) of its limit."""
         return (
-            self.table[list(self.stick_slip_columns), _LAW_FIELDS.index("coulomb_offset")]
+            self.table[list(self.stick_slip_columns), _PARAMETER_NAMES.index("coulomb_offset")]
             + limit_share * self.breakaway
         )
 

@@ -75,17 +75,17 @@ class PinocchioDynamics:
     Args:
         machine: The machine.
         forces: Its friction and passive forces.
-        carrier_bodies: See `crane.dynamics.formula_structure`.
+        motion_parents: See `crane.dynamics.formula_structure`.
     """
 
-    def __init__(self, machine: Machine, forces: JointForces, carrier_bodies: Sequence[int]):
+    def __init__(self, machine: Machine, forces: JointForces, motion_parents: Sequence[int]):
         # a copy, which later changes of the machine's model do not affect
         self._model = pin.Model(machine.model)
         # added here: Pinocchio's kinetic energy ignores the armature of some joints
         self._armature = np.array(self._model.armature)
         self._rotor_columns = np.flatnonzero(self._armature)
         self._closure, self._joint_forces = machine.closure, forces
-        self._coordinates, self._carrier_bodies = machine.coordinates, carrier_bodies
+        self._coordinates, self._carrier_bodies = machine.coordinates, motion_parents
         self._tip = None if machine.tip is None else frame_placement(machine, machine.tip)
 
     @cached_property

@@ -150,7 +150,7 @@ class QuantityEvaluator(OneLineRepr):
         self.formula_structure = FormulaStructure.from_machine(machine, formulation, self.forces)
         self.backend = backend if machine.closure.is_compiled else "pinocchio"
         self.tree_dynamics = PinocchioDynamics(
-            machine, self.forces, self.formula_structure.carrier_bodies
+            machine, self.forces, self.formula_structure.motion_parents
         )
         self._compiled_quantities: dict[str, CompiledQuantity | None] = {}
         self._parameter_derivatives: dict[

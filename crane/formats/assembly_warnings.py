@@ -84,7 +84,7 @@ def _different_home_text(
     joint, deviation = search.specified_deviation
     deviation_text = _coordinate_text(closure, joint, deviation * closure.units[joint], " is")
     loops = _list_names([f"'{loop}'" for loop in search.reversed])
-    reversed_loops_text = f", loop {loops} the other way round" if loops else ""
+    reversed_loops_text = f", loop {loops} in its other assembly mode" if loops else ""
     diagnosis = diagnose_closure(spec, closure.model, initial_guess)
     cause_text = (
         f"{diagnosis}; correct home or the frames" if diagnosis else "correct home or the frames"

@@ -137,7 +137,8 @@ class FlowBalance:
                 self.pumped_flow = self.pumped_flow + flow.rate
                 self.pump_power = self.pump_power + self._node_pressures[flow.target] * flow.rate
                 self.net_inflows[flow.target] = self.net_inflows[flow.target] + flow.rate
-            elif pair[::-1] in flow_between:
+                continue
+            if pair[::-1] in flow_between:
                 flow_between[pair[::-1]] = flow_between[pair[::-1]] - flow.rate
             else:
                 flow_between[pair] = flow_between.get(pair, 0.0) + flow.rate
@@ -146,7 +147,7 @@ class FlowBalance:
             self.net_inflows[target] = self.net_inflows[target] + rate
             if target == TANK_NODE:
                 self.returned_flow = self.returned_flow + rate
-            elif source == TANK_NODE:
+            if source == TANK_NODE and target != TANK_NODE:
                 self.returned_flow = self.returned_flow - rate
             self.lost_power = self.lost_power + rate * (
                 self._node_pressures[source] - self._node_pressures[target]
@@ -296,8 +297,9 @@ def merged_load_pressures(
     out = dict(loads)
     for element in elements:
         pair = element.source, element.target
-        if element.kind == "orifice" and {*pair} <= loads.keys():
-            share = clip(_element_opening(element, openings) * SENSING_OPENING_GAIN, 0.0, 1.0)
-            for pump, other_pump in (pair, pair[::-1]):
-                out[pump] = maximum(out[pump], tank + share * (loads[other_pump] - tank))
+        if element.kind != "orifice" or not {*pair} <= loads.keys():
+            continue
+        share = clip(_element_opening(element, openings) * SENSING_OPENING_GAIN, 0.0, 1.0)
+        for pump, other_pump in (pair, pair[::-1]):
+            out[pump] = maximum(out[pump], tank + share * (loads[other_pump] - tank))
     return out

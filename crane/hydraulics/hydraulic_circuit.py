@@ -106,11 +106,12 @@ class Hydraulics:
         check_summed_pumps(self.pumps)
         channels = [name.replace(".", "_") for name in self.node_names]  # of recorded pressures
         for section in ("supplies", "lines", "accumulators"):
-            for name in getattr(self, section):
-                if channels.count(name) > 1:
-                    raise CircuitPathError(
-                        (section, name), f"two nodes are called '{name}', give them names"
-                    )
+            repeated = [x for x in getattr(self, section) if channels.count(x) > 1]
+            if repeated:
+                raise CircuitPathError(
+                    (section, repeated[0]),
+                    f"two nodes are called '{repeated[0]}', give them names",
+                )
         return_nodes = [x for x in self.node_names if x not in self._chamber_nodes]
         for joint, valve in self.valves.items():
             path, label = ("valves", joint), f"valve of '{joint}'"
@@ -131,12 +132,13 @@ class Hydraulics:
             path, label = ("elements", name), f"element '{name}'"
             _check_node(self.node_names, label, element.source, (*path, "from"))
             _check_node(self.node_names, label, element.target, (*path, "to"))
-            for joint in element.joints:
-                if joint not in self.valves:
-                    raise CircuitPathError(
-                        (*path, "joints"),
-                        f"{label} is opened by '{joint}', {suggest_names(self.valves, joint)}",
-                    )
+            unknown = [x for x in element.joints if x not in self.valves]
+            if unknown:
+                raise CircuitPathError(
+                    (*path, "joints"),
+                    f"{label} is opened by '{unknown[0]}', "
+                    f"{suggest_names(self.valves, unknown[0])}",
+                )
 
     @property
     def pumps(self) -> dict[str, Supply]:
@@ -261,11 +263,10 @@ def _flow_paths(hydraulics: Hydraulics) -> list[tuple[str, str]]:
             paths.append((b, a))
         if cylinder.leakage > 0 or cylinder.cross_relief > 0:
             paths += [(a, b), (b, a)]
-        for node, leakage in ((a, cylinder.leakage_a), (b, cylinder.leakage_b)):
-            if leakage > 0 or cylinder.relief > 0:
-                paths.append((node, TANK_NODE))
-            if cylinder.refill > 0:
-                paths.append((TANK_NODE, node))
+        leakages = {a: cylinder.leakage_a, b: cylinder.leakage_b}
+        paths += [(x, TANK_NODE) for x in (a, b) if leakages[x] > 0 or cylinder.relief > 0]
+        if cylinder.refill > 0:
+            paths += [(TANK_NODE, a), (TANK_NODE, b)]
     for element in hydraulics.elements.values():
         paths.append((element.source, element.target))
         if element.kind in ("orifice", "leak"):

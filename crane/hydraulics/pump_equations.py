@@ -122,9 +122,9 @@ class PumpEquations:
             set_pressure = maximum(highest_load + constants["margin"], constants["standby"])
             set_pressure = minimum(set_pressure, constants["pressure"])
             share = (set_pressure - p) * constants["per_droop"]
-        elif control == "negative":
+        if control == "negative":
             share = minimum(1.0 - throttle_pressure / constants["signal"], cut_off)
-        elif control == "positive":
+        if control == "positive":
             share = minimum(
                 sum((cylinder.pump_demand for cylinder in self._cylinders), 0.0), cut_off
             )

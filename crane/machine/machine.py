@@ -326,7 +326,7 @@ class Machine(OneLineRepr):
         for name, value in changes.items():
             if isinstance(value, Mapping):
                 changes[name] = MappingProxyType(dict(value))
-            elif isinstance(value, list):
+            if isinstance(value, list):
                 changes[name] = tuple(value)
         return dataclasses.replace(self, **{k: x for k, x in changes.items() if x is not None})
 

@@ -261,10 +261,15 @@ def _path_columns(machine: Machine, table: Table) -> dict[str, str]:
         for name in (axis, _TIP_PREFIX + axis)
         if name in headings
     }
-    if any(joint in headings for joint in joints):
+    is_joint_path = any(joint in headings for joint in joints)
+    if not tip and not is_joint_path:
+        raise InputError(
+            f"it has no column of a path, give time and {', '.join(joints)}, or time and x, y, z"
+        )
+    if is_joint_path:
         columns = {joint: joint for joint in joints}
         hint = f"a path of joints has all that are driven: {', '.join(joints)}"
-    elif tip:
+    else:
         if machine.tip is None:
             raise InputError(f"'{machine.name}' has no tip, name its frame under 'tip:'")
         if len(groups) > 1:
@@ -272,10 +277,6 @@ def _path_columns(machine: Machine, table: Table) -> dict[str, str]:
         columns = {axis: tip.get(axis, axis) for axis in TIP_COORDINATES}
         columns |= {name: name for group in groups for name in group}
         hint = "a path of the tip has x, y, z, and all or no columns of an attitude"
-    else:
-        raise InputError(
-            f"it has no column of a path, give time and {', '.join(joints)}, or time and x, y, z"
-        )
     if missing := [name for name in columns.values() if name not in headings]:
         raise InputError(f"column '{missing[0]}' is missing, {hint}")
     unknown = [name for name in headings if name not in (TIME, *columns.values())]

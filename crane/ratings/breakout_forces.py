@@ -253,9 +253,9 @@ def _largest_breakout_force(
     force, best, _ = _maximize_over_starts(strokes, limits, grid, moved)
     if not (force > 0 and isolated_force > 0):
         raise InputError(f"'{joint}' exerts no force at '{frame}'")
-    forces = limits.max_magnitudes(strokes.statics.evaluate(best[None]))[0]
+    forces = limits.rated_values(strokes.statics.evaluate(best[None]))[0]
     smallest = int(np.nan_to_num(forces, nan=np.inf).argmin())
-    home = own_limits.max_magnitudes(strokes.statics.evaluate(machine.home[None]))[0].min()
+    home = own_limits.rated_values(strokes.statics.evaluate(machine.home[None]))[0].min()
     return BreakoutForce(
         joint=joint,
         pivot=find_pivot(machine, frame, stroke_index),
@@ -281,7 +281,7 @@ def _maximize_over_starts(
     """
 
     def largest_forces(q: Array) -> Array:
-        forces = limits.max_magnitudes(strokes.statics.evaluate(q))
+        forces = limits.rated_values(strokes.statics.evaluate(q))
         return np.where(np.isnan(forces), np.inf, forces).min(axis=1)
 
     value, best = -np.inf, strokes.machine.home
@@ -343,7 +343,7 @@ def maximize_force(strokes: Strokes, limits: LoadLimits, q: Array, moved: list[i
         (nq,) closed configuration; the start if no larger force is found.
     """
     statics, active = strokes.statics, strokes.machine.closure.active
-    force = float(limits.max_magnitudes(statics.evaluate(q[None]))[0].min())
+    force = float(limits.rated_values(statics.evaluate(q[None]))[0].min())
     if not 0 < force < np.inf:
         return q
     lower, lengths = strokes.low[moved], (strokes.high - strokes.low)[moved]
@@ -393,4 +393,4 @@ def maximize_force(strokes: Strokes, limits: LoadLimits, q: Array, moved: list[i
         options={"ftol": 1e-14, "maxiter": 200},
     )  # fmt: skip
     configuration, at_rest, _ = evaluate(tuple(result.x[:-1]))
-    return configuration if float(limits.max_magnitudes(at_rest)[0].min()) > force else q
+    return configuration if float(limits.rated_values(at_rest)[0].min()) > force else q

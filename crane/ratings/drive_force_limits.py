@@ -64,6 +64,8 @@ def drive_force_limits(
         column, is_raising = machine.active.index(joint), joint in raising_joints
         pressures: list[float] = []
         areas, seal_friction = np.zeros(2), 0.0
+        max_force = float(machine.model.effortLimit[machine.column(joint)])
+        min_force, seal_forces, limit_kind = -max_force, np.zeros(2), MOTOR_EFFORT
         if circuit is not None and joint in circuit.joints:
             cylinder, tank = circuit.cylinders[joint], circuit.supply.tank
             pressures = [_max_pressure(circuit, cylinder, side, is_raising) for side in "ab"]
@@ -73,11 +75,8 @@ def drive_force_limits(
             seal_friction = cylinder.seal_friction
             seal_forces = seal_friction * (np.array(pressures) - tank)
             limit_kind = WORKING_PRESSURE if is_raising else HOLDING_PRESSURE
-        else:
-            max_force = float(machine.model.effortLimit[machine.column(joint)])
-            if not (np.isfinite(max_force) and max_force > 0):
-                continue
-            min_force, seal_forces, limit_kind = -max_force, np.zeros(2), MOTOR_EFFORT
+        if not pressures and not (np.isfinite(max_force) and max_force > 0):
+            continue
         if with_friction and is_raising and joint in machine.friction:
             law = machine.friction[joint]
             max_force -= law.breakaway_force + law.coulomb_offset + seal_forces[0]

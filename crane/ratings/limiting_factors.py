@@ -131,7 +131,7 @@ class LoadLimits:
         ]
         self.rated_shares = np.array([factor.rated_share for factor in self.factors])
 
-    def max_magnitudes(
+    def rated_values(
         self, statics: StaticQuantities, angles: Array | None = None, q: Array | None = None
     ) -> Array:
         """Return the rated load or force (N, K) by limiting factor [kg], [N].

@@ -250,7 +250,7 @@ def _values_by_factor(
             q = q.copy()
             q[:, column] = slew_coordinate
             statics = conditions.places.statics.evaluate(q)
-    return limits.max_magnitudes(statics, np.full(len(q), angle), q)
+    return limits.rated_values(statics, np.full(len(q), angle), q)
 
 
 def _smallest_values(evaluate: ValueFunction, q: Array, statics: StaticQuantities) -> Array:

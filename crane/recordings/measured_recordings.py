@@ -224,13 +224,12 @@ def _remove_free_forces(machine: Machine, table: Table) -> Table:
     notes = {key: text for key, text in table.notes.items() if key != FREE_JOINTS_NOTE}
     if machine.free:
         notes[FREE_JOINTS_NOTE] = ", ".join(machine.free)
-    kept_columns = []
-    for i, name in enumerate(table.units):
-        joint = name.removesuffix(FORCE_SUFFIX)
-        if not name.endswith(FORCE_SUFFIX) or joint not in machine.free:
-            kept_columns.append(i)
-        elif table.values[:, i].any():
+    forces = {joint + FORCE_SUFFIX: joint for joint in machine.free}
+    free_columns = {i: forces[name] for i, name in enumerate(table.units) if name in forces}
+    for i, joint in free_columns.items():
+        if table.values[:, i].any():
             raise RecordingError(free_force_message(joint, table.values[:, i]))
+    kept_columns = [i for i in range(len(table.units)) if i not in free_columns]
     units = {name: unit for i, (name, unit) in enumerate(table.units.items()) if i in kept_columns}
     return Table(units, table.values[:, kept_columns], notes)
 

@@ -403,7 +403,7 @@ class Recording(Result):
                 column[joint + VELOCITY_SUFFIX] = time_derivative(column[joint], column[TIME])
             if joint + FORCE_SUFFIX in units:
                 check_unit(joint + FORCE_SUFFIX, units[joint + FORCE_SUFFIX], [FORCE_UNITS[unit]])
-            elif joint in free:
+            if joint in free and joint + FORCE_SUFFIX not in units:
                 column[joint + FORCE_SUFFIX] = np.zeros_like(column[TIME])
 
         def stacked(suffix: str) -> Array:

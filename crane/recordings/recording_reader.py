@@ -151,10 +151,10 @@ def _read_machine_log(
         heading = f"{quantity} [{unit}]" if unit else quantity
         line = logs.LogColumn(f"{machine.path}: sensor '{quantity}'", heading, sensor.column)
         missing = logs.missing_names(sensor.column, arrays)
+        if missing and quantity == TIME:
+            raise RecordingError(f"{path}: the log has no '{missing[0]}', {suggest_names(arrays)}")
         if not missing:
             lines.append(line)
-        elif quantity == TIME:
-            raise RecordingError(f"{path}: the log has no '{missing[0]}', {suggest_names(arrays)}")
         else:
             missing_sensors.append(f"'{quantity}' (no '{missing[0]}')")
     if missing_sensors:

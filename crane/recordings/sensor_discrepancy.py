@@ -167,12 +167,12 @@ class _RedundantSensor:
         if self.is_rate:
             drift_rate = factor * float(self._fit_discrepancy([self.time])[0][0])
             return (
-                f"sensors disagree: '{self.name}' is {drift_rate:+.3g} {unit}/s off on the mean "
+                f"sensors disagree: '{self.name}' is {drift_rate:+.3g} {unit}/s off on average "
                 f"against {used}: {cause}"
             )
         low, high = factor * self.off.min(), factor * self.off.max()
         return (
-            f"sensors disagree: '{self.name}' is {factor * mean:+.3g} {unit} off on the mean "
+            f"sensors disagree: '{self.name}' is {factor * mean:+.3g} {unit} off on average "
             f"({low:+.3g} to {high:+.3g} over the motion) against {used}: {cause}"
         )
 
@@ -205,10 +205,8 @@ class _RedundantSensor:
             named = " or ".join(
                 x.format_parameters(known) for x in zeros if x.residual_rms <= detection_limit
             )
-            return (
-                f"a constant offset explains it but for "
-                f"{self._format_residual(zeros[0].residual_rms)}, {named}"
-            )
+            residual = self._format_residual(zeros[0].residual_rms)
+            return f"a constant offset explains it to {residual}: {named}"
         if np.ptp(self.measured) < _STANDSTILL_SHARE * np.ptp(self.expected):
             return "" if self.is_rate else "it does not move"
         other_causes = sorted(
@@ -235,12 +233,12 @@ class _RedundantSensor:
         return self._format_causes([zero, *best[:_MAX_LISTED]], known) + rest
 
     def _format_causes(self, causes: list[_DiscrepancyCause], known: Mapping[str, Sensor]) -> str:
-        first, *more = (
-            (x.description, self._format_residual(x.residual_rms), x.format_parameters(known))
+        texts = (
+            f"{self._format_residual(x.residual_rms)} with {x.description} "
+            f"({x.format_parameters(known)})"
             for x in causes
         )
-        texts = [f"{first[0]} leaves {first[1]} of it ({first[2]})"]
-        return ", ".join(texts + [f"{words} {left} ({numbers})" for words, left, numbers in more])
+        return "residual " + ", ".join(texts)
 
     def _format_residual(self, residual_rms: float) -> str:
         unit, factor = _DISPLAY_UNITS[self.unit]
@@ -269,7 +267,7 @@ class _RedundantSensor:
             [self._zero_column, self.expected]
         )
         numbers = {"zero": float(zero), "scale": 1.0 + float(change)}
-        found = [_DiscrepancyCause({self.name: numbers}, residual_rms, "a scale besides")]
+        found = [_DiscrepancyCause({self.name: numbers}, residual_rms, "an offset and a scale")]
         delay = 0.0
         for _ in range(_MAX_ITERATIONS):
             delayed = np.interp(self.time - delay, self.time, self.expected)
@@ -280,7 +278,9 @@ class _RedundantSensor:
             delay += float(change)
         if delay > 0:  # a delay is causal
             numbers = {"zero": float(zero), "delay": delay}
-            found.append(_DiscrepancyCause({self.name: numbers}, residual_rms, "a delay besides"))
+            found.append(
+                _DiscrepancyCause({self.name: numbers}, residual_rms, "an offset and a delay")
+            )
         return found
 
     def _drive_zero_causes(self, measured_columns: Sequence[str]) -> list[_DiscrepancyCause]:
@@ -332,10 +332,10 @@ class _RedundantSensor:
             (move, zero), residual_rms = self._fit_discrepancy([derivative, self._zero_column])
             (move_alone,), residual_without_zero = self._fit_discrepancy([derivative])
             zero_parameters = {self.name: {"zero": float(zero)}}
-            description = "a pin elsewhere besides"
+            description = "an offset and another pin position"
             if residual_without_zero <= max(_NEAR_BEST_FACTOR * residual_rms, self.limit):
                 move, residual_rms = move_alone, residual_without_zero
-                zero_parameters, description = {}, "a pin elsewhere alone"
+                zero_parameters, description = {}, "another pin position"
             position = float(positions[link]["xyz".index(axis)] + move)
             cause = _DiscrepancyCause(zero_parameters, residual_rms, description, {name: position})
             found.setdefault(link, []).append((abs(float(move)), cause))

@@ -182,7 +182,7 @@ class _CircuitColumns:
         for name in self._circuit.state_units:
             if name.startswith(("pressure_", "spring_", "share_", "oil_")):
                 yield (name,)
-            elif name == "engine":
+            if name == "engine":
                 yield ("engine_speed",)
         for name, spool in self._spools.items():
             is_instantaneous = not spool.bandwidth and not spool.hysteresis and not spool.delay

@@ -113,13 +113,11 @@ def combine_task_measures(tasks: Sequence[tuple[float, dict[str, float]]]) -> di
     out = {}
     for name in [x for x in tasks[0][1] if all(x in found for _, found in tasks)]:
         values = [measures[name] for _, measures in tasks]
-        if name.startswith("peak_"):
-            out[name] = max(values)
-        elif name.startswith("rms_"):
+        if name.startswith("rms_"):
             squares = [d * x * x for (d, _), x in zip(tasks, values, strict=True)]
             out[name] = float(np.sqrt(sum(squares) / total_duration))
         else:
-            out[name] = sum(values)
+            out[name] = max(values) if name.startswith("peak_") else sum(values)
     return out
 
 

@@ -100,13 +100,12 @@ def _figure_images(value: Any) -> Iterator[str]:
 def _text_blocks(value: Any) -> Iterator[str]:
     if isinstance(value, Machine):
         # notebooks are given away, and where a file lies here concerns nobody there
-        yield from _fact_tables([fact for fact in machine_facts(value) if fact.name != "file"])
-    elif isinstance(value, Recording):
-        yield from _split_blocks(summarize(value).to_markdown(), _render_markdown)
-    elif hasattr(value, "to_markdown"):
-        yield from _split_blocks(value.to_markdown(), _render_markdown)
-    elif hasattr(value, "to_text"):
-        yield from _split_blocks(value.to_text(), _preformatted)
+        return _fact_tables([fact for fact in machine_facts(value) if fact.name != "file"])
+    if isinstance(value, Recording):
+        return _split_blocks(summarize(value).to_markdown(), _render_markdown)
+    if hasattr(value, "to_markdown"):
+        return _split_blocks(value.to_markdown(), _render_markdown)
+    return _split_blocks(value.to_text() if hasattr(value, "to_text") else "", _preformatted)
 
 
 def _fact_tables(facts: list[MachineFact]) -> Iterator[str]:
@@ -123,10 +122,11 @@ def _fact_tables(facts: list[MachineFact]) -> Iterator[str]:
 
 def _split_blocks(text: str, render_text: Callable[[str], str]) -> Iterator[str]:
     """Parts of a text that blank lines divide; its tables as such, without its title."""
-    for block in re.split(r"\n\s*\n", re.sub(r"\A# .*\n", "", text).strip("\n")):
+    blocks = re.split(r"\n\s*\n", re.sub(r"\A# .*\n", "", text).strip("\n"))
+    for block in filter(None, blocks):
         if block.lstrip().startswith("|"):
             yield f'<div class="scroll">{_render_markdown(block)}</div>'
-        elif block:
+        else:
             yield render_text(block)
 
 

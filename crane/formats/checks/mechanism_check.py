@@ -221,8 +221,8 @@ def check_strokes(spec: MachineSpec, closure: Closure) -> None:
         except ClosureError as error:
             distances = np.abs((q_a - home)[is_moved] / np.where(span > 0, span, 1.0))
             failures.append((float(distances.max()), str(error)))
-            if len(failures) == _MAX_FAILURES:
-                break
+        if len(failures) == _MAX_FAILURES:
+            break
     failed_share = len(failures) / tried_count
     if failed_share >= _MIN_FAILED_SHARE:
         names = ", ".join(np.array(closure.active_names)[is_moved])

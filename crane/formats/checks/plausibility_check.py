@@ -315,7 +315,7 @@ def _node_problems(hydraulics: Hydraulics) -> Iterator[tuple[str, str]]:
                 f"no pump feeds the {kind} '{name}', {check_valve_text}add an element that "
                 f"leads into it",
             )
-        elif name not in drained_nodes:
+        if name in fed_nodes and name not in drained_nodes:
             yield (
                 f"{kind} {name}",
                 f"what gets into the {kind} '{name}' never leaves it, add an orifice or a relief "

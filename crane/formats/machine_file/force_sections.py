@@ -200,9 +200,14 @@ def external_force_data(forces: tuple[ExternalForce, ...]) -> dict[str, Any]:
     for ground in grounds:
         data["ground"] = GROUND.values_of(ground) or {"height": 0.0}
     for force in forces:
+        if type(force) not in (Wrench, Contact, SoilCutting):
+            raise InputError(
+                f"the load '{force.name}' is a {type(force).__name__}, which no file holds: leave "
+                "it out, or give a Wrench by time"
+            )
         if type(force) is Wrench:
             data["loads"].append(load_data(force))
-        elif type(force) is Contact:
+        if type(force) is Contact:
             data["contacts"].append(
                 (
                     CONTACT.values_of(force, "name")
@@ -210,13 +215,8 @@ def external_force_data(forces: tuple[ExternalForce, ...]) -> dict[str, Any]:
                 )
                 | _name_data(force)
             )
-        elif type(force) is SoilCutting:
+        if type(force) is SoilCutting:
             data["cutters"].append(CUTTER.values_of(force, "name") | _name_data(force))
-        else:
-            raise InputError(
-                f"the load '{force.name}' is a {type(force).__name__}, which no file holds: leave "
-                "it out, or give a Wrench by time"
-            )
     return data
 
 

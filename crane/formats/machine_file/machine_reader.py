@@ -74,19 +74,19 @@ def read_machine_spec(name: str | Path) -> MachineSpec:
     Raises:
         DescriptionError: With file, line, what is wrong, and the names that exist.
     """
-    path = find_machine_file(name)
-    if is_robot_file(path):
-        spec = _read_robot(path)
-    elif path.suffix.lower() in (".xml", ".mjcf"):
-        from crane.formats.mjcf.mjcf_reader import read_mjcf  # few files are MJCF
-
-        spec = read_mjcf(path)
-    elif is_parallel_robot(path):
-        spec = read_parallel_robot(path)
-    else:
-        spec = _read_machine(path)
+    spec = _read_by_format(find_machine_file(name))
     warn_about_open_loops(spec)
     return spec
+
+
+def _read_by_format(path: Path) -> MachineSpec:
+    if is_robot_file(path):
+        return _read_robot(path)
+    if path.suffix.lower() in (".xml", ".mjcf"):
+        from crane.formats.mjcf.mjcf_reader import read_mjcf  # few files are MJCF
+
+        return read_mjcf(path)
+    return read_parallel_robot(path) if is_parallel_robot(path) else _read_machine(path)
 
 
 def _read_robot(path: Path) -> MachineSpec:
@@ -320,7 +320,7 @@ def read_estimation(top: YamlSection) -> EstimationSettings:
         section.value_map("terms", _read_term),
         section.value_map("prior", _read_prior),
         section.number("bandwidth") if "bandwidth" in section else None,
-        section.value_map("slow", YamlSection.number),
+        section.value_map("min_speed", YamlSection.number),
     )
 
 
@@ -330,7 +330,7 @@ def estimation_data(settings: EstimationSettings) -> dict[str, Any]:
         "terms": {name: _term_data(numbers) for name, numbers in settings.terms.items()},
         "prior": {name: str(known) for name, known in settings.prior.items()},
         "bandwidth": settings.bandwidth,
-        "slow": dict(settings.slow),
+        "min_speed": dict(settings.min_speed),
     }
     return {key: value for key, value in data.items() if value}
 

@@ -171,7 +171,7 @@ class MachineDraft:
             key_path = "rotor_inertia", rest[0]
         elif section == "pin_capacities":
             key_path = "pins", key
-        elif section in ("gas_springs", "end_stops"):  # which are mappings in the file
+        if section in ("gas_springs", "end_stops"):  # which are mappings in the file
             key_path = str(section), value_at(machine, path[:2]).joint, *rest
         parent: Any = self.data
         for step in key_path[:-1]:
@@ -313,7 +313,7 @@ def _task_data(task: Task) -> dict[str, Any]:
         data["via"] = [VIA_POINT.values_of(via) | dict(via.point) for via in task.via]
     elif task.coefficients:
         data[task.space] = {key: list(row) for key, row in task.coefficients.items()}
-    elif not task.phases:
+    if not (task.via or task.coefficients or task.phases):
         data["joystick"] = {
             joint: [x for point in polygon for x in point]
             for joint, polygon in task.levers.items()

@@ -253,7 +253,7 @@ def _read_chain(
         report_error(
             item.error_at(None, f"chain '{name}' has no 'parent', name the frame it hangs from")
         )
-    elif not earlier_chains and are_all_read and parent is not None:
+    if not earlier_chains and are_all_read and parent is not None:
         report_error(
             item.error_at(
                 "parent", f"chain '{name}' is first and stands on the world, remove its 'parent'"
@@ -371,7 +371,7 @@ def warn_about_open_loops(spec: MachineSpec) -> None:
     remainder_text = [f"{len(pairs) - _MAX_SHOWN} more"] if len(pairs) > _MAX_SHOWN else []
     location = spec.tree.links[pairs[0][0]].source_location
     warnings.warn(
-        f"{location}: nothing closes what looks like {len(pairs)} loop{'s' * (len(pairs) > 1)}, "
+        f"{location}: no joint closes what looks like {len(pairs)} loop{'s' * (len(pairs) > 1)}, "
         f"{', '.join(pair_texts + remainder_text)}: close them by crane add loops, paste what "
         "crane check proposes into a machine file, or rename the frames",
         CraneWarning,

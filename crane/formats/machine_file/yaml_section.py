@@ -217,11 +217,11 @@ class YamlSection(YamlValues):
         common, location = outer.pop(ALL_ITEM), outer.locations.pop(ALL_ITEM)
         for name in names:
             item = outer.get(name, LocatedMapping(*location))
-            if isinstance(item, LocatedMapping):
-                for common_key in common:
-                    if common_key not in item:
-                        item.copy_key(common, common_key)
-                outer[name], outer.locations[name] = item, outer.locations.get(name, location)
+            if not isinstance(item, LocatedMapping):
+                continue
+            for common_key in [x for x in common if x not in item]:
+                item.copy_key(common, common_key)
+            outer[name], outer.locations[name] = item, outer.locations.get(name, location)
 
     def item_names(self, key: str) -> tuple[str, ...]:
         """Names in a mapping, none where there is none."""

@@ -98,7 +98,8 @@ class LocatedMapping(dict[str, Any]):
             if isinstance(value, LocatedMapping) and isinstance(self.get(key), LocatedMapping):
                 self[key].update_from_variant(value)
                 self.locations[key] = variant.locations[key]
-            elif value is None:
+                continue
+            if value is None:
                 self.pop(key, None)
             else:
                 self.copy_key(variant, key)

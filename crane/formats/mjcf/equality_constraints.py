@@ -91,21 +91,21 @@ def read_equality_constraints(
         while name in names:
             name += "_"
         names.add(name)
+        if kind not in ("CONNECT", "WELD", "JOINT", "TENDON"):
+            raise DescriptionError(
+                f"{source_location}: the constraint '{name}' is a {kind.lower()}, which no "
+                "machine has, use connect, weld, joint or tendon"
+            )
         if kind == "CONNECT":
             pending_connects.append((name, source_location, ends[0], ends[1]))
-        elif kind == "WELD":
+        if kind == "WELD":
             loop_type = (
                 "fixed" if (model.eq_data[index, _TORQUE_SCALE_INDEX] != 0) else "spherical"
             )
             loops.append(_create_loop(name, loop_type, ends[0], ends[1], frames, source_location))
-        elif kind in ("JOINT", "TENDON"):
+        if kind in ("JOINT", "TENDON"):
             couplings.append(
                 _create_coupling(mjcf, name, source_location, kind, index, series_joints)
-            )
-        else:
-            raise DescriptionError(
-                f"{source_location}: the constraint '{name}' is a {kind.lower()}, which no "
-                "machine has, use connect, weld, joint or tendon"
             )
     return tuple(_combine_connects(pending_connects, frames) + loops), tuple(couplings)
 

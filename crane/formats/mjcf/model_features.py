@@ -183,7 +183,15 @@ def _add_tendon_effects(
         supported.add("damping")
     stiffness *= "stiffness" in supported
     damping *= "damping" in supported
-    if factors is not None and len(factors) == 1:
+    if ends is not None:
+        links = sites[ends[0]], sites[ends[1]]
+        if stiffness and not is_spring:
+            effects.ropes.append(Rope(links, length=taut_length, stiffness=stiffness))
+            stiffness = 0.0
+        if stiffness or damping:
+            rest = taut_length if stiffness else 0.0
+            effects.springs.append(ForceElement("", stiffness, rest, damping, between=links))
+    elif factors is not None and len(factors) == 1:
         supported |= {"friction", "armature"}
         ((joint, factor),) = factors.items()
         effects.add_along(
@@ -195,14 +203,6 @@ def _add_tendon_effects(
             stiffness=stiffness,
             rest=slack_length,
         )
-    elif ends is not None:
-        links = sites[ends[0]], sites[ends[1]]
-        if stiffness and not is_spring:
-            effects.ropes.append(Rope(links, length=taut_length, stiffness=stiffness))
-            stiffness = 0.0
-        if stiffness or damping:
-            rest = taut_length if stiffness else 0.0
-            effects.springs.append(ForceElement("", stiffness, rest, damping, between=links))
     else:
         supported.clear()
     for feature, fields in _TENDON_FIELDS.items():
@@ -257,10 +257,10 @@ def read_drives(mjcf: MujocoFile, series_joints: Mapping[int, Sequence[str]]) ->
             tendon = fixed_tendon_factors(mjcf, target) or {}
             name = mjcf.name("TENDON", target)
             factors = {series_joints[joint][0]: factor for joint, factor in tendon.items()}
-        elif kind == "JOINT" and len(series_joints[target]) > 1:
+        if kind == "JOINT" and len(series_joints[target]) > 1:
             used_joints = {joint for drive in found.values() for joint in drive.factors}
             factors = _multi_freedom_factors(mjcf, actuator, series_joints[target], used_joints)
-        elif kind == "JOINT":
+        if kind == "JOINT" and len(series_joints[target]) == 1:
             factors = dict.fromkeys(series_joints[target], 1.0)
         if kind == "JOINT" and len(factors) == 1:
             (name,) = factors

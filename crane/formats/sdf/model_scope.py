@@ -245,7 +245,7 @@ class ModelReader:
             part = item.wrap(child, f"{tag} '{child.get('name', '')}'")
             if tag == "model":
                 self._add_model(scope, part, None, depth)
-            elif tag == "include":
+            if tag == "include":
                 self._read_include(scope, item.wrap(child, "an include"), depth)
             if tag not in parts_by_tag:
                 continue

@@ -165,11 +165,11 @@ class SdfJoints:
                     reference, ends, (first, second), joint.number("gearbox_ratio", 1.0), joint
                 )
             )
-        elif kind in _TWO_FREEDOM_TYPES:
+        if kind in _TWO_FREEDOM_TYPES:
             parts = [f"{name}_1", f"{name}_2"]
             self._freedom_names[name] = parts
             self._add_edge_pair(parts, ("revolute", "revolute"), ends, placement, joint, axes)
-        elif kind == "screw":
+        if kind == "screw":
             axes.append(SdfAxis(joint, axes[0].direction))
             parts = [name, f"{name}_slide"]
             self._add_edge_pair(parts, ("revolute", "prismatic"), ends, placement, joint, axes)
@@ -180,7 +180,7 @@ class SdfJoints:
             self.coupled_coordinates.append(
                 CoupledCoordinate(parts[1], name, travel_per_radian, 0.0, joint)
             )
-        else:
+        if kind in (*_SINGLE_FREEDOM_TYPES, *_AXISLESS_TYPES):
             edge_kind, axis = _SINGLE_FREEDOM_TYPES.get(kind, kind), axes[0] if axes else None
             self.edges.append(SdfJointEdge(name, edge_kind, *ends, placement, joint, axis))
 

@@ -229,15 +229,13 @@ def read_graph(
     cut_joints: set[str] = set()
     parents: dict[str, tuple[str, str]] = {}  # link -> parent, joint
     for name, (parent, child) in end_links.items():
-        if child in parents:
+        if child and parents.setdefault(child, (parent, name)) != (parent, name):
             xml.report(
                 joints[name],
                 f"link '{child}' has two parents, joints '{parents[child][1]}' and '{name}': "
                 "keep one and close the other as a loop",
             )
             cut_joints.add(name)
-        elif child:
-            parents[child] = (parent, name)
     roots = [name for name in links if name not in parents]
     joined_count = len(parents)
     while (repeated_link := _link_in_cycle(parents, links)) is not None:

@@ -124,13 +124,15 @@ def read_end_link(
     """
     child = xml.single_child(element, tag, label)
     link = "" if child is None else child.get("link", "").strip()
+    if link in links:
+        return child, link
     if not link:
         xml.report(element, f'{label} has no {tag}{noun}, add <{tag} link="..."/>')
-    elif link not in links and "link" in xml.unnamed_kinds:
+    elif "link" in xml.unnamed_kinds:
         report_error(FollowUpError(f"link '{link}' may be the one without a name"))
-    elif link not in links:
+    else:
         xml.report(child, f"{label} has the unknown {tag} '{link}', {suggest_names(links, link)}")
-    return child, link if link in links else ""
+    return child, ""
 
 
 def independent_joints(
@@ -153,7 +155,7 @@ def independent_joints(
             xml.report(
                 joint, f"independent=\"{value}\" of joint '{name}' is neither true nor false"
             )
-        elif value == "true" and is_fixed:
+        if value == "true" and is_fixed:
             xml.report(joint, f"joint '{name}' is fixed and independent, keep one of the two")
         marks[name] = value != "false" and not is_fixed
     if not marks:

@@ -296,17 +296,17 @@ def _elements_by_name(xml: XmlFile, kind: str) -> dict[str, etree._Element]:
     found: dict[str, etree._Element] = {}
     for element in xml.root.iterfind(kind):
         name = element.get("name", "").strip()
+        if name and name not in found:
+            found[name] = element
+            continue
+        xml.unnamed_kinds.add(kind)
         if not name:
-            xml.unnamed_kinds.add(kind)
             xml.report(element, f'a {kind} has no name, add name="..."')
-        elif name in found:
-            xml.unnamed_kinds.add(kind)
+        else:
             first = xml.source_location(found[name]).rpartition(":")[2]
             xml.report(
                 element, f"{kind} '{name}' is there twice (first in line {first}), rename one"
             )
-        else:
-            found[name] = element
     return found
 
 

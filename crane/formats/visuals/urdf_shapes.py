@@ -403,33 +403,35 @@ class _ShapeReader:
         if len(name) >= _MAX_NAME_LENGTH:
             name = f"...{name[-_MAX_NAME_LENGTH:]}"
         mesh_label = f"{mesh.source_location}: mesh '{name}'"
-        parts = () if mesh.file is None else meshes[mesh.file]
+        box = (
+            [] if replacement is None else [Visual(mesh.link, replacement, mesh.placement, colour)]
+        )
         if mesh.file is None:
             self.missing_meshes.setdefault(name, mesh.source_location)
-        elif isinstance(parts, str):
+            return box
+        parts = meshes[mesh.file]
+        if isinstance(parts, str):
             first_location = self._damaged_meshes.setdefault(name, mesh.source_location)
             self.problems.append(
                 f"{first_location}: mesh file '{name}' cannot be read ({parts}), export "
                 "it again; a box is drawn instead"
             )
-        elif any(_largest_coordinate(part, mesh.scale) > _MAX_DISTANCE for part in parts):
+            return box
+        if any(_largest_coordinate(part, mesh.scale) > _MAX_DISTANCE for part in parts):
             self.problems.append(
                 f"{mesh_label} is far larger than a machine, scale it; a box is drawn instead"
             )
-        else:
-            return [
-                Visual(
-                    mesh.link,
-                    MeshShape(part.vertices * mesh.scale, part.faces),
-                    mesh.placement,
-                    mesh.colour or part.colour or DEFAULT_COLOUR,
-                    mesh_label,
-                )
-                for part in parts
-            ]
-        if replacement is None:
-            return []
-        return [Visual(mesh.link, replacement, mesh.placement, colour)]
+            return box
+        return [
+            Visual(
+                mesh.link,
+                MeshShape(part.vertices * mesh.scale, part.faces),
+                mesh.placement,
+                mesh.colour or part.colour or DEFAULT_COLOUR,
+                mesh_label,
+            )
+            for part in parts
+        ]
 
 
 def _largest_coordinate(part: MeshPart, scale: tuple[float, ...]) -> float:

@@ -194,9 +194,9 @@ class CalibrationProblem:
             k, derivative = case.sensors.index(unknown.sensor), np.zeros_like(undistorted)
             if unknown.sensor_parameter == "zero":
                 derivative[:, k] = 1.0
-            elif unknown.sensor_parameter == "scale":
+            if unknown.sensor_parameter == "scale":
                 derivative[:, k] = undistorted[:, k]
-            else:
+            if unknown.sensor_parameter == "delay":
                 delayed_time = np.clip(time - delays[k], 0.0, last)
                 derivative[:, k] = (
                     -scales[k] * curve.derivative()(delayed_time)[:, k] * (time > delays[k])

@@ -208,7 +208,7 @@ class Calibration(Result):
         ]
 
     @property
-    def cautions(self) -> list[str]:
+    def quality_warnings(self) -> list[str]:
         """Warnings about the calibration as a whole."""
         texts = [] if self.is_lowest_minimum else [LOWER_MINIMUM_WARNING]
         if self.degraded_channels:
@@ -244,8 +244,8 @@ class Calibration(Result):
             lines.append(
                 f"| {one.name} | {one.start:.5g} | {one.value:.5g} | {width} | {one.remark} |"
             )
-        for caution in self.cautions:
-            lines += ["", caution]
+        for text in self.quality_warnings:
+            lines += ["", text]
         if self.correlated_pairs:
             lines += ["", "Strongly correlated, of which only a combination is identifiable:", ""]
             lines += [f"- {a} and {b} (correlation {r:+.3f})" for a, b, r in self.correlated_pairs]

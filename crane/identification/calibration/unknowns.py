@@ -112,9 +112,17 @@ def _build_unknown(
     sensor_units: Mapping[str, str],
 ) -> Unknown:
     start, low, high = _read_bounds(name, given)
-    members: tuple[tuple[str, float], ...] = ()
+    is_of_sensor = name.startswith(SENSOR_PREFIX)
+    pattern = name if "*" in name and not is_of_sensor else ""
+    members = tuple(
+        (x, parameters[x]) for x in fnmatch.filter(parameters, pattern) if parameters[x]
+    )
+    if pattern and not members:
+        raise InputError(f"'{name}' matches no nonzero parameter of the machine")
+    if not is_of_sensor and not pattern and name not in parameters:
+        raise InputError(unknown_parameter_text(spec, parameters, name))
     sensor = ""
-    if name.startswith(SENSOR_PREFIX):
+    if is_of_sensor:
         sensor, _, what = name.removeprefix(SENSOR_PREFIX).rpartition(".")
         check_name(sensor, sensor_units, f"'{name}' is of no sensor")
         check_name(what, SENSOR_PARAMETER_DEFAULTS, f"'{name}': a sensor has no '{what}'")
@@ -123,36 +131,38 @@ def _build_unknown(
         scale = {"delay": _DELAY_SCALE, "scale": 0.05, "zero": zero_scale}[what]
         if what == "delay" and low is None:
             low = 0.0
-    elif "*" in name:
-        found = {x: parameters[x] for x in fnmatch.filter(parameters, name) if parameters[x]}
-        if not found:
-            raise InputError(f"'{name}' matches no nonzero parameter of the machine")
-        described, scale, members = 1.0, 1.0, tuple(found.items())
-        low = _MIN_SHARE if low is None else low
-    elif name not in parameters:
-        raise InputError(unknown_parameter_text(spec, parameters, name))
+    elif pattern:
+        described, scale, low = 1.0, 1.0, _MIN_SHARE if low is None else low
     else:
         described = parameters[name]
         initial = described if start is None else start
-        scale = abs(initial)
-        if name.endswith(".delay"):
-            scale, low = _DELAY_SCALE, 0.0 if low is None else low
-        elif not name.endswith(tuple("." + word for word in _SIGNED_PARAMETERS)):
-            if initial >= 0:
-                low = _MIN_SHARE * initial if low is None else low
-            else:
-                high = _MIN_SHARE * initial if high is None else high
-        if not scale:
-            if low is None or high is None:
-                raise InputError(f"'{name}' is 0 initially, give its range: '{name}=0,LOW~HIGH'")
-            scale = high - low
-        if name.endswith((".x", ".y", ".z")):
-            scale = min(scale, 0.1)
+        scale, low, high = _scale_and_bounds(name, initial, low, high)
     start = float(described if start is None else start)
     lower, upper = -math.inf if low is None else low, math.inf if high is None else high
     if not lower < upper or not lower <= start <= upper:
         raise InputError(f"'{name}': {start:g} does not lie within {lower:g} to {upper:g}")
     return Unknown(name, start, lower, upper, scale, members or ((name, described),), sensor)
+
+
+def _scale_and_bounds(
+    name: str, initial: float, low: float | None, high: float | None
+) -> tuple[float, float | None, float | None]:
+    """Scale of a machine parameter and its bounds, by default those of its sign."""
+    scale = abs(initial)
+    if name.endswith(".delay"):
+        scale, low = _DELAY_SCALE, 0.0 if low is None else low
+    if not name.endswith((".delay", *("." + word for word in _SIGNED_PARAMETERS))):
+        if initial >= 0:
+            low = _MIN_SHARE * initial if low is None else low
+        else:
+            high = _MIN_SHARE * initial if high is None else high
+    if not scale:
+        if low is None or high is None:
+            raise InputError(f"'{name}' is 0 initially, give its range: '{name}=0,LOW~HIGH'")
+        scale = high - low
+    if name.endswith((".x", ".y", ".z")):
+        scale = min(scale, 0.1)
+    return scale, low, high
 
 
 def _read_bounds(name: str, given: object) -> tuple[float | None, float | None, float | None]:

@@ -321,7 +321,7 @@ class ExchangeAlgorithm:
             if reason := limits.exceeded_limit(run):
                 self._rejection_reason = f"for {reason}"
                 return None
-            rows = self._information.information_root(run, estimate_start=False)
+            rows = self._information.information_factor(run, estimate_start=False)
             singular_values = np.asarray(np.linalg.svd(rows, compute_uv=False), dtype=np.float64)
             cost = float(self._criterion(singular_values))
             if not cost < lowest_cost:

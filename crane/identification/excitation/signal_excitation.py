@@ -113,7 +113,9 @@ class SignalExcitation(Result):
 
     def to_text(self) -> str:
         """Tables of standard deviations, strokes and unidentifiable parameters."""
-        numbers: list[tuple[str, ...]] = [("parameter", "value", "std, plain", "std, designed")]
+        numbers: list[tuple[str, ...]] = [
+            ("parameter", "value", "std, initial signals", "std, optimized signals")
+        ]
         for one, initial_std, optimized_std in zip(
             self.unknowns,
             self.initial_information.std,
@@ -128,7 +130,7 @@ class SignalExcitation(Result):
         )
         numbers.append(("ln det (1 + M)", "", *gain))
         strokes: list[tuple[str, ...]] = [
-            ("stroke", "least margin", "worst case", "largest pressure", "fastest signal")
+            ("stroke", "smallest margin", "worst case", "largest pressure", "fastest signal")
         ]
         for i, joint in enumerate(require_circuit(self.machine).joints):
             strokes.append((

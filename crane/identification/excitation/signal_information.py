@@ -132,7 +132,7 @@ class SignalInformation:
         columns = [run.channels[VALVE_SIGNAL_PREFIX + joint] for joint in joints]
         return Table(sensor_units, np.column_stack([run.time, *columns, values]), {})
 
-    def information_root(self, run: Recording, estimate_start: bool = True) -> Array:
+    def information_factor(self, run: Recording, estimate_start: bool = True) -> Array:
         """Root of M as an upper triangular matrix (p, p).
 
         Args:
@@ -160,7 +160,7 @@ class SignalInformation:
 
     def measures(self, run: Recording) -> InformationMeasures:
         """Information measures of a recording of a run; standard deviations in SI units."""
-        rows = self.information_root(run)
+        rows = self.information_factor(run)
         result = information_measures(rows, np.eye(len(rows)), 0.0)
         is_identifiable = np.linalg.norm(rows, axis=0) > _MIN_SENSITIVITY
         std = np.full(len(rows), np.inf)

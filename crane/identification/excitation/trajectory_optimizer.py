@@ -107,9 +107,9 @@ def trajectory_limits(
         areas,
     )
     for what, values in zip(QUANTITIES, found.as_array, strict=True):
-        for joint, value in zip(machine.active, values, strict=True):
-            if not value > 0:
-                raise InputError(f"the {what} limit of '{joint}' is 0, give one above")
+        immovable = [x for x, value in zip(machine.active, values, strict=True) if not value > 0]
+        if immovable:
+            raise InputError(f"the {what} limit of '{immovable[0]}' is 0, give one above")
     return found
 
 
@@ -131,10 +131,10 @@ def _fed(machine: Machine) -> tuple[Array, Array, Array]:
         for edge, area in ((valve.c1, cylinder.area_a), (valve.c4, cylinder.area_b)):
             most = edge * np.sqrt(valve.margin) if valve.margin else np.inf
             velocity[i] = min(velocity[i], most / area, flow[i] / area)
-        for other, j in column.items():
-            if pump.flow and hydraulics.valves[other].supply == valve.supply:
-                beside = hydraulics.cylinders[other]
-                areas[:, i, j] = beside.area_a, beside.area_b
+        sharing = [x for x in column if pump.flow and hydraulics.valves[x].supply == valve.supply]
+        for other in sharing:
+            beside = hydraulics.cylinders[other]
+            areas[:, i, column[other]] = beside.area_a, beside.area_b
     return velocity, flow, areas
 
 

@@ -191,7 +191,7 @@ def _held_out_error(
             identification.base,
             held_out,
             bandwidth or identification.bandwidth,
-            identification.slow,
+            identification.min_speed,
         )
         return (
             held_out_equations.compare(identification.values).overall_relative_error

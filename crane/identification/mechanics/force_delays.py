@@ -90,7 +90,7 @@ class ForceDelays(OneLineRepr):
 
 
 def force_delays(
-    model: IdentificationModel, base: BaseParameters, motion: Motion, slow: Array
+    model: IdentificationModel, base: BaseParameters, motion: Motion, min_speed: Array
 ) -> ForceDelays:
     """Delays of the forces of a motion, late or early.
 
@@ -109,7 +109,7 @@ def force_delays(
         model: The model.
         base: Base parameters of the model.
         motion: Recorded motion.
-        slow: Standstill velocities (n,), if above a share of the largest velocity.
+        min_speed: Standstill velocities (n,), if above a share of the largest velocity.
     """
     from scipy.ndimage import binary_dilation
 
@@ -132,7 +132,7 @@ def force_delays(
     known = low_pass(time, model.known_forces(at), cutoff)
     force = low_pass(motion.time, motion.tau, cutoff)[chosen]
     speed = np.abs(motion.v)
-    is_resting = (speed <= np.maximum(slow, _STANDSTILL_SHARE * speed.max(axis=0)))[chosen]
+    is_resting = (speed <= np.maximum(min_speed, _STANDSTILL_SHARE * speed.max(axis=0)))[chosen]
     is_used = ~binary_dilation(is_resting, np.ones((2 * filter_reach + 1, 1), dtype=bool))
     is_used[:filter_reach] = is_used[-filter_reach:] = False
     is_used[:, ~model.machine.is_driven] = False  # forces of free joints are zero

@@ -48,7 +48,7 @@ class Identification(EstimatedValues, Result):
         speeds: Least and largest speed of the training data by direction of friction [m/s],
             [rad/s].
         bandwidth: Bandwidth of the low-pass [Hz].
-        slow: (n,) standstill velocities, below which rows were omitted [m/s], [rad/s].
+        min_speed: (n,) standstill velocities, below which rows were omitted [m/s], [rad/s].
         validation: Comparison of forces on held-out data, None without them.
         delays: Delays of the forces, one object per recording.
     """
@@ -66,7 +66,7 @@ class Identification(EstimatedValues, Result):
     advice: str
     speeds: Mapping[str, tuple[float, float]]
     bandwidth: float
-    slow: Array
+    min_speed: Array
     validation: ForceComparison | None = None
     delays: tuple[ForceDelays, ...] = ()
 
@@ -126,7 +126,7 @@ class Identification(EstimatedValues, Result):
             return "take the delays of the forces out first"
         if self.parameters is not None:
             return f"leave such terms out, or {self.advice}"
-        return f"give a prior, ask for feasible bodies, or {self.advice}"
+        return f"give a prior, require physically feasible bodies, or {self.advice}"
 
     @property
     def warning(self) -> str:
@@ -217,7 +217,10 @@ class Identification(EstimatedValues, Result):
             rows.append([name, f"{value:.6g}", f"{std:.2g}", share, f"{before:.6g}", mark])
         lines += format_table(rows, (0, 5))
         if self.undetermined_directions:
-            lines += ["", "not determined by this motion, in units of what can be:"]
+            lines += [
+                "",
+                "not determined by this motion (std in multiples of the plausible magnitude):",
+            ]
             lines += [
                 f"  +- {std:.2g}  {words}"
                 for std, words in self.undetermined_directions[:_MAX_SHOWN]

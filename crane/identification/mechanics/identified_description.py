@@ -170,12 +170,12 @@ def divide_locked_bodies(
         A = frame.placement.homogeneous  # the pseudo-inertia about the body's joint is A P A^T
         if frame.parentJoint == 0:
             out[name] = body
-        else:
-            P = pseudo_inertia(body)
-            units = np.sqrt(np.maximum(np.diag(P), np.finfo(float).tiny))
-            if np.linalg.eigvalsh(P / np.outer(units, units))[0] <= _FLATNESS_TOLERANCE:
-                P = pseudo_inertia(thicken_body(body))
-            links_by_body.setdefault(frame.parentJoint - 1, []).append((name, A, P))
+            continue
+        P = pseudo_inertia(body)
+        units = np.sqrt(np.maximum(np.diag(P), np.finfo(float).tiny))
+        if np.linalg.eigvalsh(P / np.outer(units, units))[0] <= _FLATNESS_TOLERANCE:
+            P = pseudo_inertia(thicken_body(body))
+        links_by_body.setdefault(frame.parentJoint - 1, []).append((name, A, P))
     for i, links in links_by_body.items():
         body = parameters[10 * i : 10 * i + 10]
         if len(links) == 1:

@@ -81,7 +81,7 @@ def identify(
     *,
     terms: Sequence[ModelTerm] | TermChanges | None = None,
     bandwidth: float | None = None,
-    slow: Mapping[str, float] | ArrayLike | None = None,
+    min_speed: Mapping[str, float] | ArrayLike | None = None,
     trust: bool = False,
     progress: Progress | None = None,
 ) -> Identification:
@@ -89,8 +89,8 @@ def identify(
 
     Both sides of tau_A + gamma^T f = W(q_A, v_A, a_A) beta pass a zero-phase low-pass and are
     decimated; rows of a joint near standstill are omitted. The settings of the machine file under
-    `identification` (terms, prior, bandwidth, slow) are used; arguments add to them or replace
-    them.
+    `identification` (terms, prior, bandwidth, min_speed) are used; arguments add to them or
+    replace them.
 
     Args:
         machine: The machine, whose geometry is taken as known.
@@ -109,7 +109,7 @@ def identify(
             {"q*.rotor_inertia": (), "q1.coulomb": None}, see `select_terms`.
         bandwidth: Bandwidth of the low-pass [Hz]; default far above the frequencies of the motion,
             but at most the passband of the smoothing of noisy coordinates.
-        slow: Standstill velocities below which rows are omitted, (n,) or by joint or pattern.
+        min_speed: Standstill velocities below which rows are omitted, (n,) or by joint or pattern.
             Default 4 times the smoothing or Stribeck velocity of the description (0.01 rad/s and 1
             mm/s for stiction without them), or 2 % of a joint's largest velocity.
         trust: Whether to accept a recording that is probably wrong: reasons become warnings, and
@@ -133,7 +133,7 @@ def identify(
     final_progress, progress = progress, multi_pass_progress(progress)
     check_shared_samples(as_list(recording), as_list(validation), trust)
     motions = prepare_motions(machine, recording, trust, progress)
-    equations, identifiable = build_equations(model, motions, bandwidth, slow, progress)
+    equations, identifiable = build_equations(model, motions, bandwidth, min_speed, progress)
     delays = _check_forces(model, motions, equations, trust) if model.bodies else ()
     selection = equations.column_selection(identifiable)
     columns = CombinedRegressor(equations, selection)
@@ -163,14 +163,14 @@ def identify(
         selection @ values if parameters is None else equations.base.values(parameters)
     )
     training, validation_comparison = equations.compare(predicting_values), None
-    base, bandwidth, slow_speeds = equations.base, equations.bandwidth, equations.slow
+    base, bandwidth, min_speeds = equations.base, equations.bandwidth, equations.min_speed
     advice = motion_advice(machine, motions)
-    speeds = speed_ranges(model, motions, slow_speeds)
+    speeds = speed_ranges(model, motions, min_speeds)
     del equations, motions
     if validation is not None:
         validation_motions = prepare_motions(machine, validation, trust, progress, "validation")
         validation_comparison = _compare_held_out(
-            model, base, validation_motions, bandwidth, slow_speeds, progress, predicting_values
+            model, base, validation_motions, bandwidth, min_speeds, progress, predicting_values
         )
         if validation_comparison is not None:
             warn_validation(training, validation_comparison)
@@ -179,7 +179,7 @@ def identify(
     magnitudes = np.sqrt(identifiable.grouping**2 @ parameter_sizes**2)
     identification = Identification(
         model, identifiable, values, covariance, parameters, estimate, method, feasible, training,
-        magnitudes, advice, speeds, bandwidth, slow_speeds, validation_comparison, delays,
+        magnitudes, advice, speeds, bandwidth, min_speeds, validation_comparison, delays,
     )  # fmt: skip
     if all(mark == "not determined" for mark in identification.marks):
         reject_unless_trusted(identification.warning, trust)
@@ -193,7 +193,7 @@ def _compare_held_out(
     base: BaseParameters,
     motions: Sequence[Motion],
     bandwidth: float,
-    slow_speeds: Array,
+    min_speeds: Array,
     progress: Progress | None,
     values: Array,
 ) -> ForceComparison | None:
@@ -201,7 +201,7 @@ def _compare_held_out(
     long_motions = [motion for motion in motions if is_long_enough(motion, bandwidth)]
     comparison = None
     if long_motions:
-        held_out = RegressionEquations(model, base, long_motions, bandwidth, slow_speeds, progress)
+        held_out = RegressionEquations(model, base, long_motions, bandwidth, min_speeds, progress)
         if held_out.is_moving.any():
             comparison = held_out.compare(values)
     short_count = len(motions) - len(long_motions)
@@ -264,7 +264,7 @@ def _check_forces(
         here = modelled[first : first + len(thinned.time)]
         if len(here) >= _MIN_COMPARED_ROWS:
             check_forces(thinned, here, model.machine.active, trust=trust)
-        delays.append(force_delays(model, equations.base, motion, equations.slow))
+        delays.append(force_delays(model, equations.base, motion, equations.min_speed))
         if delays[-1].warning:
             warnings.warn(delays[-1].warning, CraneWarning, stacklevel=3)
         first += len(here)
@@ -275,7 +275,7 @@ def build_equations(
     model: IdentificationModel,
     motions: Sequence[Motion],
     bandwidth: float | None = None,
-    slow: Mapping[str, float] | ArrayLike | None = None,
+    min_speed: Mapping[str, float] | ArrayLike | None = None,
     progress: Progress | None = None,
 ) -> tuple[RegressionEquations, BaseParameters]:
     """Regression equations of motions, and the identifiable part of the base parameters.
@@ -286,9 +286,9 @@ def build_equations(
         bandwidth = model.machine.estimation.bandwidth or min(map(_default_bandwidth, motions))
     bandwidth = as_number(bandwidth, "the bandwidth", "Hz", greater_than=0)
     fastest = np.max([np.abs(motion.v).max(axis=0) for motion in motions], axis=0)
-    slow_speeds = _slow_speeds(model.machine, slow, fastest)
+    min_speeds = _min_speeds(model.machine, min_speed, fastest)
     equations = RegressionEquations(
-        model, base_parameters(model), motions, bandwidth, slow_speeds, progress
+        model, base_parameters(model), motions, bandwidth, min_speeds, progress
     )
     if not equations.is_moving.any():
         raise RecordingError("no joint moves faster than what counts as standstill, move it more")
@@ -296,7 +296,7 @@ def build_equations(
         if count == 1:  # one row does not determine the noise
             raise RecordingError(
                 f"'{joint}' is in one sample only faster than what counts as standstill, move it "
-                "more, or raise its slow"
+                "more, or raise its min_speed"
             )
     # the triangular factors have the column dependences of all rows
     return equations, equations.base.identifiable_part(
@@ -344,7 +344,7 @@ def as_list(
 
 
 def speed_ranges(
-    model: IdentificationModel, motions: Sequence[Motion], slow: Array
+    model: IdentificationModel, motions: Sequence[Motion], min_speed: Array
 ) -> dict[str, tuple[float, float]]:
     """Least and largest speed along each direction of friction."""
     directions = {
@@ -357,7 +357,7 @@ def speed_ranges(
         for name, direction in directions.items():
             speed = np.einsum("ij,ij->i", direction.jacobian(model.machine, at), at.v_a)
             fastest[name] = max(fastest[name], float(np.abs(speed).max()))
-    lowest = dict(zip(model.machine.active, slow.tolist(), strict=True))
+    lowest = dict(zip(model.machine.active, min_speed.tolist(), strict=True))
     return {
         name: (lowest.get(name, _SLOW_SPEED_SHARE * most), most) for name, most in fastest.items()
     }
@@ -379,8 +379,8 @@ def multi_pass_progress(progress: Progress | None) -> Progress | None:
     return report
 
 
-def _slow_speeds(
-    machine: Machine, slow: Mapping[str, float] | ArrayLike | None, fastest: Array
+def _min_speeds(
+    machine: Machine, min_speed: Mapping[str, float] | ArrayLike | None, fastest: Array
 ) -> Array:
     """Standstill velocities (n,), below which rows are omitted.
 
@@ -398,16 +398,16 @@ def _slow_speeds(
                 max(law.stribeck, law.smoothing) if law.stiction else smoothing_speed
             )
             out[i] = max(out[i], min(stiction_speed, _MAX_SLOW_SHARE * fastest[i]))
-    if slow is not None and not isinstance(slow, Mapping):
-        each = np.full(out.shape, slow) if np.ndim(slow) == 0 else slow
-        each = as_sample(each, len(out), "slow", machine.active)
-        slow = dict(zip(machine.active, each.tolist(), strict=True))
-    for name, value in (*machine.estimation.slow.items(), *(slow or {}).items()):
+    if min_speed is not None and not isinstance(min_speed, Mapping):
+        each = np.full(out.shape, min_speed) if np.ndim(min_speed) == 0 else min_speed
+        each = as_sample(each, len(out), "min_speed", machine.active)
+        min_speed = dict(zip(machine.active, each.tolist(), strict=True))
+    for name, value in (*machine.estimation.min_speed.items(), *(min_speed or {}).items()):
         joints = fnmatch.filter(machine.active, name)
         if not joints and name not in machine.locked_joints:
-            raise InputError(f"slow is for '{name}', {suggest_names(machine.active, name)}")
-        if (limit := as_number(value, f"slow of '{name}'", "")) < 0:
-            raise InputError(f"slow of '{name}' is {limit:g}, it must not be negative")
+            raise InputError(f"min_speed is for '{name}', {suggest_names(machine.active, name)}")
+        if (limit := as_number(value, f"min_speed of '{name}'", "")) < 0:
+            raise InputError(f"min_speed of '{name}' is {limit:g}, it must not be negative")
         out[[machine.active.index(joint) for joint in joints]] = limit
     return out
 

@@ -134,8 +134,8 @@ class PayloadEstimate(EstimatedValues):
                 continue
             interval = f"{low:.5g} to {high:.5g} {unit}"
             rows.append([name, f"{value:.5g}", f"{deviation:.2g}", interval, ""])
-        point = ", taken as a point" if self.mass_gradient is not None else ""
-        at = " there" if point and not self.is_com_given else ""
+        point = ", modelled as a point mass" if self.mass_gradient is not None else ""
+        at = " at this frame" if point and not self.is_com_given else ""
         lines = [f"load on {self.frame}{point}{at}", *format_table(rows, (0, 3))]
         if at and self.mass_gradient is not None:
             shares = ", ".join(f"{0.1 * x:+.2g} kg" for x in self.mass_gradient)
@@ -152,8 +152,7 @@ class PayloadEstimate(EstimatedValues):
         if self.warning:
             lines.append(f"do not trust this: {self.warning}")
         lines.append(
-            f"forces left unexplained: {100 * self.fit.overall_relative_error:.3g} % of the "
-            f"load's share"
+            f"residual forces: {100 * self.fit.overall_relative_error:.3g} % of the load's share"
         )
         return "\n".join(lines) + "\n"
 

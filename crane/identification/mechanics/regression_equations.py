@@ -42,7 +42,7 @@ class _FilteredMotion:
         is_moving: (M, n) mask of the decimated rows that are used.
     """
 
-    def __init__(self, motion: Motion, bandwidth: float, slow: Array):
+    def __init__(self, motion: Motion, bandwidth: float, min_speed: Array):
         from scipy.ndimage import maximum_filter1d
 
         self.motion, self.step = motion, float(motion.time[1] - motion.time[0])
@@ -58,7 +58,7 @@ class _FilteredMotion:
             kernel_reach = len(filter_kernel(self.step, bandwidth)) // 2
         self.filter_reach = -(-kernel_reach // self.thinning) * self.thinning
         # friction laws are not valid near standstill, nor in rows within the reach of the filter
-        is_resting = np.abs(motion.v) <= slow
+        is_resting = np.abs(motion.v) <= min_speed
         is_near_rest = maximum_filter1d(
             is_resting.view(np.uint8), 2 * kernel_reach + 1, axis=0, mode="constant"
         )
@@ -93,7 +93,7 @@ class RegressionEquations:
         base: Base parameters, whose columns W has.
         motions: The motions, one after the other.
         bandwidth: Bandwidth of the low-pass [Hz].
-        slow: (n,) standstill velocities, below which rows are omitted.
+        min_speed: (n,) standstill velocities, below which rows are omitted.
         progress: Called with the finished share of each pass over the motions.
         values: (r,) parameters at which rows of free joints are evaluated, see `_free_joint_rows`.
 
@@ -104,7 +104,7 @@ class RegressionEquations:
         is_moving: (M, n) mask of the rows that are used.
         samples: (m,) instants of the used rows.
         groups: (m,) groups of the used rows: joints 0, 1, ... without those that have no rows.
-        base, bandwidth, slow: See above.
+        base, bandwidth, min_speed: See above.
 
     Raises:
         InputError: The bandwidth is too low, or values are not finite.
@@ -116,14 +116,16 @@ class RegressionEquations:
         base: BaseParameters,
         motions: Sequence[Motion],
         bandwidth: float,
-        slow: Array,
+        min_speed: Array,
         progress: Progress | None = None,
         values: Array | None = None,
     ):
-        self.base, self.bandwidth, self.slow = base, bandwidth, slow
+        self.base, self.bandwidth, self.min_speed = base, bandwidth, min_speed
         self._model, self._progress, self._values = model, progress, values
         self._motions = motions
-        self._filtered_motions = [_FilteredMotion(motion, bandwidth, slow) for motion in motions]
+        self._filtered_motions = [
+            _FilteredMotion(motion, bandwidth, min_speed) for motion in motions
+        ]
         self.is_moving = np.concatenate([part.is_moving for part in self._filtered_motions])
         instant, joint = np.nonzero(self.is_moving)
         self.samples = instant.astype(np.int32)
@@ -330,7 +332,7 @@ class RegressionEquations:
                     self.base,
                     self._motions,
                     self.bandwidth,
-                    self.slow,
+                    self.min_speed,
                     self._progress,
                     values,
                 )

@@ -208,10 +208,9 @@ def _create_patches(
     """Patches over the strokes, and indices of those that count for the closed share."""
     home = machine.home[machine.closure.active]
     planned: list[_PlannedPatch]
-    if len(strokes) == 1:
-        planned = [((strokes[0], strokes[0]), home.copy(), min(samples, 2001), True)]
-    elif len(strokes) == 2:
-        planned = [((strokes[0], strokes[1]), home.copy(), int(samples**0.5), True)]
+    if len(strokes) <= 2:
+        size = min(samples, 2001) if len(strokes) == 1 else int(samples**0.5)
+        planned = [((strokes[0], strokes[-1]), home.copy(), size, True)]
     elif len(strokes) == _MAX_GRID_JOINTS:
         planned = list(_sliced_patches(home, strokes, lower, upper, samples))
     else:

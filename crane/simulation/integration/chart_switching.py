@@ -102,10 +102,10 @@ class ChartSwitchingIntegrator:
             if self._switch_chart(times[0] + i * step, state, halt):
                 continue
             next_index = self._pass_branch_crossing(times, i, state, step, rows)
+            if next_index is None and halt is not None:
+                raise halt
             if next_index is not None:
                 i = next_index
-            elif halt is not None:
-                raise halt
             else:
                 self._chart_limits = self._chart_limits * _LIMIT_RELAXATION
                 self._integrator.set_chart_limits(self._chart_limits)

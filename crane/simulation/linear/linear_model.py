@@ -110,21 +110,15 @@ class LinearModel(Result):
             size = abs(pole)
             if size < _INTEGRATOR_ROUNDING * fastest:
                 pole, size = 0j, 0.0
-            elif abs(pole.real) < _DAMPING_ROUNDING * fastest:
+            if abs(pole.real) < _DAMPING_ROUNDING * fastest:
                 pole = complex(0.0, pole.imag)
             moved = self.gamma @ vector[: self.gamma.shape[1]]
             at = np.argmax(np.abs(moved / units))
             largest = moved[at] / units[at]
             if abs(largest) > 1e-12 * np.abs(vector).max():
                 moved = moved / largest
-            mode = Mode(
-                complex(pole),
-                size / (2 * np.pi),
-                float((0.0 - pole.real) / size if size else 0.0),
-                moved,
-                vector,
-            )
-            found.append(mode)
+            damping = float((0.0 - pole.real) / size if size else 0.0)
+            found.append(Mode(complex(pole), size / (2 * np.pi), damping, moved, vector))
         return tuple(sorted(found, key=lambda mode: (mode.frequency, mode.pole.imag)))
 
     def response(self, frequencies: ArrayLike) -> Array:
@@ -259,6 +253,8 @@ class LinearModel(Result):
             OutputError: Another suffix, or it cannot be written.
         """
         path = Path(path)
+        if path.suffix not in (".mat", ".npz"):
+            raise OutputError(f"{path}: a linear model is written as .mat or .npz")
         values: dict[str, Any] = {name: getattr(self, name) for name in ("A", "B", "C", "D")}
         values |= {name: getattr(self, name) for name in ("x", "u", "y", "rate")}
         named = {name: getattr(self, name) for name in ("states", "inputs", "outputs")}
@@ -268,10 +264,8 @@ class LinearModel(Result):
             cells = {key: np.array(value, dtype=object) for key, value in named.items()}
             with replace_file(path) as part:
                 savemat(str(part), values | cells, appendmat=False)
-        elif path.suffix == ".npz":
+        else:
             every: dict[str, Any] = values | {key: np.array(x) for key, x in named.items()}
             with replace_file(path) as part, open(part, "wb") as file:
                 np.savez(file, **every)
-        else:
-            raise OutputError(f"{path}: a linear model is written as .mat or .npz")
         return path

@@ -101,17 +101,18 @@ class AdjointIntegrator:
             track.adopt_mode(segment.mode)
             if isinstance(segment, TransitionJump):
                 adjoint = self._apply_jump(segment, adjoint)
-            elif isinstance(segment, ResimulatedSegment):
+                continue
+            if isinstance(segment, ResimulatedSegment):
                 nodes = track.resimulated_nodes(*segment[1:])
                 adjoint = self._integrate_segment(nodes, adjoint, None, MAX_REFINEMENTS - 1)
-            else:
-                nodes = track.recorded_nodes(segment)
-                output_weights = np.swapaxes(
-                    weights[:, segment.first_instant : segment.last_instant + 1], 0, 1
-                ).copy()
-                if len(output_weights) > 1:
-                    output_weights[-1] = 0.0  # it belongs to the next segment
-                adjoint = self._integrate_segment(nodes, adjoint, output_weights, MAX_REFINEMENTS)
+                continue
+            nodes = track.recorded_nodes(segment)
+            output_weights = np.swapaxes(
+                weights[:, segment.first_instant : segment.last_instant + 1], 0, 1
+            ).copy()
+            if len(output_weights) > 1:
+                output_weights[-1] = 0.0  # it belongs to the next segment
+            adjoint = self._integrate_segment(nodes, adjoint, output_weights, MAX_REFINEMENTS)
         out = SimulationConstants(
             *(np.zeros((sum_count, part.shape[-1])) for part in self._nominal_constants)
         )

@@ -203,7 +203,8 @@ class VariationalIntegrator:
             track.adopt_mode(segment.mode)
             if isinstance(segment, TransitionJump):
                 sensitivity = self._apply_jump(segment, sensitivity)
-            elif isinstance(segment, ResimulatedSegment):
+                continue
+            if isinstance(segment, ResimulatedSegment):
                 sensitivity = self._integrate_segment(
                     track.resimulated_nodes(*segment[1:]), sensitivity, MAX_REFINEMENTS - 1
                 )[0][-1]

@@ -100,9 +100,11 @@ def _parameter_table(calibration: Calibration) -> str:
     }
     if not any(columns["in the file"]):
         del columns["in the file"]
-    cautions = "".join(f"<p><b>{escape(caution)}</b></p>" for caution in calibration.cautions)
+    quality_warnings = "".join(
+        f"<p><b>{escape(text)}</b></p>" for text in calibration.quality_warnings
+    )
     return (
-        f"{cautions}<p>Confidence intervals of 95 %, computed without bounds; correlated "
+        f"{quality_warnings}<p>Confidence intervals of 95 %, computed without bounds; correlated "
         "residuals reduce the number of independent samples. Grey rows are parameters on a bound "
         "and parameters that the recordings do not determine: they are no result. Intervals hold "
         "for a correct model. A parameter that compensates an effect which is missing in the "

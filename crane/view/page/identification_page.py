@@ -77,12 +77,12 @@ def _summary_facts(result: Identification, recording: str, validation: str) -> s
         method += ", with physically feasible bodies"
     elif result.parameters is not None:
         method += ", about a prior"
-    unexplained_text = "no drive, no force to compare"
+    residual_text = "no drive, no force to compare"
     if not np.isnan(fit.overall_relative_error):
-        unexplained_text = f"{100 * fit.overall_relative_error:.3g} % of the forces"
+        residual_text = f"{100 * fit.overall_relative_error:.3g} % of the forces"
         if result.validation is not None:
             error = result.validation.overall_relative_error
-            unexplained_text += f", {100 * error:.3g} % in validation"
+            residual_text += f", {100 * error:.3g} % in validation"
     sample_rate = 1 / float(np.median(np.diff(fit.time)))
     drive_count, joint_count = len(machine.driven_joints), len(machine.joints)
     return definition_list(
@@ -103,7 +103,7 @@ def _summary_facts(result: Identification, recording: str, validation: str) -> s
                 f"{result.estimate.condition:.3g}; {result.estimate.scaled_condition:.3g} with "
                 "columns scaled to one",
             ),
-            ("unexplained", unexplained_text),
+            ("residual forces", residual_text),
         ]
     )
 

@@ -348,6 +348,9 @@ def tool_force_figure(chart: ToolForce) -> Figure:
     grid = figure.subplots(count, 2, squeeze=False, sharex=True, sharey=True)
     colors = {k: _FORCE_COLOURS[j % len(_FORCE_COLOURS)] for j, k in enumerate(active_factors)}
     options: Any = {"shading": "nearest", "rasterized": True}
+    u, w = chart.section.coordinate_names
+    for axes in grid[-1]:
+        axes.set_xlabel(f"{u} [m]")
     for s, (left, right) in enumerate(grid):
         forces = np.ma.masked_invalid(all_forces[s])
         mesh = left.pcolormesh(
@@ -369,14 +372,11 @@ def tool_force_figure(chart: ToolForce) -> Figure:
                          cmap=palette, vmin=-0.5, vmax=max(len(colors), 1) - 0.5,
                          **options)  # fmt: skip
         slew_text = f", slewed {np.rad2deg(chart.slews[s]):.4g}°" if count > 1 else ""
-        u, w = chart.section.coordinate_names
         left.set(title=f"largest force{slew_text}", ylabel=f"{w} [m]")
         right.set_title("limiting factor")
         for axes in (left, right):
             axes.set_aspect("equal")
             axes.grid(False)
-            if s == count - 1:
-                axes.set_xlabel(f"{u} [m]")
     figure.legend(
         handles=[
             Swatch(color=color, label=escape_label(str(chart.limiting_factors[k])))

@@ -126,13 +126,12 @@ class _SankeyDiagram:
         )
         # groups that return more than they receive become sources
         self._returning_groups: dict[str, float] = {}
-        for group in groups:
-            if group.returned_energy > group.total_energy:
-                if group.returned_energy > _MIN_RIBBON_SHARE * self._total_energy:
-                    self._returning_groups[f"{escape_label(group.label)}\ngives back"] = (
-                        group.returned_energy
-                    )
-                group.returned_energy = 0.0
+        for group in [x for x in groups if x.returned_energy > x.total_energy]:
+            if group.returned_energy > _MIN_RIBBON_SHARE * self._total_energy:
+                self._returning_groups[f"{escape_label(group.label)}\ngives back"] = (
+                    group.returned_energy
+                )
+            group.returned_energy = 0.0
         self._owner_groups = [
             group
             for group in groups
@@ -142,22 +141,25 @@ class _SankeyDiagram:
 
     def _create_group(self, owner: str, names: list[str]) -> _SankeyGroup:
         balance, ribbons, returned_energy, small_energy = self._balance, [], 0.0, 0.0
+        min_energy = _MIN_RIBBON_SHARE * self._total_energy
         for name in names:
             power, kind, part_owner_name = balance.powers[name], part_kind(name), part_owner(name)
             energy, returned = balance.integrate_energy(power), 0.0
             if kind == LOAD:
                 returned = balance.integrate_energy(np.maximum(-power, 0.0))
-            elif energy < 0:
+            if kind != LOAD and energy < 0:
                 returned = -energy
             energy, returned_energy = energy + returned, returned_energy + returned
             label = f"{part_owner_name} {kind}"
             if kind == "element":
                 label = part_owner_name
-            elif kind != "stored" and (owner == part_owner_name or len(self._shaft_energies) == 1):
+            if kind not in ("element", "stored") and (
+                owner == part_owner_name or len(self._shaft_energies) == 1
+            ):
                 label = kind
-            if energy < _MIN_RIBBON_SHARE * self._total_energy:
+            if energy < min_energy:
                 small_energy += energy
-            elif energy > 0:
+            if energy > 0 and energy >= min_energy:
                 ribbons.append(
                     _SankeyRibbon(
                         escape_label(label), energy, CLASS_COLOURS[part_class(balance, name)]

@@ -170,7 +170,7 @@ class CircuitSection:
         if kind == "port":
             for side in _SIGNS:
                 self._draw_port_valves(side, y + height)
-        elif kind == "cross":
+        if kind == "cross":
             for inlet, outlet, level in (("a", "b", y + 12), ("b", "a", y + 34)):
                 pose = SymbolPose(x, level, 3 if inlet == "a" else 1, is_mirrored=inlet == "a")
                 paths = [(self._lanes[inlet], level)], [(self._lanes[outlet], level)]
@@ -185,14 +185,14 @@ class CircuitSection:
                 f"label cross {joint}",
                 ha="left",
             )
-        elif kind == "regeneration":
+        if kind == "regeneration":
             component, middle = f"regeneration {joint}", y + 10
             paths = [(self._lanes["b"], middle)], [(self._lanes["a"], middle)]
             nets = self._nets["b"], self._nets["a"]
             pose = SymbolPose(x, middle, 1)
             valve_symbols.draw_check_valve(canvas, pose, component, nets, paths)
             canvas.draw_text(text_x, middle, "regen.", f"label {component}", ha="left")
-        elif kind == "tap":
+        if kind == "tap":
             for side in self._function.tapped_chambers:
                 net, lane = self._nets[side], x + _SIGNS[side] * _TAP_LANE
                 canvas.draw_wire(
