@@ -138,10 +138,10 @@ class PayloadEstimate(EstimatedValues):
         at = " at this frame" if point and not self.is_com_given else ""
         lines = [f"load on {self.frame}{point}{at}", *format_table(rows, (0, 3))]
         if at and self.mass_gradient is not None:
-            shares = ", ".join(f"{0.1 * x:+.2g} kg" for x in self.mass_gradient)
+            changes = ", ".join(f"{0.1 * x:+.2g}" for x in self.mass_gradient)
             lines.append(
-                f"the motion does not tell its centre; for each 0.1 m along x, y, z from "
-                f"{self.frame} the mass is {shares}: give the centre (--centre X,Y,Z)"
+                f"per 0.1 m of its centre along x, y, z the mass changes by {changes} kg: give "
+                "the centre (--centre X,Y,Z)"
             )
         if self.confidence_interval()[0, 0] <= 0:
             lines.append("the mass may be zero: do not trust its centre")
