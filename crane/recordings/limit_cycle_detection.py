@@ -1,5 +1,6 @@
 """Limit cycles: sustained oscillations that are not commanded, of a circuit or controller."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,8 +12,9 @@ from crane.description.sensors import VELOCITY_SUFFIX
 from crane.recordings.recording import REFERENCE_PREFIX, Recording
 
 _MIN_PERIODS = 8  # least number of periods
-_MIN_DECAY_RATIO = 0.85  # ratio of the last to the first swings: a damping ratio below 0.003
+_MIN_DECAY_RATIO = 0.85  # of swings eight periods apart: a damping ratio below 0.003
 _MIN_TIME_SHARE = 0.5  # of the time without a change of command, least duration
+_ORDERS = (1, 2, 3)  # periods after which a cycle repeats: some double or triple their period
 _MANY_PERIODS = 60  # number of periods that counts as sustained in any case
 _MIN_EVEN_SHARE = 0.75  # of the swings of a side and of the periods, which are even
 _MAX_PERIOD_RANGE = 0.33  # range of the even periods over their median
@@ -50,7 +52,7 @@ def sustained_oscillation(
 
     Moving means of doubling widths are subtracted from the samples; the difference crosses zero
     twice per period. Widths of one to two and a half periods are used. An oscillation decays if
-    the swings of its last quarter of eight periods are below 0.85 of those of the first. One that
+    its swings fall below 0.85 in eight periods, by those of the first and the last four. One that
     begins and ends while commands do not change is a transient, or noise, unless it lasts half of
     that time or sixty periods. It is commanded if a command reverses in at least half of the
     periods.
@@ -67,9 +69,9 @@ def sustained_oscillation(
     changes = np.concatenate([[0, len(values)], *map(_command_changes, commands)])
     width = _MIN_PERIOD_SAMPLES
     while width * _MIN_PERIODS <= 2.5 * len(values):
-        for first, last, period in _oscillation_spans(
-            values - _moving_mean(values, width), width, 0.5 * least
-        ):
+        deviation = values - _moving_mean(values, width)
+        spans = [_oscillation_spans(deviation, width, 0.5 * least, x) for x in _ORDERS]
+        for first, last, period in itertools.chain(*spans):
             amplitude = 0.5 * float(np.median(_peak_to_peak(values, first, last, period)))
             if amplitude < max(least, 0.0 if found is None else found.amplitude):
                 continue
@@ -162,35 +164,38 @@ def _moving_mean(values: Array, width: int) -> Array:
 
 
 def _oscillation_spans(
-    deviation: Array, width: int, least: float
+    deviation: Array, width: int, least: float, order: int
 ) -> Sequence[tuple[int, int, float]]:
-    """Start, end and median period, in samples, of sustained oscillations."""
+    """Start, end and median period, in samples, of what repeats after `order` periods."""
     from scipy.ndimage import binary_closing
 
     up = deviation > 0
     edges = np.flatnonzero(up[1:] != up[:-1]) + 1  # starts of half periods
-    count = 2 * _MIN_PERIODS
+    count = 2 * _MIN_PERIODS * order
     if len(edges) <= count:
         return []
     sizes = np.maximum.reduceat(np.abs(deviation), edges)[:-1]  # amplitude of each half period
     # interpolated zero crossings
     exact = edges - deviation[edges] / (deviation[edges] - deviation[edges - 1])
-    periods = exact[2:] - exact[:-2]
+    periods = (exact[2 * order :] - exact[: -2 * order]) / order
     rows = np.lib.stride_tricks.sliding_window_view(sizes, count)
-    lengths = np.lib.stride_tricks.sliding_window_view(periods, count - 1)[: len(rows)]
+    lengths = np.lib.stride_tricks.sliding_window_view(periods, count + 1 - 2 * order)
     length = np.median(lengths, axis=1)
-    quarter = count // 4
-    good = np.median(rows[:, -quarter:], axis=1) >= _MIN_DECAY_RATIO * np.median(
-        rows[:, :quarter], axis=1
-    )
-    for side in (rows[:, ::2], rows[:, 1::2]):  # above and below, which may differ
-        good &= _are_even(side, _MAX_SWING_RANGE) & (np.median(side, axis=1) >= least)
+    first, last = (np.median(x, axis=1) for x in np.split(rows, 2, axis=1))
+    good = last >= _MIN_DECAY_RATIO**0.5 * first
+    for half in range(2 * order):  # above and below, which may differ
+        good &= _are_even(rows[:, half :: 2 * order], _MAX_SWING_RANGE)
+        good &= np.median(rows[:, half % 2 :: 2], axis=1) >= least
     good &= _are_even(lengths, _MAX_PERIOD_RANGE)
     good &= (length >= _MIN_PERIOD_SAMPLES) & (length <= width) & (width <= 2.5 * length)
     good = binary_closing(np.pad(good, count), np.ones(count + 1))[count:-count]  # single jolts
     marks = np.flatnonzero(np.diff(good.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
     return [
-        (int(edges[a]), int(edges[b - 1 + count]), float(np.median(periods[a : b + count - 2])))
+        (
+            int(edges[a]),
+            int(edges[b - 1 + count]),
+            float(np.median(periods[a : b + count - 2 * order])),
+        )
         for a, b in marks.tolist()
     ]
 
