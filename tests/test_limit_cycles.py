@@ -114,7 +114,7 @@ def test_peak_forces_are_smaller_without_the_cycle(tmp_path):
     assert peaks[0] > 1.1 * peaks[1]
 
 
-@pytest.mark.parametrize(("frequency", "damping"), [(7.0, 0.002), (30.0, 0.004)])
+@pytest.mark.parametrize(("frequency", "damping"), [(7.0, 0.002), (30.0, 0.008)])
 def test_a_transient_that_grows_and_fades_is_none(frequency, damping):
     """While the command stands still; eight periods about its top hardly change."""
     phase = 2 * np.pi * frequency * TIME
@@ -146,6 +146,14 @@ def test_a_cycle_of_uneven_halves_and_jolts_is_found():
     assert found.frequency == pytest.approx(5.0, rel=0.02)
     assert found.amplitude == pytest.approx(2e6, rel=0.1)
     assert found.start < 1.0 and found.end > 8.5
+
+
+@pytest.mark.parametrize("order", [2, 3])
+def test_a_cycle_whose_period_doubles_or_triples_is_found(order):
+    """As of bouncing loads: one large swing, then smaller ones."""
+    size = np.where(np.floor(5 * TIME) % order == 0, 4e6, 1.5e6)
+    found = sustained_oscillation(TIME, 1e7 + size * np.sin(2 * np.pi * 5 * TIME), 1e5)
+    assert found.frequency == pytest.approx(5.0, rel=0.02) and found.end - found.start > 8
 
 
 def test_revolutions_are_no_cycle():

@@ -190,12 +190,9 @@ def _oscillation_spans(
     good &= (length >= _MIN_PERIOD_SAMPLES) & (length <= width) & (width <= 2.5 * length)
     good = binary_closing(np.pad(good, count), np.ones(count + 1))[count:-count]  # single jolts
     marks = np.flatnonzero(np.diff(good.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+    last_period = count - 2 * order
     return [
-        (
-            int(edges[a]),
-            int(edges[b - 1 + count]),
-            float(np.median(periods[a : b + count - 2 * order])),
-        )
+        (int(edges[a]), int(edges[b - 1 + count]), float(np.median(periods[a : b + last_period])))
         for a, b in marks.tolist()
     ]
 
