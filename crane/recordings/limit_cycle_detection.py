@@ -14,6 +14,7 @@ from crane.recordings.recording import REFERENCE_PREFIX, Recording
 _MIN_PERIODS = 8  # least number of periods
 _MIN_DECAY_RATIO = 0.85  # of swings eight periods apart: a damping ratio below 0.003
 _MIN_TIME_SHARE = 0.5  # of the time without a change of command, least duration
+_MAX_WIDTH = 2.5  # periods, width of moving means
 _ORDERS = (1, 2, 3)  # periods after which a cycle repeats: some double or triple their period
 _MANY_PERIODS = 60  # number of periods that counts as sustained in any case
 _MIN_EVEN_SHARE = 0.75  # of the swings of a side and of the periods, which are even
@@ -68,7 +69,7 @@ def sustained_oscillation(
     found: LimitCycle | None = None
     changes = np.concatenate([[0, len(values)], *map(_command_changes, commands)])
     width = _MIN_PERIOD_SAMPLES
-    while width * _MIN_PERIODS <= 2.5 * len(values):
+    while width * _MIN_PERIODS <= _MAX_WIDTH * len(values):
         deviation = values - _moving_mean(values, width)
         spans = [_oscillation_spans(deviation, width, 0.5 * least, x) for x in _ORDERS]
         for first, last, period in itertools.chain(*spans):
@@ -179,15 +180,23 @@ def _oscillation_spans(
     exact = edges - deviation[edges] / (deviation[edges] - deviation[edges - 1])
     periods = (exact[2 * order :] - exact[: -2 * order]) / order
     rows = np.lib.stride_tricks.sliding_window_view(sizes, count)
-    lengths = np.lib.stride_tricks.sliding_window_view(periods, count + 1 - 2 * order)
-    length = np.median(lengths, axis=1)
-    first, last = (np.median(x, axis=1) for x in np.split(rows, 2, axis=1))
-    good = last >= _MIN_DECAY_RATIO**0.5 * first
+    size = count + 1 - 2 * order
+    lengths = np.lib.stride_tricks.sliding_window_view(periods, size)
+    # from here on only windows that may pass; outliers shorten the mean by less than this share
+    total = np.append(0.0, np.cumsum(periods))
+    least_total = 0.5 * _MIN_EVEN_SHARE * size * width / _MAX_WIDTH
+    at = np.flatnonzero(total[size:] - total[:-size] >= least_total)
+    length, is_even = _evenness(lengths[at], _MAX_PERIOD_RANGE)
+    is_even &= (length >= _MIN_PERIOD_SAMPLES) & (length <= width) & (width <= _MAX_WIDTH * length)
+    at = at[is_even]
     for half in range(2 * order):  # above and below, which may differ
-        good &= _are_even(rows[:, half :: 2 * order], _MAX_SWING_RANGE)
-        good &= np.median(rows[:, half % 2 :: 2], axis=1) >= least
-    good &= _are_even(lengths, _MAX_PERIOD_RANGE)
-    good &= (length >= _MIN_PERIOD_SAMPLES) & (length <= width) & (width <= 2.5 * length)
+        at = at[_evenness(rows[at, half :: 2 * order], _MAX_SWING_RANGE)[1]]
+    first, last = (np.median(x, axis=1) for x in np.split(rows[at], 2, axis=1))
+    at = at[last >= np.maximum(_MIN_DECAY_RATIO**0.5 * first, least)]
+    if not len(at):
+        return []
+    good = np.zeros(len(rows), dtype=bool)
+    good[at] = True
     good = binary_closing(np.pad(good, count), np.ones(count + 1))[count:-count]  # single jolts
     marks = np.flatnonzero(np.diff(good.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
     last_period = count - 2 * order
@@ -197,12 +206,13 @@ def _oscillation_spans(
     ]
 
 
-def _are_even(values: Array, max_range: float) -> np.ndarray:
-    """Mask (n,) of rows (n, k) of which most values are close together."""
+def _evenness(values: Array, max_range: float) -> tuple[Array, np.ndarray]:
+    """Medians (n,) of rows (n, k), and a mask of those of which most values are close together."""
     values, count = np.sort(values, axis=1), values.shape[1]
     even = int(_MIN_EVEN_SHARE * count)
     ranges = values[:, even - 1 :] - values[:, : count - even + 1]
-    return np.asarray(ranges.min(axis=1) <= max_range * np.median(values, axis=1))
+    median = values[:, count // 2]
+    return median, ranges.min(axis=1) <= max_range * median
 
 
 def _peak_to_peak(values: Array, first: int, last: int, period: float) -> Array:
