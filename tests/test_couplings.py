@@ -166,13 +166,16 @@ ROTOR = """<robot name="rotor"><link name="base"/>
 </robot>"""
 
 
-@pytest.mark.parametrize("ratio", [-2.0, 26.9, 300.0])
-@pytest.mark.parametrize("active", ["crank", "rotor"])
-def test_a_geared_rotor_does_not_disturb_home(tmp_path, edited, ratio, active):
-    """The rotor follows the crank of the file by any number of turns, without a search."""
+@pytest.mark.parametrize(
+    ("leader", "ratio", "active"),
+    [("crank", -2.0, "crank"), ("crank", 26.9, "rotor"), ("crank", 300.0, "crank"),
+     ("crank", 300.0, "rotor"), ("rocker", 50.0, "crank"), ("coupler", -80.0, "crank")],
+)  # fmt: skip
+def test_a_geared_rotor_does_not_disturb_home(tmp_path, edited, leader, ratio, active):
+    """It follows a joint that the file gives or the loop moves by many turns, without a search."""
     (tmp_path / "rotor.urdf").write_text(ROTOR)
     chain = f"\n  - {{name: gear, urdf: {tmp_path}/rotor.urdf, parent: pin_B}}\n\nloops:"
-    gear = f"couplings: [{{name: gear, joints: {{rotor: 1, crank: {-ratio}}}}}]"
+    gear = f"couplings: [{{name: gear, joints: {{rotor: 1, {leader}: {-ratio}}}}}]"
     end = re.search("tasks:.*", (DATA / "four_bar.yaml").read_text(), re.DOTALL)[0]
     plain = crane.load(DATA / "four_bar.yaml")
     with warnings.catch_warnings():
@@ -183,7 +186,7 @@ def test_a_geared_rotor_does_not_disturb_home(tmp_path, edited, ratio, active):
         )  # fmt: skip
     assert machine.closure.home_search is None
     home = dict(zip(machine.joints, machine.home, strict=True))
-    assert home["rotor"] == pytest.approx(ratio * 1.2, rel=1e-12)
+    assert home["rotor"] == pytest.approx(ratio * home[leader], rel=1e-10)
     for joint, value in zip(plain.joints, plain.home, strict=True):
         assert home[joint] == pytest.approx(value, abs=1e-10)
 

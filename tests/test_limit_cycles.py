@@ -151,7 +151,7 @@ def test_a_cycle_of_uneven_halves_and_jolts_is_found():
 @pytest.mark.parametrize("order", [2, 3])
 def test_a_cycle_whose_period_doubles_or_triples_is_found(order):
     """As of bouncing loads: one large swing, then smaller ones."""
-    size = np.where(np.floor(5 * TIME) % order == 0, 4e6, 1.5e6)
+    size = np.where(np.floor(5 * TIME) % order == 0, 4e6, 1e6)
     found = sustained_oscillation(TIME, 1e7 + size * np.sin(2 * np.pi * 5 * TIME), 1e5)
     assert found.frequency == pytest.approx(5.0, rel=0.02) and found.end - found.start > 8
 
