@@ -169,7 +169,7 @@ ROTOR = """<robot name="rotor"><link name="base"/>
 @pytest.mark.parametrize(
     ("leader", "ratio", "active"),
     [("crank", -2.0, "crank"), ("crank", 26.9, "rotor"), ("crank", 300.0, "crank"),
-     ("crank", 300.0, "rotor"), ("rocker", 50.0, "crank"), ("coupler", -80.0, "crank")],
+     ("crank", 300.0, "rotor"), ("rocker", 300.0, "crank"), ("coupler", -1000.0, "crank")],
 )  # fmt: skip
 def test_a_geared_rotor_does_not_disturb_home(tmp_path, edited, leader, ratio, active):
     """It follows a joint that the file gives or the loop moves by many turns, without a search."""

@@ -211,11 +211,11 @@ class ExactConstraints:
         q, units = q.copy(), self._equations.step_units[movable]
         for _ in range(200):
             phi, jacobian = self._equations.evaluate(q)
-            phi = phi / self._residual_units
-            if np.abs(phi).max(initial=0.0) < tolerance:
+            if np.abs(phi / self._residual_units).max(initial=0.0) < tolerance:
                 break
-            scaled_jacobian = jacobian[:, movable] / self._residual_units[:, None] * units
-            q[movable] += least_squares_step(scaled_jacobian, phi) * units
+            scales = self._equations.step_residual_units
+            scaled_jacobian = jacobian[:, movable] / scales[:, None] * units
+            q[movable] += least_squares_step(scaled_jacobian, phi / scales) * units
         return q
 
     def intended_jacobian(self, q: Array) -> Array:
@@ -291,7 +291,9 @@ class ExactConstraints:
         self, home: Array, passive: Indices, rank: int, tolerance: float
     ) -> tuple[Indices, Indices] | None:
         """Independent rows (rank,) and the others; None if the rank of J_P is lower."""
-        jacobian = self._equations.evaluate_scaled(home)[1][:, passive]
+        equations = self._equations
+        jacobian = equations.evaluate(home)[1] / equations.step_residual_units[:, None]
+        jacobian = (jacobian * equations.step_units)[:, passive]
         from scipy.linalg import qr  # slow to import, only needed with loops
 
         _, upper, pivots = qr(jacobian.T, mode="economic", pivoting=True)

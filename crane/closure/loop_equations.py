@@ -78,6 +78,7 @@ class LoopEquations:
         geared_columns: (row of `coupling_factors`, column) of coordinates in no loop that a
             coupling gives from others, such as rotors; after those that they follow from.
         step_units: (nv,) coordinate units; of geared columns, how far they move with the others.
+        step_residual_units: (m,) residual units; of their couplings, those of their motion.
     """
 
     def __init__(
@@ -133,10 +134,13 @@ class LoopEquations:
         self.residual_units = np.where(self.is_translation, self.characteristic_length, 1.0)
         self.geared_columns = self._find_geared_columns()
         self.step_units = self.coordinate_units.copy()
+        self.step_residual_units = self.residual_units.copy()
         for row, column in self.geared_columns:
-            moved = np.abs(self.coupling_factors[row]) * self.step_units
-            ratio = (moved.sum() - moved[column]) / abs(self.coupling_factors[row, column])
+            factor = abs(self.coupling_factors[row, column])
+            moved = np.abs(self.coupling_factors[row]) @ self.step_units
+            ratio = moved / factor - self.step_units[column]
             self.step_units[column] = max(self.step_units[column], ratio)
+            self.step_residual_units[len(self._loop_index) + row] = factor * ratio
 
     def _find_geared_columns(self) -> list[tuple[int, int]]:
         """Columns in no loop and one coupling, then those in one of the remaining couplings."""
