@@ -197,7 +197,9 @@ def _oscillation_spans(
         return []
     good = np.zeros(len(rows), dtype=bool)
     good[at] = True
-    good = binary_closing(np.pad(good, count), np.ones(count + 1))[count:-count]  # single jolts
+    good = binary_closing(np.pad(good, count), np.ones(count + 1, dtype=bool))[
+        count:-count
+    ]  # single jolts
     marks = np.flatnonzero(np.diff(good.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
     last_period = count - 2 * order
     return [
@@ -225,10 +227,11 @@ def _peak_to_peak(values: Array, first: int, last: int, period: float) -> Array:
 
 
 def _reversal_count(command: Array) -> int:
-    return int(np.count_nonzero(np.diff(_directions(command)[np.nonzero(_directions(command))])))
+    directions = _directions(command)
+    return int(np.count_nonzero(np.diff(directions[directions != 0])))
 
 
-def _command_changes(command: Array) -> Array:
+def _command_changes(command: Array) -> np.ndarray:
     """Indices of samples where a command starts, stops or reverses."""
     return np.flatnonzero(np.diff(_directions(command))) + 1
 

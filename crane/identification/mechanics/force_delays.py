@@ -80,7 +80,7 @@ class ForceDelays(OneLineRepr):
             return ""
         return f"{self.text}: record them with one clock, or {self._remedy(found)}"
 
-    def _remedy(self, found: Array) -> str:
+    def _remedy(self, found: np.ndarray) -> str:
         weights = self.std[found] ** -2
         mean = float(weights @ self.seconds[found] / weights.sum())
         spread = np.abs(self.seconds[found] - mean)
@@ -114,7 +114,8 @@ def force_delays(
     from scipy.ndimage import binary_dilation
 
     n, joints = motion.tau.shape[1], model.machine.active
-    unknown = ForceDelays(joints, *np.full((3, n), np.nan), 0)
+    nothing = np.full(n, np.nan)
+    unknown = ForceDelays(joints, nothing, nothing, nothing, 0)
     step = float(motion.time[1] - motion.time[0])
     frequency = spectral_edge_frequency(motion.q, step)
     cutoff = min(_CUTOFF_FACTOR * frequency, 0.2 / step)
@@ -160,7 +161,8 @@ def _iterate_delays(
     A, shifts = W[instant, joint], np.zeros(n)
     splines = [CubicSpline(time, column) for column in force.T]
     min_noise = _SINGULAR_VALUE_TOLERANCE * force.std(axis=0) + _TINY
-    noise, first = force.std(axis=0) + _TINY, None
+    noise = force.std(axis=0) + _TINY
+    squares = []  # of the residuals with the delays so far
     for _ in range(_MAX_ITERATIONS):
         shifted = np.stack([f(time + d) for f, d in zip(splines, shifts, strict=True)], axis=1)
         # truncated singular value decomposition with columns of length one
@@ -179,11 +181,9 @@ def _iterate_delays(
         found = np.linalg.lstsq(X, y - U @ projected, rcond=None)[0]
         without = y - U @ projected
         e = without - X @ found
-        if first is None:
-            first = np.bincount(joint, (without * noise[joint]) ** 2, minlength=n)
+        squares.append(np.bincount(joint, (without * noise[joint]) ** 2, minlength=n))
         shifts[is_identifiable] += np.clip(found, -stride, stride)
         spread = np.sqrt(np.bincount(joint, e**2, minlength=n) / np.maximum(count, 1))
-        last = count * (noise * spread) ** 2
         noise = np.maximum(noise * spread, min_noise)
     block = instant * blocks // len(time)
     score = np.stack([np.bincount(block, x * e, minlength=blocks) for x in X.T], axis=1)
@@ -194,4 +194,4 @@ def _iterate_delays(
     not_converged = is_identifiable.copy()
     not_converged[is_identifiable] = np.abs(found) > std[is_identifiable]
     shifts[~is_identifiable | not_converged] = std[not_converged] = np.nan
-    return shifts, std, 1.0 - last / np.maximum(first, _TINY)
+    return shifts, std, 1.0 - squares[-1] / np.maximum(squares[0], _TINY)

@@ -366,8 +366,9 @@ def check_recording(
             )
         if limits is not None:
             _check_range(q[:, i], limits[i], joint, units[joint], trust)
-        has_rate = v is not None and np.isfinite(v[:, i]).all()
-        if has_rate and np.var(np.diff(q[:, i])) < np.var(q[:, i]):
+        if v is None or np.isnan(v[:, i]).any():
+            continue
+        if np.var(np.diff(q[:, i])) < np.var(q[:, i]):
             _check_velocity(time, q[:, i], v[:, i], joint, units[joint], longest_delay, trust)
 
 
