@@ -3,53 +3,24 @@
 import dataclasses
 
 import numpy as np
+import urdf_text
+from urdf_text import body, frame, joint, loop
+from warned import quiet
 
 import crane
 
 
-def link(name, mass=0.0, centre=(0, 0, 0), inertia=0.0):
+def link(name, mass, centre, inertia):
     """A body in the plane of x and y, its inertia about z."""
-    if not mass:
-        return f'<link name="{name}"/>'
-    place = " ".join(f"{x:.17g}" for x in centre)
-    return (
-        f'<link name="{name}"><inertial><origin xyz="{place}"/><mass value="{mass:.17g}"/>'
-        f'<inertia ixx="{inertia / 2:.17g}" iyy="{inertia / 2:.17g}" izz="{inertia:.17g}" ixy="0" '
-        'ixz="0" iyz="0"/></inertial></link>'
-    )
-
-
-def joint(name, parent, child, place=(0, 0, 0), kind="continuous", axis=(0, 0, 1)):
-    xyz, way = (" ".join(f"{x:.17g}" for x in vector) for vector in (place, axis))
-    limit = '<limit lower="-9" upper="9" effort="1" velocity="1"/>' if kind == "prismatic" else ""
-    return (
-        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
-        f'<origin xyz="{xyz}"/><axis xyz="{way}"/>{limit}</joint>'
-    )
-
-
-def place(name, on, at):
-    """A frame on a body."""
-    return link(name) + joint(f"{name}_joint", on, name, at, "fixed")
-
-
-def loop(name, one, two, axis=(0, 0, 1)):
-    way = " ".join(f"{x:.17g}" for x in axis)
-    return (
-        f'<loop name="{name}" type="revolute"><predecessor link="{one}"/>'
-        f'<successor link="{two}"/><axis xyz="{way}"/></loop>'
-    )
+    return body(name, mass, centre, (inertia / 2, inertia / 2, inertia))
 
 
 def load(folder, name, parts, home, active):
     """The machine of a URDF's parts."""
     states = "".join(f'<joint name="{x}" value="{value:.17g}"/>' for x, value in home.items())
-    path = folder / f"{name}.urdf"
-    path.write_text(
-        f'<robot name="{name}"><link name="base"/>{"".join(parts)}'
-        f'<group_state name="home">{states}</group_state></robot>'
-    )
-    machine = crane.load(path, active=[next(iter(home))])
+    state = f'<group_state name="home">{states}</group_state>'
+    path = urdf_text.write(folder, name, "base", *parts, state)
+    machine = quiet(crane.load, path, active=[next(iter(home))])
     return (
         machine
         if active == machine.active[0]
@@ -97,12 +68,12 @@ def squeezer(folder, active="beta"):
         joint("phi", "k5", "k4", (0.04, 0, 0)),
         joint("epsilon", "base", "k7", a),
         joint("omega", "k7", "k6", (0, -0.04, 0)),
-        place("e2", "k2", (-0.028, 0, 0)),
-        place("e3", "k3", (0, -0.035, 0)),
-        place("e4", "k4", (0, -0.02, 0)),
-        place("e6", "k6", (0.02, 0, 0)),
-        place("c", "base", (0.014, 0.072, 0)),
-        place("d", "k3", (0.02, -0.018, 0)),
+        frame("e2", "k2", (-0.028, 0, 0)),
+        frame("e3", "k3", (0, -0.035, 0)),
+        frame("e4", "k4", (0, -0.02, 0)),
+        frame("e6", "k6", (0.02, 0, 0)),
+        frame("c", "base", (0.014, 0.072, 0)),
+        frame("d", "k3", (0.02, -0.018, 0)),
         *(loop(f"e2_{other}", "e2", other) for other in ("e3", "e4", "e6")),
     ]
     machine = load(folder, "squeezer", parts, home, active)
@@ -119,9 +90,8 @@ def governor(folder):
     parts = [
         link("shaft", 1.0, (0, 0, 0), 0.1),
         joint("spin", "base", "shaft"),
-        '<link name="collar"><inertial><mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.01" '
-        'ixy="0" ixz="0" iyz="0"/></inertial></link>',
-        joint("collar", "shaft", "collar", kind="prismatic"),
+        body("collar", 1.0, moments=(0.01, 0.01, 0.01)),
+        joint("collar", "shaft", "collar", kind="prismatic", limits=(-9, 9)),
     ]
     home = {"spin": 0.0, "collar": -np.cos(lean)}
     for side, sign in (("left", -1.0), ("right", 1.0)):
@@ -129,16 +99,13 @@ def governor(folder):
             centre = -length * (0.5 * mass + far) / (mass + far)
             inertia = mass * length**2 / 12 + mass * (centre + length / 2) ** 2
             inertia += far * (centre + length) ** 2
-            parts.append(
-                f'<link name="{rod}_{side}"><inertial><origin xyz="0 0 {centre:.17g}"/><mass '
-                f'value="{mass + far:.17g}"/><inertia ixx="{inertia:.17g}" iyy="{inertia:.17g}" '
-                'izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>'
-            )
+            moments = (inertia, inertia, 0.001)
+            parts.append(body(f"{rod}_{side}", mass + far, (0, 0, centre), moments))
         parts += [
             joint(f"arm_{side}", "shaft", f"arm_{side}", axis=(0, 1, 0)),
             joint(f"link_{side}", f"arm_{side}", f"link_{side}", (0, 0, -0.5), axis=(0, 1, 0)),
-            place(f"end_{side}", f"link_{side}", (0, 0, -0.5)),
-            place(f"eye_{side}", "collar", (0, 0, 0)),
+            frame(f"end_{side}", f"link_{side}", (0, 0, -0.5)),
+            frame(f"eye_{side}", "collar", (0, 0, 0)),
             loop(f"pin_{side}", f"eye_{side}", f"end_{side}", (0, 1, 0)),
         ]
         home[f"arm_{side}"], home[f"link_{side}"] = -sign * lean, 2 * sign * lean
@@ -158,17 +125,12 @@ def bricard(folder, active="j0"):
     for i in range(5):
         way = corners[i + 1] - corners[i]
         across = (1 - way**2) / 12 + 1e-6
-        place_of = " ".join(f"{x:g}" for x in way / 2)
-        parts.append(
-            f'<link name="bar{i}"><inertial><origin xyz="{place_of}"/><mass value="1"/><inertia '
-            f'ixx="{across[0]:.17g}" iyy="{across[1]:.17g}" izz="{across[2]:.17g}" ixy="0" '
-            'ixz="0" iyz="0"/></inertial></link>'
-        )
+        parts.append(body(f"bar{i}", 1.0, way / 2, across))
         parts.append(joint(f"j{i}", before, f"bar{i}", corners[i] - here, axis=axes[i]))
         before, here = f"bar{i}", corners[i]
     parts += [
-        place("far", "bar4", corners[5] - corners[4]),
-        place("near", "base", corners[5]),
+        frame("far", "bar4", corners[5] - corners[4]),
+        frame("near", "base", corners[5]),
         loop("j5", "near", "far", axes[5]),
     ]
     return load(folder, "bricard", parts, {f"j{i}": 0.0 for i in range(5)}, active)

@@ -6,52 +6,42 @@ triangle has two mirror images, and so has the four-bar linkage of stick, rocker
 
 import math
 
+from urdf_text import body, frame, joint
+
 CYLINDER, ROCKER_PIN, BUCKET_PIN = (0.55, 0.62), (2.33, 0.05), (2.8, 0.0)
 RETRACTED, ROCKER, LINK, ARM = 1.45, 0.62, 0.58, 0.45
 ACTIVE, PASSIVE = "stroke", ("barrel", "rocker", "link", "bucket")
 ZERO = (0.0, math.pi / 2, math.pi / 2, math.pi / 4)  # of each part at zero, from its parent [rad]
 
-_BODY = (
-    '<link name="{}"><inertial><origin xyz="{} 0 0"/><mass value="{}"/><inertia ixx="{}" '
-    'iyy="{}" izz="{}" ixy="0" ixz="0" iyz="0"/></inertial></link>\n'
-)
-
 
 def _body(name, length, mass):
     inertia = mass * length**2 / 12
-    return _BODY.format(name, length / 2, mass, 0.1 * inertia, inertia, inertia)
+    return body(name, mass, (length / 2, 0, 0), (0.1 * inertia, inertia, inertia))
 
 
-def _joint(name, parent, child, xyz, kind="continuous", axis="0 -1 0", limit="", turn=0.0):
-    return (
-        f'<joint name="{name}" type="{kind}"><origin xyz="{xyz[0]} 0 {xyz[1]}" '
-        f'rpy="0 {-turn} 0"/>'
-        f'<parent link="{parent}"/><child link="{child}"/><axis xyz="{axis}"/>{limit}</joint>\n'
-    )
+def _joint(name, parent, child, at, turn=0.0, **options):
+    options = {"axis": (0, -1, 0)} | options
+    return joint(name, parent, child, (at[0], 0, at[1]), turn=(0, -turn, 0), **options)
 
 
-def _pin(name, parent, x):
-    return f'<link name="{name}"/>' + _joint(f"{name}_fixed", parent, name, (x, 0.0), "fixed")
-
-
-def write(folder, stroke, home="", limits="", zero=ZERO):
+def write(folder, stroke, home="", limits=(), zero=ZERO):
     """Write the machine; `home` are more lines of that section, `limits` those of the rocker."""
     turns = dict(zip(PASSIVE, zero, strict=True))
-    slide = '<limit lower="0" upper="1.0" effort="2e5" velocity="0.5"/>'
     parts = [
         '<robot name="bucket_linkage"><link name="stick"/>\n',
         _body("barrel", 1.2, 80) + _body("rod", 1.4, 50),
         _body("rocker", ROCKER, 45) + _body("link", LINK, 40) + _body("bucket", ARM, 600),
         _joint("barrel", "stick", "barrel", CYLINDER, turn=turns["barrel"]),
-        _joint("stroke", "barrel", "rod", (RETRACTED, 0), "prismatic", "1 0 0", slide),
+        _joint("stroke", "barrel", "rod", (RETRACTED, 0), kind="prismatic", axis=(1, 0, 0),
+               limits=(0, 1, 2e5, 0.5)),
         _joint(
-            "rocker", "stick", "rocker", ROCKER_PIN, "revolute" if limits else "continuous",
-            limit=limits, turn=turns["rocker"],
+            "rocker", "stick", "rocker", ROCKER_PIN, turns["rocker"], limits=limits,
+            kind="revolute" if limits else "continuous",
         ),
         _joint("link", "rocker", "link", (ROCKER, 0), turn=turns["link"]),
         _joint("bucket", "stick", "bucket", BUCKET_PIN, turn=turns["bucket"]),
-        _pin("rod_eye", "rod", 0.0) + _pin("rocker_eye", "rocker", ROCKER),
-        _pin("link_eye", "link", LINK) + _pin("bucket_eye", "bucket", ARM),
+        frame("rod_eye", "rod", (0.0, 0, 0)) + frame("rocker_eye", "rocker", (ROCKER, 0, 0)),
+        frame("link_eye", "link", (LINK, 0, 0)) + frame("bucket_eye", "bucket", (ARM, 0, 0)),
         "</robot>\n",
     ]  # fmt: skip
     (folder / "bucket_linkage.urdf").write_text("".join(parts))

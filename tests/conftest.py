@@ -45,6 +45,21 @@ def smooth(mini):
 
 
 @pytest.fixture(scope="session")
+def patu():
+    return crane.load("patu655")
+
+
+@pytest.fixture(scope="session")
+def excavator():
+    return crane.load("excavator")
+
+
+@pytest.fixture(scope="session")
+def kr300():
+    return crane.load("kr300")
+
+
+@pytest.fixture(scope="session")
 def slider_crank():
     return crane.load(DATA / "slider_crank.yaml")
 

@@ -7,7 +7,6 @@ from hydraulic_rig import AREA_A, AREA_B, HOSE, rig
 from crane.hydraulics.circuit_elements import (
     Accumulator,
     CircuitElement,
-    CircuitLine,
     Engine,
     Supply,
 )
@@ -67,34 +66,6 @@ def two_pumps(folder, count=8):
     return circuit(
         folder, second, [{"relief": 3.6e7, "refill": 1e-6}] * count, centre, engine=ENGINE,
         supplies={"second": second},
-    )  # fmt: skip
-
-
-def network(folder):
-    """Lines, an accumulator, elements of all kinds, a motor, floating, parted returns."""
-    cylinders = [EVERYTHING, {"refill": 1e-6}, {"motor": True, "cross_relief": 2e7}, {}]
-    valves = [
-        {"sharing": True, "return_a": "back", "return_b": "tank"},
-        {"float_from": 0.8, "float_coefficient": 1e-6, "return_a": "back", "return_b": "back"},
-        {"margin": 7e5, "supply": "second"},
-        {"regeneration": 1e-6, "supply": "third", "centre": 1e-6},
-    ]
-    elements = {
-        "filter": CircuitElement("orifice", "back", "tank", coefficient=1e-6),
-        "bypass": CircuitElement("check", "back", "tank", coefficient=1e-6, pressure=2e5),
-        "charge": CircuitElement("check", "supply", "store", coefficient=1e-6),
-        "ride": CircuitElement(
-            "orifice", "X1.a", "store", coefficient=1e-7, joints=("X1",), side="out"
-        ),
-        "cross": CircuitElement("relief", "X3.a", "X3.b", gain=1e-9, pressure=2e7),
-        "drain": CircuitElement("leak", "X3.b", "tank", gain=1e-13),
-        "unload": CircuitElement("relief", "store", "tank", gain=1e-9, pressure=2.5e7),
-        "anti": CircuitElement("check", "tank", "back", coefficient=1e-6),
-    }
-    return circuit(
-        folder, SENSING, cylinders, valves, supplies={"second": POSITIVE, "third": FIXED},
-        engine=ENGINE, lines={"back": CircuitLine(2e-3)}, elements=elements,
-        accumulators={"store": Accumulator(2.5e-3, 8e6)},
     )  # fmt: skip
 
 

@@ -1,33 +1,24 @@
 """Small excavators without cylinders as URDF texts: open trees with a boom and an arm."""
 
-BODY = """<link name="{}"><inertial><origin xyz="{} 0 {}"/><mass value="{}"/>
-  <inertia ixx="{}" iyy="{}" izz="{}" ixy="0" ixz="0" iyz="0"/></inertial></link>
-"""
-JOINT = """<joint name="{}" type="revolute"><origin xyz="{}" rpy="{}"/>
-  <parent link="{}"/><child link="{}"/><axis xyz="{}"/>
-  <limit lower="{}" upper="{}" effort="1000" velocity="1"/></joint>
-"""
+from urdf_text import body, frame, joint, write
 
 
-def body(name, length, mass, height=0.0):
+def _body(name, length, mass):
     across = mass * length**2 / 12
-    return BODY.format(name, length / 2, height, mass, 0.1 * across, across, across)
+    return body(name, mass, (length / 2, 0, 0), (0.1 * across, across, across))
 
 
-def joint(name, parent, child, xyz, lower, upper, axis="0 1 0", rpy="0 0 0"):
-    return JOINT.format(name, xyz, rpy, parent, child, axis, lower, upper)
+def _joint(name, parent, child, at, lower, upper, axis="0 1 0", turn="0 0 0"):
+    return joint(name, parent, child, at, "revolute", axis, (lower, upper, 1000), turn)
 
 
 def planar(folder, name="digger", rpy="0 0 0", more=""):
     """House, boom and arm that move in the plane y = 0; both links lie along x at zero."""
-    text = f'<robot name="{name}"><link name="house"/>\n'
-    text += body("boom", 4.0, 800.0) + body("arm", 2.0, 300.0) + '<link name="tip"/>\n'
-    text += joint("lift", "house", "boom", "0 0 1.5", -1.1, 0.2, rpy=rpy)
-    text += joint("fold", "boom", "arm", "4 0 0", 0.5, 2.3)
-    text += '<joint name="tip" type="fixed"><origin xyz="2 0 0"/><parent link="arm"/>'
-    text += f'<child link="tip"/></joint>{more}</robot>'
-    (folder / f"{name}.urdf").write_text(text)
-    return folder / f"{name}.urdf"
+    return write(
+        folder, name, "house", _body("boom", 4.0, 800.0), _body("arm", 2.0, 300.0),
+        _joint("lift", "house", "boom", (0, 0, 1.5), -1.1, 0.2, turn=rpy),
+        _joint("fold", "boom", "arm", (4, 0, 0), 0.5, 2.3), frame("tip", "arm", (2, 0, 0)), more,
+    )  # fmt: skip
 
 
 # cylinders that fit: eyes, bore, rod and stroke
@@ -40,11 +31,11 @@ FOLD = {
 
 def spatial(folder):
     """The same on a slewing gear, and with a swing of the arm out of the boom's plane."""
-    text = '<robot name="swinger"><link name="track"/>\n' + body("house", 2.0, 3000.0)
-    text += body("boom", 4.0, 800.0) + body("post", 0.4, 100.0) + body("arm", 2.0, 300.0)
-    text += joint("slew", "track", "house", "0 0 1", -3, 3, "0 0 1")
-    text += joint("lift", "house", "boom", "0.3 0 0.8", -1.1, 0.2)
-    text += joint("swing", "boom", "post", "4 0 0", -0.6, 0.6, "0 0 1")
-    text += joint("fold", "post", "arm", "0.4 0 0", 0.5, 2.3)
-    (folder / "swinger.urdf").write_text(text + "</robot>")
-    return folder / "swinger.urdf"
+    return write(
+        folder, "swinger", "track", _body("house", 2.0, 3000.0), _body("boom", 4.0, 800.0),
+        _body("post", 0.4, 100.0), _body("arm", 2.0, 300.0),
+        _joint("slew", "track", "house", (0, 0, 1), -3, 3, (0, 0, 1)),
+        _joint("lift", "house", "boom", (0.3, 0, 0.8), -1.1, 0.2),
+        _joint("swing", "boom", "post", (4, 0, 0), -0.6, 0.6, (0, 0, 1)),
+        _joint("fold", "post", "arm", (0.4, 0, 0), 0.5, 2.3),
+    )  # fmt: skip

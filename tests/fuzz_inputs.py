@@ -1,4 +1,4 @@
-"""Damages visuals, meshes and recordings. `test_fuzz_inputs.py` runs this as a process.
+"""Damages visuals, meshes and recordings. `test_fuzz.py` runs this as a process.
 
     python tests/fuzz_inputs.py KIND FIRST COUNT
 

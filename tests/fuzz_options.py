@@ -1,4 +1,4 @@
-"""Calls every command with extreme option values; `test_extreme_options.py` runs this.
+"""Calls every command with extreme option values; `test_fuzz.py` runs this.
 
     python tests/fuzz_options.py reported
     python tests/fuzz_options.py FIRST COUNT [COMMAND]

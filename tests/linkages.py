@@ -79,8 +79,9 @@ def multipliers(machine, q, v, tau):
                 )
             pairs.append(ends)
     data = model.createData()
-    pin.computeJointJacobians(model, data, q)
-    pin.forwardKinematics(model, data, q, v, np.zeros(model.nv))
+    at = machine.coordinates.configuration(q)
+    pin.computeJointJacobians(model, data, at)
+    pin.forwardKinematics(model, data, at, v, np.zeros(model.nv))
     pin.updateFramePlacements(model, data)
     world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     rows, biases = [], []
@@ -96,9 +97,9 @@ def multipliers(machine, q, v, tau):
         rows.append(row)
         biases.append(np.zeros(1))
     jacobian, bias = np.vstack(rows), np.concatenate(biases)
-    mass = pin.crba(model, data, q)
+    mass = pin.crba(model, data, at)
     mass = np.triu(mass) + np.triu(mass, 1).T
-    rest = tau - pin.nonLinearEffects(model, data, q, v)
+    rest = tau - pin.nonLinearEffects(model, data, at, v)
     whole = np.block([[mass, jacobian.T], [jacobian, np.zeros((len(bias),) * 2)]])
     solution = np.linalg.lstsq(whole, np.concatenate([rest, -bias]), rcond=1e-12)[0]
     return solution[: model.nv]
@@ -137,7 +138,9 @@ def assert_same(one, two, reach, forces=True):
     places = []
     for machine in (one, two):
         data = machine.model.createData()
-        pin.framesForwardKinematics(machine.model, data, machine.home)
+        pin.framesForwardKinematics(
+            machine.model, data, machine.coordinates.configuration(machine.home)
+        )
         places.append([data.oMf[machine.frame(link)].homogeneous for link in shared])
     np.testing.assert_allclose(places[1], places[0], rtol=0, atol=1e-11)
     if not forces:

@@ -13,14 +13,6 @@ import numpy as np
 _STEP = 2e-3  # [s] of the differences, whose error goes with its sixth power
 
 
-def _spin(angles, rates):
-    """Rate of turning in the child's frame of R_x R_y R_z."""
-    _, b, c = angles
-    one = np.array([np.cos(b) * np.cos(c), -np.cos(b) * np.sin(c), np.sin(b)])
-    two = np.array([np.sin(c), np.cos(c), 0 * c])
-    return rates[0] * one + rates[1] * two + rates[2] * np.array([0, 0, 1])
-
-
 class Oracle:
     """A file as MuJoCo has it.
 
@@ -50,11 +42,11 @@ class Oracle:
         return np.arange(first, first + 6) if first in floating else None
 
     def _turned(self, q, columns):
-        """Rotation (3, 3) of a free-flyer."""
+        """Rotation (3, 3) and quaternion of a rotation vector."""
         turn = np.zeros(9)
         quaternion = np.zeros(4)
-        length = np.linalg.norm(q[columns[3:]])
-        mujoco.mju_axisAngle2Quat(quaternion, q[columns[3:]] / max(length, 1e-300), length)
+        length = np.linalg.norm(q[columns])
+        mujoco.mju_axisAngle2Quat(quaternion, q[columns] / max(length, 1e-300), length)
         mujoco.mju_quat2Mat(turn, quaternion)
         return turn.reshape(3, 3), quaternion
 
@@ -67,7 +59,7 @@ class Oracle:
                 data.qpos[at], data.qvel[dof] = (x[self.machine.column(name)] for x in (q, v))
                 continue
             if (fly := self._floats(name)) is not None:
-                turn, data.qpos[at + 3 : at + 7] = self._turned(q, fly)
+                turn, data.qpos[at + 3 : at + 7] = self._turned(q, fly[3:])
                 data.qpos[at : at + 3] = q[fly[:3]]
                 data.qvel[dof : dof + 6] = *(turn @ v[fly[:3]]), *v[fly[3:]]
                 continue
@@ -76,15 +68,8 @@ class Oracle:
                 data.qpos[at : at + 3], data.qvel[dof : dof + 3] = q[slides], v[slides]
                 at, dof = at + 3, dof + 3
             turns = self._turns(name)
-            whole = np.array([1.0, 0, 0, 0])
-            for axis, angle in zip(np.eye(3), q[turns], strict=True):
-                one = np.zeros(4)
-                mujoco.mju_axisAngle2Quat(one, axis, angle)
-                product = np.zeros(4)
-                mujoco.mju_mulQuat(product, whole, one)
-                whole = product
-            data.qpos[at : at + 4] = whole
-            data.qvel[dof : dof + 3] = _spin(q[turns], v[turns])
+            data.qpos[at : at + 4] = self._turned(q, turns)[1]
+            data.qvel[dof : dof + 3] = v[turns]
         mujoco.mj_forward(model, data)
 
     def motion(self, q, v, a):
@@ -96,16 +81,14 @@ class Oracle:
                 out[dof] = a[self.machine.column(name)]
                 continue
             if (fly := self._floats(name)) is not None:
-                turn, spin = self._turned(q, fly)[0], v[fly[3:]]
+                turn, spin = self._turned(q, fly[3:])[0], v[fly[3:]]
                 out[dof : dof + 3] = turn @ (a[fly[:3]] + np.cross(spin, v[fly[:3]]))
                 out[dof + 3 : dof + 6] = a[fly[3:]]
                 continue
             if model.jnt_type[joint] == 0:
                 out[dof : dof + 3] = [a[self.machine.column(f"{name}_{x}")] for x in "xyz"]
                 dof += 3
-            turns = self._turns(name)
-            ahead = _spin(q[turns] + 1e-30j * v[turns], v[turns] + 1e-30j * a[turns])
-            out[dof : dof + 3] = ahead.imag / 1e-30
+            out[dof : dof + 3] = a[self._turns(name)]
         return out
 
     def forces(self, q, along):
@@ -117,14 +100,13 @@ class Oracle:
                 out[dof] = along[self.machine.column(name)]
                 continue
             if (fly := self._floats(name)) is not None:
-                out[dof : dof + 6] = *(self._turned(q, fly)[0] @ along[fly[:3]]), *along[fly[3:]]
+                turn = self._turned(q, fly[3:])[0]
+                out[dof : dof + 6] = *(turn @ along[fly[:3]]), *along[fly[3:]]
                 continue
             if model.jnt_type[joint] == 0:
                 out[dof : dof + 3] = [along[self.machine.column(f"{name}_{x}")] for x in "xyz"]
                 dof += 3
-            turns = self._turns(name)
-            spins = np.column_stack([_spin(q[turns], rates) for rates in np.eye(3)])
-            out[dof : dof + 3] = np.linalg.solve(spins.T, along[turns])
+            out[dof : dof + 3] = along[self._turns(name)]
         return out
 
     def _jacobian(self):

@@ -3,55 +3,25 @@
 They lie in the plane of x and z and turn about y; rods are slender, of 1 kg per rod.
 """
 
-import warnings
-
 import numpy as np
+from benchmark_mechanisms import load
+from urdf_text import body, frame, joint, loop
 
-import crane
 
-
-def _joint(name, parent, child, x=0.0, kind="continuous", axis="0 1 0"):
-    limit = (
-        '<limit lower="-50" upper="50" effort="1" velocity="1"/>' if kind == "prismatic" else ""
-    )
-    return (
-        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
-        f'<origin xyz="{x} 0 0"/><axis xyz="{axis}"/>{limit}</joint>'
-    )
+def _joint(name, parent, child, x=0.0):
+    return joint(name, parent, child, (x, 0, 0), axis=(0, 1, 0))
 
 
 def _rod(name, length):
-    inertia = length**2 / 12
-    return (
-        f'<link name="{name}"><inertial><origin xyz="{length / 2} 0 0"/><mass value="1"/>'
-        f'<inertia ixx="1e-9" iyy="{inertia}" izz="{inertia}" ixy="0" ixz="0" iyz="0"/>'
-        "</inertial></link>"
-    )
+    return body(name, 1.0, (length / 2, 0, 0), (1e-9, length**2 / 12, length**2 / 12))
 
 
 def _end(rod, length):
-    end = f"{rod}_end"
-    return f'<link name="{end}"/>' + _joint(f"{end}_joint", rod, end, length, "fixed")
+    return frame(f"{rod}_end", rod, (length, 0, 0))
 
 
 def _pin(name, one, two):
-    return (
-        f'<loop name="{name}" type="revolute"><predecessor link="{one}"/>'
-        f'<successor link="{two}"/><axis xyz="0 1 0"/></loop>'
-    )
-
-
-def _load(folder, parts, home, active):
-    states = "".join(f'<joint name="{joint}" value="{x}"/>' for joint, x in home.items())
-    path = folder / "linkage.urdf"
-    path.write_text(
-        f'<robot name="linkage"><link name="base"/>{"".join(parts)}'
-        f'<group_state name="home">{states}</group_state></robot>'
-    )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", crane.common.errors.CraneWarning)
-        machine = crane.load(path, active=[next(iter(home))])
-        return machine.with_home_configuration(machine.home, (active,))
+    return loop(name, one, two, (0, 1, 0))
 
 
 def slider_crank(folder, active, crank=1.0, rod=1.0):
@@ -62,13 +32,12 @@ def slider_crank(folder, active, crank=1.0, rod=1.0):
     home["s"] = crank * np.cos(np.pi / 4) + np.sqrt(rod**2 - lift**2)
     parts = [
         _rod("crank", crank), _rod("rod", rod),
-        '<link name="slider"><inertial><mass value="1"/><inertia ixx="1e-3" iyy="1e-3" izz="1e-3" '
-        'ixy="0" ixz="0" iyz="0"/></inertial></link>',
+        body("slider", 1.0, moments=(1e-3, 1e-3, 1e-3)),
         _joint("a", "base", "crank"), _joint("b", "crank", "rod", crank), _end("rod", rod),
-        _joint("s", "base", "slider", kind="prismatic", axis="1 0 0"),
+        joint("s", "base", "slider", kind="prismatic", axis=(1, 0, 0), limits=(-50, 50)),
         _pin("wrist", "rod_end", "slider"),
     ]  # fmt: skip
-    return _load(folder, parts, home, active)
+    return load(folder, "linkage", parts, home, active)
 
 
 def four_bar(folder, active, a=1.0, b=0.9, c=1.2, d=2.2):
@@ -78,7 +47,7 @@ def four_bar(folder, active, a=1.0, b=0.9, c=1.2, d=2.2):
         _joint("b", "one", "two", a), _joint("c", "base", "three", d), _end("two", b),
         _end("three", c), _pin("pin", "two_end", "three_end"),
     ]  # fmt: skip
-    return _load(folder, parts, {"a": -1.0, "b": 0.7, "c": -2.2}, active)
+    return load(folder, "linkage", parts, {"a": -1.0, "b": 0.7, "c": -2.2}, active)
 
 
 def windows(folder, active, count):
@@ -96,7 +65,7 @@ def windows(folder, active, count):
         parts += [_end(f"bar{k}", 1.0), _end(f"rod{k + 1}", 1.0)]
         parts += [_pin(f"l{k}", f"bar{k}_end", f"rod{k + 1}_end")]
         home[f"c{k}"] = np.pi / 2
-    return _load(folder, parts, home, active)
+    return load(folder, "linkage", parts, home, active)
 
 
 def start(machine, joint, speed):

@@ -2,7 +2,6 @@
 
 import os
 import re
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -11,22 +10,15 @@ import pytest
 from command_line import typed
 from excavators import FOLD, LIFT, planar, spatial
 from oracles import SliderCrank
+from warned import told as told_by
 
 import crane
-from crane.common.errors import CraneError, CraneWarning
+from crane.common.errors import CraneError
 from crane.formats.additions.steel_cylinder import RELIEF_PRESSURE, SteelCylinder
 
 ZX200 = Path(__file__).parents[2] / "shared/data/third_party/zx200/zx200.xacro"
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
-
-
-def told_by(call, *arguments, **given):
-    """What a call gives, and what it warned of."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", CraneWarning)
-        found = call(*arguments, **given)
-    return found, [str(one.message) for one in caught]
 
 
 def eyes_apart(machine, name, q):
@@ -92,13 +84,6 @@ def test_masses_are_those_of_the_shapes(retracted):
     # the piston runs from the cap to the gland
     assert 2 * e + stroke <= retracted - 2 * e + 1e-12
     assert steel.max_force == pytest.approx(RELIEF_PRESSURE * np.pi / 4 * bore**2)
-
-
-def test_a_cylinder_is_as_long_as_it_is_said():
-    assert SteelCylinder.from_dimensions(0.12, 0.085, 1.26).retracted_length == pytest.approx(
-        1.26 + 4 * 0.12
-    )
-    assert SteelCylinder.from_dimensions(0.12, 0.085, 1.26, 1.6).retracted_length == 1.6
 
 
 # --- machines ----------------------------------------------------------------------------------
@@ -171,15 +156,6 @@ def test_the_force_of_the_boom_cylinder_by_moments(closed):
         push = (pull + across * turned(normal)) / turned(axis)
         push += weights["hoist_rod"][1] * axis[1]
         assert dynamics.gravity(sample)[0] == pytest.approx(push, rel=1e-12)
-
-
-def test_the_closed_digger_moves_as_it_should(closed):
-    q_a = closed.home[closed.closure.active]
-    free = crane.simulate(closed, lambda t, q, v: np.zeros(2), duration=0.4)
-    assert energy_of(free) < 1e-9
-    reference = crane.point_to_point(q_a, q_a + [0.2, 0.2], 1.0)
-    run = crane.simulate(closed, crane.ComputedTorque(closed, reference))
-    assert run.q == pytest.approx(reference.position(run.time), abs=1e-8)
 
 
 def test_without_weight_it_is_the_open_machine(tmp_path):

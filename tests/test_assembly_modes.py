@@ -10,6 +10,7 @@ import pytest
 from broken_machines import DATA, LOOPED, copy_machine, swap
 from command_line import typed
 from executed_lines import at_most
+from warned import quiet, told
 
 import crane
 from crane.closure.assembly_modes import find_alternative_assembly_modes
@@ -28,14 +29,12 @@ def apart(one, two):
 
 def assembly(path, stroke, zero=bucket_linkage.ZERO):
     """Which of the four it is, and what was said of it."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        machine = crane.load(path)
+    machine, lines = told(crane.load, path)
     q = [machine.home[machine.column(joint)] for joint in bucket_linkage.PASSIVE]
     (which,) = (
         i for i, a in enumerate(bucket_linkage.assemblies(stroke, zero)) if apart(a, q) < 1e-9
     )
-    return which, [str(warning.message) for warning in caught]
+    return which, lines
 
 
 def lines(text):
@@ -124,7 +123,7 @@ def test_limits_decide(tmp_path):
     for which, wide in ((0, 2), (2, 0)):
         low, high = rockers[which] - 0.5, rockers[which] + 0.5
         assert not low <= rockers[wide] <= high
-        limits = f'<limit lower="{low:.3f}" upper="{high:.3f}" effort="1e9" velocity="1e9"/>'
+        limits = round(low, 3), round(high, 3), 1e9, 1e9
         path = bucket_linkage.write(tmp_path, 0.25, limits=limits)
         told = [finding.message for finding in check(path).findings]
         eye = [what for what in told if what.startswith("loop 'eye'")]
@@ -156,9 +155,7 @@ def test_all_others_are_found(tmp_path):
     for stroke in random.choice(STROKES, 12):
         zero = (0.0, *random.uniform(-math.pi, math.pi, 3).tolist())
         path = bucket_linkage.write(tmp_path, float(stroke), zero=zero)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", CraneWarning)
-            machine = crane.load(path)
+        machine = quiet(crane.load, path)
         columns = [machine.column(joint) for joint in bucket_linkage.PASSIVE]
         four = bucket_linkage.assemblies(float(stroke), zero)
         at_home = [apart(a, machine.home[columns]) < 1e-9 for a in four].index(True)

@@ -1,29 +1,18 @@
 """Batches of simulations equal single simulations."""
 
-import threading
-import warnings
-
 import numpy as np
 import pytest
 
 import crane
-from crane.common.errors import CraneWarning, InputError
-
-
-@pytest.fixture(scope="module")
-def forwarder():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        return crane.load("mini_forwarder")
-
+from crane.common.errors import InputError
 
 STARTS = [[0.1 * i, 0.012 + 0.001 * i, 0.011] for i in range(6)]
 
 
-def test_a_batch_is_its_simulations(forwarder):
+def test_a_batch_is_its_simulations(mini):
     target = crane.point_to_point([0, 0.015, 0.012], [0.5, 0.02, 0.014], 0.2)
     machines = [
-        forwarder.with_payload(crane.Payload("link7_tip", 0.02 * i)) for i in range(len(STARTS))
+        mini.with_payload(crane.Payload("link7_tip", 0.02 * i)) for i in range(len(STARTS))
     ]
     shares = []
     batch = crane.simulation.simulate_batch(
@@ -41,81 +30,38 @@ def test_a_batch_is_its_simulations(forwarder):
     assert np.ptp(batch.tau[:, 0, 1]) > 1  # [N], the payloads differ
 
 
-def test_one_machine_many_starts(forwarder):
-    batch = crane.simulation.simulate_batch(forwarder, initial=STARTS, duration=0.05)
+def test_one_machine_many_starts(mini):
+    batch = crane.simulation.simulate_batch(mini, initial=STARTS, duration=0.05)
     np.testing.assert_array_equal(batch.q[:, 0], STARTS)
 
 
-def test_a_variant_that_fails_loses_nothing_of_the_others(forwarder):
+def test_a_variant_that_fails_loses_nothing_of_the_others(mini):
     starts = [*STARTS[:2], [0.0, 0.04, 0.01], *STARTS[2:]]
-    batch = crane.simulation.simulate_batch(forwarder, initial=starts, duration=0.05)
+    batch = crane.simulation.simulate_batch(mini, initial=starts, duration=0.05)
     assert list(batch.failures) == [2]
     assert "X1 = 0.04 is outside of its limits" in batch.failures[2]
     assert np.isnan(batch.q[2]).all() and np.isfinite(np.delete(batch.q, 2, axis=0)).all()
 
 
-def test_a_step_too_long_is_told(forwarder):
-    hard = {**forwarder.friction, "X1": crane.description.Friction(coulomb=16, smoothing=5e-5)}
-    machines = [forwarder, forwarder.replace(friction=hard)]
-    target = crane.point_to_point([0, 0.015, 0.012], [0, 0.018, 0.012], 1.0)
-    batch = crane.simulation.simulate_batch(
-        machines, lambda m: crane.PI(m, target), step=1e-3, method="rk4"
-    )
-    assert batch.failures == {} and list(batch.warnings) == [1]
-    assert "the step of 0.001 s is too long" in batch.warnings[1]
-
-
-def test_wrong_batches(forwarder):
+def test_wrong_batches(mini):
     arm = crane.load("ur5_robot")
     for call, text in (
         (lambda: crane.simulation.simulate_batch([], duration=1.0), "there are no machines"),
         (
-            lambda: crane.simulation.simulate_batch([forwarder] * 2, initial=STARTS, duration=1.0),
+            lambda: crane.simulation.simulate_batch([mini] * 2, initial=STARTS, duration=1.0),
             "2 machines and 6 initial states",
         ),
         (
-            lambda: crane.simulation.simulate_batch([forwarder, arm], duration=1.0),
+            lambda: crane.simulation.simulate_batch([mini, arm], duration=1.0),
             "machine 1 is driven at",
         ),
         (
-            lambda: crane.simulation.simulate_batch(forwarder, initial=[[0, 1, 0]], duration=1.0),
+            lambda: crane.simulation.simulate_batch(mini, initial=[[0, 1, 0]], duration=1.0),
             "all 1 simulations failed, the first: initial: X1 = 1",
         ),
     ):
         with pytest.raises(InputError, match=text):
             call()
-
-
-def test_threads_share_a_machine(forwarder):
-    """Each thread its own Dynamics on one machine: nothing mixes."""
-    rng = np.random.default_rng(5)
-    q_a = np.column_stack([rng.uniform(-3, 3, 400), *rng.uniform(0, 0.03, (2, 400))])
-    v_a = rng.normal(size=(400, 3)) * [1, 0.02, 0.02]
-    wanted = crane.Dynamics(forwarder, backend="pinocchio").bias(q_a, v_a)
-    worst = []
-
-    def work(backend, shift):
-        dynamics = crane.Dynamics(forwarder, backend=backend)
-        order = np.roll(np.arange(400), shift)
-        found = np.array([dynamics.bias(q_a[i], v_a[i]) for i in order])
-        worst.append(np.abs(found - wanted[order]).max())
-
-    threads = [
-        threading.Thread(target=work, args=(backend, 37 * i))
-        for i, backend in enumerate(["compiled", "pinocchio"] * 2)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(worst) == 4 and max(worst) < 1e-10
-
-
-def test_a_machine_cannot_be_changed(forwarder):
-    with pytest.raises(ValueError, match="read-only"):
-        forwarder.lower[1] = -1
-    with pytest.raises(TypeError):
-        forwarder.friction["X1"] = crane.description.Friction()
 
 
 @pytest.mark.parametrize("backend", ["compiled", "pinocchio"])

@@ -5,6 +5,8 @@ import warnings
 import benchmark_mechanisms
 import numpy as np
 import pytest
+from urdf_text import sliding_block
+from warned import quiet
 
 import crane
 
@@ -63,9 +65,7 @@ def test_bricard_s_mechanism_moves_alike_by_any_joint(tmp_path, active):
 
 def test_a_stiff_governor_by_all_methods(tmp_path):
     """Flyballs against 8e5 N/m and 4e4 N s/m: errors are what the tolerance says."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", crane.CraneWarning)
-        machine = benchmark_mechanisms.governor(tmp_path)
+    machine = quiet(benchmark_mechanisms.governor, tmp_path)
     start = machine.home[machine.closure.active], np.array([2 * np.pi, 0.0])
 
     def run(**how):
@@ -112,13 +112,7 @@ def test_tolerances_that_cannot_be(mini):
 def test_a_block_between_stops_bounces_as_its_closed_form(tmp_path, how, error):
     """Straight lines and half sines, for a minute: a stop begins and ends where it does."""
     stiffness, mass = 1e6, 2.0
-    (tmp_path / "block.urdf").write_text(
-        f"""<robot name="block"><link name="base"/><link name="block"><inertial>
-        <mass value="{mass}"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
-        </link><joint name="x" type="prismatic"><parent link="base"/><child link="block"/>
-        <axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
-    )
-    machine = crane.load(tmp_path / "block.urdf")
+    machine = crane.load(sliding_block(tmp_path, mass, end=1))
     machine = machine.replace(end_stops=(crane.description.EndStop("x", stiffness),))
     found = crane.simulate(machine, None, (np.zeros(1), np.ones(1)), 60.0, 0.1, **how)
     omega = np.sqrt(stiffness / mass)

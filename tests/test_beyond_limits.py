@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from rig import Rig
 from scipy.optimize import brentq
+from warned import quiet
 
 import crane
 from crane.common.errors import ClosureError, CraneWarning, InputError, LimitError, SimulationError
@@ -188,9 +189,7 @@ def test_batches_say_it_of_each(mini, free):
 
 @pytest.mark.slow
 def test_the_rig_says_it_too(free):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        rig = Rig(free, 1)
+    rig = quiet(Rig, free, 1)
     told = "'X1' goes to 0.06 m at t = 1 s"
     with pytest.warns(CraneWarning, match=told), pytest.raises(SimulationError) as error:
         rig.run(to(0.06, 1.0))

@@ -3,12 +3,13 @@
 import re
 import warnings
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import typed
 from hydraulic_rig import COMPENSATED, rig
+from test_sensors import COLUMNS, LIFTING
+from warned import quiet
 
 import crane
 from crane.common.errors import CraneError, CraneWarning, InputError
@@ -23,7 +24,6 @@ from crane.recordings import table_reader, timeseries
 
 pytestmark = pytest.mark.slow
 
-LIFTING = Path(__file__).parents[2] / "shared" / "data" / "patu655" / "lifting_first_half.csv"
 TRUTH = {
     "valve.x.neutral": 5.87, "friction.x.viscous": 900.0, "oil.bulk_modulus": 0.9e9,
     "load_x.mass": 2300.0, "friction.x.coulomb": 350.0,
@@ -67,12 +67,6 @@ def recorded(machine, path, seed, truth=None, offset=0.0, extra=()):
     table = timeseries.Table(units, np.column_stack([run.time, voltage, *values]), {})
     timeseries.write_table(path, table)
     return path
-
-
-def quiet(call, *args, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        return call(*args, **options)
 
 
 @pytest.fixture(scope="module")
@@ -273,21 +267,7 @@ def test_the_command_writes_machine_report_and_picture(fitted, tmp_path):
 def test_a_measured_crane_lifts_as_it_did(tmp_path):
     """One command from a raw log; what was held out is predicted, ringing by all numbers."""
     columns = tmp_path / "columns.txt"
-    columns.write_text("""# machine: patu655
-time [s] = t_s
-voltage_X_lift [V] = U1_V
-voltage_X_tilt [V] = U2_V
-X_lift [mm] = s1_mm - 820
-X_tilt [mm] = s2_mm - 1050
-pressure_X_lift_a [Pa] = p1_Pa
-pressure_X_lift_b [Pa] = p2_Pa
-pressure_X_tilt_a [Pa] = p3_Pa
-pressure_X_tilt_b [Pa] = p4_Pa
-pressure_supply [Pa] = pP_Pa
-pressure_tank [Pa] = pT_Pa
-inclination_lift_boom [deg] = z1_deg
-inclination_tilt_boom [deg] = z2_deg
-""")
+    columns.write_text(COLUMNS)
     machine = quiet(
         crane.load, "patu655", lock={"slew": 0.0, "X_ext": 0.0}, changes={"payload.mass": 211.4}
     )

@@ -1,24 +1,25 @@
-"""Lifting capacity against statics by hand, cell by cell, and against brute force."""
+"""Lifting capacity, pins and buckling against statics by hand and brute force."""
+
+import dataclasses
+import re
+import shutil
 
 import numpy as np
 import pytest
+import urdf_text
+from broken_machines import MODELS
 from free_bodies import balance, moment, places
-from scipy.optimize import root
+from scipy.optimize import brentq, root
 
 import crane
+from crane.description.machine_parameters import parameter_unit
 from crane.dynamics.statics import StaticsEvaluator
 from crane.formats.machine_loading import MachineVariants
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.lifting_capacity import torques
-from crane.ratings.limiting_factors import largest_feasible_magnitude
 
 G = np.array([0.0, 0.0, -9.81])
 PUMP = 3.5e7  # of the excavator [Pa]
-
-
-@pytest.fixture(scope="module")
-def excavator():
-    return crane.load("excavator")
 
 
 def cells(chart, count, seed=0):
@@ -183,28 +184,6 @@ def test_friction_and_pressure_count(excavator):
     assert less == pytest.approx(PUMP / 2 * 2.2619467e-2 / slope, rel=1e-9)
 
 
-def test_cones_end_where_they_say():
-    """A root of a + b x + |c + d x| that all before it stay below."""
-    random = np.random.default_rng(0)
-    a, b = -random.uniform(0.1, 3, 3000), random.normal(size=3000)
-    c, d = 0.4 * random.normal(size=(3000, 3)), random.normal(size=(3000, 3))
-    x = largest_feasible_magnitude(a, b, c, d)
-
-    def value(x):
-        return a + b * x + np.linalg.norm(c + d * x[:, None], axis=1)
-
-    ends = np.isfinite(x) & (x > 0)
-    x[x > 1e9] = np.inf
-    assert 0.3 < ends.mean() < 0.99
-    assert (np.abs(value(np.where(ends, x, 0.0)))[ends] < 1e-9 * (1 + np.abs(x[ends]))).all()
-    for share in np.linspace(0, 0.999, 50):
-        assert (value(share * np.where(ends, x, 0.0))[ends] < 1e-9).all()
-    never = ~np.isfinite(x)
-    for far in np.logspace(-3, 6, 60):
-        assert (value(np.full(3000, far))[never] < 1e-6 * far).all()
-    assert (value(np.zeros(3000))[x == 0] >= 0).all()
-
-
 @pytest.mark.parametrize(
     ("given", "said"),
     [
@@ -264,17 +243,6 @@ def test_slopes_are_those_of_charts_beside(name, frame, numbers, given):
         assert np.median(gap) < 1e-7 and gap.max() < 1e-3
 
 
-def test_slopes_do_not_turn_with_the_crane():
-    """Loads limited by drives alone do not depend on the slew angle."""
-    machine, slews = crane.load("patu655"), [0.0, 1.0, np.pi / 2, -np.pi / 2, 3.0]
-    chart = crane.capacity(machine, slews=slews, step=1.0)
-    slopes = chart.derivatives(["lift_boom.mass", "lift_eye.x", "supply.pressure"])
-    there = np.isfinite(slopes[0]).all(axis=-1)
-    assert there.sum() > 10 and (np.abs(slopes[0, there]) > 0).any(axis=0).all()
-    size = np.abs(slopes[0, there]).max(axis=0)
-    assert slopes[:, there] / size == pytest.approx(slopes[[0] * 5][:, there] / size, abs=1e-9)
-
-
 def test_slopes_refuse_what_moves_the_supports(excavator):
     chart = crane.capacity(excavator, "bucket", radii=[6.0], heights=[1.0])
     with pytest.raises(crane.CraneError, match="moves the supports"):
@@ -321,21 +289,12 @@ def test_the_rule_for_timber_cranes_leans_the_ground(excavator):
 
 def test_what_moves_straight_up_ends_on_a_slope_too(tmp_path):
     """A mast: its lift holds effort / (g cos slope) less what it carries, whatever rounds."""
-    inertia = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
-    joint = (
-        '<joint name="{}" type="prismatic"><parent link="{}"/><child link="{}"/>'
-        '<axis xyz="{}"/><limit lower="0" upper="2" effort="{}" velocity="1"/></joint>'
-    )
-    (tmp_path / "mast.urdf").write_text(
-        '<robot name="mast"><link name="ground"/>'
-        + "".join(
-            f'<link name="{name}"><inertial><mass value="{mass}"/>{inertia}</inertial></link>'
-            for name, mass in (("car", 37.0), ("fork", 11.0))
-        )
-        + joint.format("lift", "ground", "car", "0 0 1", 3333.3)
-        + joint.format("out", "car", "fork", "1 0 0", 1e6)
-        + "</robot>"
-    )
+    slides = {"kind": "prismatic"}
+    urdf_text.write(
+        tmp_path, "mast", "ground", urdf_text.body("car", 37.0), urdf_text.body("fork", 11.0),
+        urdf_text.joint("lift", "ground", "car", limits=(0, 2, 3333.3), **slides),
+        urdf_text.joint("out", "car", "fork", axis=(1, 0, 0), limits=(0, 2, 1e6), **slides),
+    )  # fmt: skip
     machine = crane.load(tmp_path / "mast.urdf")
     for slope in np.linspace(0.01, 0.4, 40):
         chart = crane.capacity(machine, "fork", radii=[1.0], heights=[0.5], slope=slope)
@@ -396,12 +355,6 @@ def test_odd_arguments_are_said_in_one_line(excavator, given):
         crane.capacity(excavator, "bucket", **given)
 
 
-@pytest.mark.parametrize("share", [-1.0, 0.0, 1.5, np.nan])
-def test_rules_have_shares(share):
-    with pytest.raises(crane.CraneError, match="the tipping share of rule 'own'"):
-        crane.ratings.Rule("own", "", tipping=share)
-
-
 def test_a_column_behind_the_axis_has_a_table():
     chart = crane.capacity(crane.load("patu655"), radii=[-0.7], heights=[-0.4])
     assert np.isfinite(chart.loads).all() and "-0.4" in chart.to_markdown()
@@ -423,3 +376,150 @@ def test_places_at_folds_are_found():
         gaps = np.abs(found.q[:, closure.active] - drawn[k]).max(axis=1)
         lost += not len(gaps) or gaps.min() > 1e-6
     assert lost <= 3
+
+
+# --- pins and buckling --------------------------------------------------------------------------
+
+
+PINS = {"boom": 260e3, "boom_eye": 250e3, "X_arm": 30e3}
+
+
+@pytest.fixture(scope="module")
+def pinned(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pins") / "models"
+    shutil.copytree(MODELS, folder)
+    text = f"\npins: {PINS}\n".replace("'", "")
+    (folder / "excavator.yaml").write_text((folder / "excavator.yaml").read_text() + text)
+    return crane.load(folder / "excavator.yaml")
+
+
+@pytest.fixture(scope="module")
+def chart(pinned):
+    return crane.capacity(
+        pinned, "bucket", rule=crane.ratings.Rule("own", "", structural=0.8), step=1.0
+    )
+
+
+def force(machine, q, load, name):
+    return np.linalg.norm(balance(machine, q, G, load, "bucket")[1][name][:3])
+
+
+def test_pins_end_loads_where_statics_by_hand_has_their_limit(pinned, chart):
+    ends = {
+        chart.limiting_factors[k].element
+        for k in chart.active_factors
+        if chart.limiting_factors[k].reason == "pin force"
+    }
+    assert ends == set(PINS)
+    for cell in map(tuple, cells(chart, 25)):
+        q = pinned.closure.solve(chart.q_a[cell])
+        for k, cause in enumerate(chart.limiting_factors):
+            if cause.reason != "pin force":
+                continue
+            found = chart.values_by_factor[cell][k] / 0.8
+            if not found:
+                assert force(pinned, q, 0.0, cause.element) >= PINS[cause.element]
+                continue
+
+            def left(load, name=cause.element, q=q):
+                return force(pinned, q, load, name) - PINS[name]
+
+            samples = [left(load) for load in np.linspace(0, found * (1 - 1e-9), 5)]
+            assert max(samples) <= 0
+            assert found == pytest.approx(brentq(left, 0, 2 * found, rtol=1e-12), rel=1e-9)
+
+
+def test_pin_forces_and_margins_are_those_of_statics_by_hand(pinned, chart):
+    forces, margins = chart.pin_forces(), chart.buckling()
+    assert set(forces) == set(crane.dynamics.Reactions(pinned).names)
+    assert set(margins) == {"X_boom", "X_arm", "X_bucket"}
+    loads = crane.dynamics.Buckling(pinned)
+    for cell in map(tuple, cells(chart, 5, seed=1)):
+        q = pinned.closure.solve(chart.q_a[cell])
+        drives, pins = balance(pinned, q, G, chart.loads[cell], "bucket")
+        most = max(np.linalg.norm(pin[:3]) for pin in pins.values())
+        for name, pin in pins.items():
+            assert forces[name][cell] == pytest.approx(np.linalg.norm(pin[:3]), abs=1e-9 * most)
+        for joint, column in loads.columns.items():
+            load = column.buckling_load(q[pinned.column(joint)])
+            pressed = column.compression_sign * drives[joint]
+            margin = load / pressed if pressed > 0 else np.inf
+            assert margins[joint][cell] == pytest.approx(float(margin), rel=1e-9)
+    none = np.isnan(chart.loads)
+    assert none.any()
+    assert all(np.isnan(x[none]).all() for x in (*forces.values(), *margins.values()))
+    text = chart.to_markdown()
+    assert "X_arm 30 kN (pin force)" in text and "by tipping or by pins" in text
+    name = max(set(forces) - {"X_boom", "X_arm", "X_bucket"}, key=lambda x: np.nanmax(forces[x]))
+    assert re.search(f"in a pin: {name} +[|] +{np.nanmax(forces[name]) / 1e3:.1f} kN", text)
+    first = min(margins, key=lambda x: np.nanmin(margins[x]))
+    assert re.search(f"buckle: {first} +[|] +{np.nanmin(margins[first]):.3g} times", text)
+
+
+def test_margins_on_a_slope_are_those_of_the_worst_side(pinned):
+    """The worst direction of a slope equals that of many single directions."""
+    slope = 0.1
+    bare = crane.load("excavator")
+    chart = crane.capacity(bare, "bucket", radii=[5.0, 7.0], heights=[0.0, 2.0], slope=slope)
+    margins, columns = chart.buckling(), crane.dynamics.Buckling(bare).columns
+    cell = tuple(np.argwhere(np.isfinite(chart.loads))[0])
+    q = bare.closure.solve(chart.q_a[cell])
+    least = dict.fromkeys(columns, np.inf)
+    for side in np.linspace(0, 2 * np.pi, 181):
+        way = [np.sin(slope) * np.cos(side), np.sin(slope) * np.sin(side), -np.cos(slope)]
+        drives, _ = balance(bare, q, 9.81 * np.array(way), chart.loads[cell], "bucket")
+        for joint, column in columns.items():
+            if (pressed := column.compression_sign * drives[joint]) > 0:
+                load = float(column.buckling_load(q[bare.column(joint)]))
+                least[joint] = min(least[joint], load / pressed)
+    for joint, margin in least.items():
+        assert margins[joint][cell] == pytest.approx(margin, rel=1e-4)
+    with pytest.raises(crane.CraneError, match="slopes by 5.73 degrees: rate without slope"):
+        chart.pin_forces()
+    assert "in a pin" not in chart.to_markdown() and "first to buckle" in chart.to_markdown()
+
+
+def test_derivatives_are_left_out_where_a_pin_ends_the_load(pinned):
+    more = {"pins.boom": 7e5, "pins.boom_eye": 9e5, "pins.X_arm": 9e5}
+    machine, bare = crane.load(pinned.path, changes=more), crane.load("excavator")
+    chart, without = (crane.capacity(x, "bucket", step=1.0, slews=[0.0]) for x in (machine, bare))
+    slopes, free = (x.derivatives(["arm.mass"])[..., 0] for x in (chart, without))
+    pins = np.array([cause.reason == "pin force" for cause in chart.limiting_factors] + [False])[
+        chart.limiting_factor_index
+    ]
+    same = (chart.limiting_factor_index == without.limiting_factor_index) & (without.loads > 0)
+    assert pins.sum() > 3 and np.isnan(slopes[pins]).all()
+    assert same.sum() > 3 and slopes[same] == pytest.approx(free[same], rel=1e-9)
+
+
+def test_pins_are_read_written_and_changed(pinned, tmp_path):
+    assert dict(pinned.pin_capacities) == PINS
+    written = crane.write_machine(pinned, tmp_path / "written", {"pins.boom": "from a drawing"})
+    assert dict(crane.load(written).pin_capacities) == PINS
+    assert re.search("boom: 260000.0 +# from a drawing", written.read_text())
+    more = crane.load(pinned.path, changes={"pins.boom": 5e5})
+    assert dict(more.pin_capacities) == PINS | {"boom": 5e5}
+    assert "X_arm" not in crane.load(pinned.path, lock={"X_arm": 0.5}).pin_capacities
+    assert not crane.load("excavator").pin_capacities
+
+
+def test_pins_that_are_not_there_are_named(pinned):
+    odd = dataclasses.replace(pinned, pin_capacities={"bom": 1e5})
+    with pytest.raises(crane.CraneError, match="'bom' is no joint or loop, did you mean 'boom'"):
+        crane.capacity(odd, "bucket", radii=[6.0], heights=[1.0])
+    assert parameter_unit(pinned.tree, "pins.boom") == "N"
+
+
+@pytest.mark.parametrize(
+    ("change", "given", "said"),
+    [
+        ({"pins.boom": 0.0}, {}, "'pins.boom' is 0 N, give a force above 0"),
+        ({"pins.bom": 1.0}, {}, "'pins.bom' is unknown, did you mean 'pins.boom'"),
+        ({}, {"slope": 0.1}, "rated on level ground, but the ground slopes by 5.73 degrees"),
+        ({}, {"rule": "sfs4677"}, "rated on level ground, but the ground slopes by 5 degrees"),
+    ],
+)
+def test_wrong_pins_are_said_in_one_line(pinned, change, given, said):
+    with pytest.raises(crane.CraneError, match=said) as error:
+        crane.capacity(crane.load(pinned.path, changes=change), "bucket", **given)
+    assert "\n" not in str(error.value)

@@ -1,7 +1,6 @@
 """Output of lifting capacity: pressures, table, figures, page and command."""
 
 import csv
-import dataclasses
 import json
 import math
 import re
@@ -25,11 +24,6 @@ from crane.view.sketches.mechanism_projection import machine_outline
 
 G = np.array([0.0, 0.0, -9.81])
 TANK = 3.0e5
-
-
-@pytest.fixture(scope="module")
-def excavator():
-    return crane.load("excavator")
 
 
 @pytest.fixture(scope="module")
@@ -205,19 +199,6 @@ def test_labels_of_contours_are_not_upon_one_another(turns):
     assert len(boxes) >= 2
     for i, one in enumerate(boxes):
         assert not any(one.intersects_path(other, filled=True) for other in boxes[:i])
-
-
-@pytest.mark.slow
-def test_names_are_drawn_as_they_are(chart, tmp_path):
-    """No mathematics, no HTML."""
-    odd = dataclasses.replace(chart.machine, name=r"$\bad$ <b>_crane", supports=())
-    bare = dataclasses.replace(chart, machine=odd)
-    sheet = capacity_sheet_figure(bare)
-    sheet.draw_without_rendering()
-    assert any(r"\$\bad\$ <b>_crane" in text.get_text() for text in sheet.texts)
-    capacity_figure(bare).draw_without_rendering()
-    text = write_capacity_page(bare, tmp_path / "odd.html").read_text(encoding="utf-8")
-    assert "<b>" not in text and "&lt;b&gt;" in text
 
 
 @pytest.mark.slow

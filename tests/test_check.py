@@ -1,9 +1,12 @@
 """Findings of `crane check`, line by line."""
 
+import math
+import re
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
+import misfit_linkages
 import pytest
 from broken_machines import (
     GROUND,
@@ -18,10 +21,13 @@ from broken_machines import (
     with_line,
 )
 from command_line import typed
-from executed_lines import TooMuchWorkError, at_most
+from executed_lines import at_most
 
 import crane
+from crane.common.errors import SimulationError
+from crane.control.levers import LeverPhases
 from crane.description import bundled_machines, example_robots
+from crane.description.specification import Phase
 from crane.formats import write_machine
 from crane.formats.checks import CheckReport, check
 
@@ -50,8 +56,8 @@ class Checked:
     machine: str
 
 
-def seen(name: str, lines: list[str], *edits: Edit, machine: str = MACHINE):
-    return pytest.param(Checked(lines, edits, machine), id=name.replace(" ", "-"))
+def seen(lines: list[str], *edits: Edit, machine: str = MACHINE):
+    return pytest.param(Checked(lines, edits, machine), id=re.sub(r"\W+", "-", lines[0])[:60])
 
 
 def checked(machine: str, edits: tuple[Edit, ...], folder: Path) -> CheckReport:
@@ -63,28 +69,6 @@ def checked(machine: str, edits: tuple[Edit, ...], folder: Path) -> CheckReport:
 
 NUMBERS = [
     seen(
-        "four numbers in one file",
-        [
-            "ground.urdf:14: error: upper=\"nan\" of the limit of joint 'crank' is not "
-            "finite, give a number",
-            "ground.urdf:20: error: value=\"1,5\" of the mass of link 'crank_arm' is not a "
-            "number, write a decimal point",
-            "ground.urdf:26: error: xyz=\"0.2 zero 0\" of the origin of joint 'coupler' is "
-            "not a number, write digits",
-            "ground.urdf:34: error: value=\"inf\" of the mass of link 'coupler_arm' is not "
-            "finite, give a number",
-        ],
-        swap('<mass value="1.5"/>', '<mass value="1,5"/>', GROUND),
-        swap('<mass value="2.0"/>', '<mass value="inf"/>', GROUND),
-        swap(
-            '<origin xyz="0.2 0 0"/>\n    <parent',
-            '<origin xyz="0.2 zero 0"/>\n    <parent',
-            GROUND,
-        ),
-        swap('upper="2.5"', 'upper="nan"', GROUND),
-    ),
-    seen(
-        "all six of an inertia",
         [
             "ground.urdf:21: error: ixx=\"a\" of the inertia of link 'crank_arm' is not a "
             "number, write digits",
@@ -101,7 +85,6 @@ NUMBERS = [
         swap(CRANK_INERTIA, '<inertia ixx="a" ixy="" ixz="1,0" iyy="nan" iyz="1 2"/>', GROUND),
     ),
     seen(
-        "numbers of the machine file",
         [
             "four_bar.yaml:15: error: 'crank' of 'home' is '1,2', give a number with a "
             "decimal point",
@@ -116,18 +99,6 @@ NUMBERS = [
         swap("duration: 2", "duration: two"),
     ),
     seen(
-        "two numbers in one item",
-        [
-            "four_bar.yaml:20: error: 'coulomb' of friction of 'crank' is -0.3, give at least 0",
-            "four_bar.yaml:20: error: 'viscous' of friction of 'crank' is 'much', give a number",
-            "four_bar.yaml:42: error: 'ki' of control of 'crank' is inf, give a finite number",
-            "four_bar.yaml:42: error: 'kp' of control of 'crank' is -1, give at least 0",
-        ],
-        swap("coulomb: 0.3, viscous: 0.1", "coulomb: -0.3, viscous: much"),
-        swap("kp: 50, ki: 20", "kp: -1, ki: .inf"),
-    ),
-    seen(
-        "files at once",
         [
             "four_bar.yaml:16: error: joint 'couple' is unknown, did you mean 'coupler'?",
             "four_bar.yaml:20: error: unknown key 'colomb' in friction of 'crank', did you "
@@ -150,7 +121,6 @@ NUMBERS = [
 
 GRAPH = [
     seen(
-        "two links without a parent and a ring",
         [
             "ground.urdf:45: error: 2 links have no parent (ground, lost): join all but one",
             "ground.urdf:47: error: link 'a' is its own ancestor: cut the ring of joints ab, ba at"
@@ -165,7 +135,6 @@ GRAPH = [
         ),
     ),
     seen(
-        "unknown ends",
         [
             "ground.urdf:7: error: joint 'pin_B_fixed' has the unknown child 'pin_C', did "
             "you mean 'pin_B'?",
@@ -176,15 +145,13 @@ GRAPH = [
         swap('<child link="pin_B"/>', '<child link="pin_C"/>', GROUND),
     ),
     seen(
-        "a child that is unknown leaves no second root",
         [
             "rocker.urdf:19: error: joint 'rocker_pin_fixed' has the unknown child "
-            "'roker_pin', did you mean 'rocker_pin'?",
+            "'roker_pin', did you mean 'rocker_pin'?"
         ],
         swap('<child link="rocker_pin"/>', '<child link="roker_pin"/>', ROCKER),
     ),
     seen(
-        "two parents and a joint from a link to itself",
         [
             "ground.urdf:45: error: link 'coupler_arm' has two parents, joints 'coupler' "
             "and 'c': keep one and close the other as a loop",
@@ -200,7 +167,6 @@ GRAPH = [
         ),
     ),
     seen(
-        "names twice",
         [
             "ground.urdf:45: error: link 'pin_B' is there twice (first in line 3), rename one",
             "ground.urdf:46: error: joint 'crank' is there twice (first in line 10), rename one",
@@ -213,7 +179,6 @@ GRAPH = [
         ),
     ),
     seen(
-        "names missing",
         [
             'ground.urdf:3: error: a link has no name, add name="..."',
             'rocker.urdf:3: error: a joint has no name, add name="..."',
@@ -222,34 +187,19 @@ GRAPH = [
         swap('<joint name="rocker" type', "<joint type", ROCKER),
     ),
     seen(
-        "names of two chains",
-        [
-            "rocker.urdf:8: error: link 'crank_arm' is also in ground.urdf:17, rename one",
-        ],
+        ["rocker.urdf:8: error: link 'crank_arm' is also in ground.urdf:17, rename one"],
         swap('<link name="rocker_arm">', '<link name="crank_arm">', ROCKER),
         swap('<child link="rocker_arm"/>', '<child link="crank_arm"/>', ROCKER),
         swap('<parent link="rocker_arm"/>', '<parent link="crank_arm"/>', ROCKER),
     ),
     seen(
-        "a lost chain says nothing about what refers to it",
         [
             "four_bar.yaml:7: error: chain 'rocker': there is no file "
-            "'four_bar/roker.urdf', give its path from this folder",
+            "'four_bar/roker.urdf', give its path from this folder"
         ],
         swap("four_bar/rocker.urdf", "four_bar/roker.urdf"),
     ),
     seen(
-        "a chain that is not XML, and a slip elsewhere",
-        [
-            "four_bar.yaml:42: error: 'kp' of control of 'crank' is 'fast', give a number",
-            "rocker.urdf:1: error: not XML, Start tag expected, '<' not found, correct it",
-        ],
-        whole("rocker", ROCKER),
-        swap("kp: 50", "kp: fast"),
-        swap("  coupler: -1.0", "  crank_: -1.0"),
-    ),
-    seen(
-        "no chain can be read",
         [
             "ground.urdf:1: error: not XML, Start tag expected, '<' not found, correct it",
             "rocker.urdf: error: the file is empty, write a <robot> in it",
@@ -258,7 +208,6 @@ GRAPH = [
         whole("", ROCKER),
     ),
     seen(
-        "types of joints",
         [
             "ground.urdf:10: error: joint 'crank' has the type 'revolut', which is not "
             "supported, did you mean 'revolute'?",
@@ -273,7 +222,6 @@ GRAPH = [
 
 SLIPS = [
     seen(
-        "tags and attributes are read as they were meant",
         [
             "ground.urdf:14: error: the limits of joint 'crank' are reversed (-1.5 > -2.5),"
             " swap them",
@@ -290,7 +238,6 @@ SLIPS = [
         swap('damping="0.2"', 'dampng="-0.2"', GROUND),
     ),
     seen(
-        "keys are read as they were meant",
         [
             "four_bar.yaml:14: error: unknown key 'hoem' in the machine file, did you mean "
             "'home'?",
@@ -308,20 +255,6 @@ SLIPS = [
         swap("viscous: 0.01", "visous: -0.01"),
     ),
     seen(
-        "a misspelt section of chains",
-        [
-            "four_bar.yaml:5: error: unknown key 'chain' in the machine file, did you mean "
-            "'chains'?",
-            "four_bar.yaml:10: error: loop 'pin' has the unknown successor 'roker_pin', did"
-            " you mean 'rocker_pin'?",
-            "four_bar.yaml:10: error: unknown key 'sucessor' in loop 'pin', did you mean "
-            "'successor'?",
-        ],
-        swap("chains:", "chain:"),
-        swap("successor: rocker_pin", "sucessor: roker_pin"),
-    ),
-    seen(
-        "keys twice and no names",
         [
             "four_bar.yaml:16: error: key 3 is not a name, write names in quotes, and "
             "decimals with a point",
@@ -331,7 +264,6 @@ SLIPS = [
         swap("  coupler: -1.0", "  3: -1.0"),
     ),
     seen(
-        "places and doubles",
         [
             "ground.urdf:3: error: <mass> has no place in <link>, move it",
             "ground.urdf:20: error: link 'crank_arm' has 2 <mass>, keep one",
@@ -345,7 +277,6 @@ SLIPS = [
 
 INERTIAS = [
     seen(
-        "one of each kind",
         [
             "ground.urdf:21: error: link 'crank_arm' has a mass but no inertia, give at "
             "least a small sphere's",
@@ -368,7 +299,6 @@ INERTIAS = [
         ),
     ),
     seen(
-        "parts of an inertial",
         [
             "ground.urdf:18: error: the inertial of link 'crank_arm' has no <mass>, add it",
             "ground.urdf:32: error: the inertial of link 'coupler_arm' has no <inertia>, add it",
@@ -377,11 +307,10 @@ INERTIAS = [
         swap('<inertia ixx="0.001" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.03"/>', "", GROUND),
     ),
     seen(
-        "in kg mm2",
         [
             "ground.urdf:21: warning: link 'crank_arm' has a radius of gyration of 63.2 m, "
             "and its joints and its centre of mass are at most 0.2 m away, correct the "
-            "inertia (kg m2, about the centre of mass) or the mass (kg)",
+            "inertia (kg m2, about the centre of mass) or the mass (kg)"
         ],
         swap(
             CRANK_INERTIA,
@@ -390,11 +319,10 @@ INERTIAS = [
         ),
     ),
     seen(
-        "far too small",
         [
             "ground.urdf:21: warning: link 'crank_arm' has a radius of gyration of 8.16e-05"
             " m, and its joints and its centre of mass are at most 0.2 m away, correct the "
-            "inertia (kg m2, about the centre of mass) or the mass (kg)",
+            "inertia (kg m2, about the centre of mass) or the mass (kg)"
         ],
         swap(
             CRANK_INERTIA,
@@ -403,30 +331,27 @@ INERTIAS = [
         ),
     ),
     seen(
-        "against what is drawn",
         [
             "rocker.urdf:14: warning: link 'rocker_arm' has a radius of gyration of 3.16 m "
             "and is drawn 0.301 m large, correct the inertia (kg m2, about the centre of "
-            "mass) or the mass (kg)",
+            "mass) or the mass (kg)"
         ],
         swap('<mass value="1.0"/>', '<mass value="0.001"/>', ROCKER),
         swap(ROCKER_LINK, ROCKER_LINK + DRAWN, ROCKER),
     ),
     seen(
-        "centre of mass far from what is drawn",
         [
             "rocker.urdf:12: warning: link 'rocker_arm' has its centre of mass 14.7 m "
             "outside of what is drawn, which is 0.301 m large, correct one of them (m, in "
-            "the link's frame)",
+            "the link's frame)"
         ],
         swap('<origin xyz="0.15 0 0"/>', '<origin xyz="15 0 0"/>', ROCKER),
         swap(ROCKER_LINK, ROCKER_LINK + DRAWN, ROCKER),
     ),
     seen(
-        "mass in grams",
         [
             "rocker.urdf:13: warning: link 'rocker_arm' has 1000 kg in a box of 0.00012 m3,"
-            " denser than any metal, write kilograms if these are grams",
+            " denser than any metal, write kilograms if these are grams"
         ],
         swap('<mass value="1.0"/>', '<mass value="1000"/>', ROCKER),
         swap(
@@ -440,7 +365,6 @@ INERTIAS = [
 
 UNITS = [
     seen(
-        "millimetres",
         [
             "ground.urdf:5: warning: 400 m in <origin> is a long way for a machine (3 such "
             "in this file), write metres if these are millimetres",
@@ -463,7 +387,6 @@ UNITS = [
         swap('<origin xyz="0.3 0 0"/>', '<origin xyz="300 0 0"/>', ROCKER),
     ),
     seen(
-        "degrees",
         [
             "four_bar.yaml:14: error: the loops close only far from the home of the file: rocker "
             "is 1.53 rad off; at the home of the file loop 'pin' is 367 mm open, and would close "
@@ -490,10 +413,9 @@ UNITS = [
         ),
     ),
     seen(
-        "a stroke in millimetres",
         [
             "chain_b1.urdf:57: warning: the limit 300 m of joint 'X1' is a long way, write "
-            "metres if these are millimetres",
+            "metres if these are millimetres"
         ],
         swap('lower="0" upper="0.030"', 'lower="0" upper="300"', CHAIN_B1),
         machine=MINI,
@@ -502,7 +424,6 @@ UNITS = [
 
 MESHES = [
     seen(
-        "missing, broken and in millimetres",
         [
             "rocker.urdf:9: warning: mesh file 'package://gone/link.stl' is not there, "
             "correct its path or install the package that has it; a box is drawn instead",
@@ -519,25 +440,14 @@ MESHES = [
 
 MECHANISM = [
     seen(
-        "loop that stays open",
         [
             "four_bar.yaml:10: error: loop 'pin' cannot be closed from the home guess "
             "(crank = 1.2): it stays 0.0961 rad open, correct the frames or the guess (it "
-            "is 10 mm apart and 5.73 deg askew)",
+            "is 10 mm apart and 5.73 deg askew)"
         ],
         swap('<origin xyz="0.3 0 0"/>', '<origin xyz="0.3 0 0.01" rpy="0.1 0 0"/>', ROCKER),
     ),
     seen(
-        "loop too far away",
-        [
-            "four_bar.yaml:10: error: loop 'pin' cannot be closed from the home guess "
-            "(crank = 1.2): it stays 1.59 m open, correct the frames or the guess (it is "
-            "2.09 m apart and 0 deg askew)",
-        ],
-        swap('<origin xyz="0.3 0 0"/>', '<origin xyz="3 0 0"/>', ROCKER),
-    ),
-    seen(
-        "idle loop and wrong number of active joints",
         [
             "four_bar.yaml:11: error: loop 'again' locks nothing that the joints do not "
             "lock already: remove it",
@@ -556,7 +466,6 @@ MECHANISM = [
         ),
     ),
     seen(
-        "checked in spite of errors in friction, tasks and gains",
         [
             "four_bar.yaml:10: error: loop 'pin' cannot be closed from the home guess "
             "(crank = 1.2): it stays 0.101 m open, correct the frames or the guess (it is "
@@ -571,18 +480,16 @@ MECHANISM = [
         swap("ki: 20", "ki: -20"),
     ),
     seen(
-        "home outside of the limits",
         [
             "four_bar.yaml:15: error: home of 'crank' is 2.6, outside of its limits -1.5 to"
-            " 2.5 (ground.urdf:14), choose one within them",
+            " 2.5 (ground.urdf:14), choose one within them"
         ],
         swap("  crank: 1.2", "  crank: 2.6"),
     ),
     seen(
-        "passive joint outside of its limits",
         [
             "rocker.urdf:3: warning: passive joint 'rocker' is at 1.378 with the loops "
-            "closed at home, outside of its limits 0 to 0.5, widen them or correct the home",
+            "closed at home, outside of its limits 0 to 0.5, widen them or correct the home"
         ],
         swap('name="rocker" type="continuous"', 'name="rocker" type="revolute"', ROCKER),
         swap(
@@ -592,7 +499,6 @@ MECHANISM = [
         ),
     ),
     seen(
-        "two loops stay open",
         [
             "mini_forwarder.yaml:{line of - {name: A1}: error: loop 'A1_eye' cannot be "
             "closed from the home "
@@ -610,7 +516,6 @@ MECHANISM = [
 
 SECTIONS = [
     seen(
-        "joints that are not there",
         [
             "four_bar.yaml:12: error: joint 'crnk' is unknown, did you mean 'crank'?",
             "four_bar.yaml:12: error: joint 'rocker_pin_fixed' is fixed, name a moving one",
@@ -620,7 +525,6 @@ SECTIONS = [
         swap("{joint: rocker,", "{joint: roker,"),
     ),
     seen(
-        "lists that are none",
         [
             "four_bar.yaml:9: error: 'loops' is 'pin', give a list, its items with '- '",
             "four_bar.yaml:11: error: 'active' of the machine file is 'crank', give a list "
@@ -636,7 +540,6 @@ SECTIONS = [
         swap("home:\n  crank: 1.2\n  coupler: -1.0\n  rocker: 1.5", "home: [1.2]"),
     ),
     seen(
-        "a loop with four slips",
         [
             "four_bar.yaml:10: error: 'name' of a loop is 4, give text (or quote it)",
             "four_bar.yaml:10: error: 'type' of a loop: 'hinge' is unknown, known: "
@@ -651,24 +554,10 @@ SECTIONS = [
             "{name: 4, type: hinge, predecessor: coupler_pn, successor: rocker_pin, axis: [0, 0]}",
         ),
     ),
-    seen(
-        "offsets larger than their means",
-        [
-            "four_bar.yaml:20: warning: friction of 'crank' drives the joint in one "
-            "direction (|coulomb_offset| 0.4 > coulomb 0.3), a constant force may hide in "
-            "it; write drives: true if it is meant",
-            "four_bar.yaml:21: warning: friction of 'coupler' drives the joint in one "
-            "direction (|viscous_offset| 0.02 > viscous 0.01), a constant force may hide in"
-            " it; write drives: true if it is meant",
-        ],
-        swap("coulomb: 0.3", "coulomb: 0.3, coulomb_offset: 0.4"),
-        swap("viscous: 0.01", "viscous: 0.01, viscous_offset: -0.02"),
-    ),
 ]
 
 LOOPS = [
     seen(
-        "of a URDF",
         [
             "four_bar_loop.urdf:5: error: independent=\"yes\" of joint 'crank' is neither "
             "true nor false",
@@ -805,18 +694,6 @@ def test_the_next_command_closes_the_same_open_machine(tmp_path):
     assert crane.load(tmp_path / "bars_closed.yaml").closure.degrees_of_freedom == 1
 
 
-def test_status_and_counts_with_warnings(tmp_path):
-    path = copy_machine(MACHINE, tmp_path)
-    swap("coulomb: 0.3", "coulomb: 0.3, coulomb_offset: 0.4").apply(tmp_path)
-    result = run(path)
-    assert (result.returncode, result.stderr) == (1, "")
-    first, summary, counts, then = result.stdout.splitlines()
-    assert then.startswith("next: crane simulate ")
-    assert first.startswith("four_bar.yaml:20: warning: friction of 'crank' drives the joint")
-    assert summary.startswith("four_bar: 3 joints")
-    assert counts == "no errors, 1 warning"
-
-
 def test_status_and_counts_with_errors(tmp_path):
     path = copy_machine(MACHINE, tmp_path)
     swap("coulomb: 0.3", "coulomb: -0.3, coulomb_offset: 0.4").apply(tmp_path)
@@ -910,17 +787,6 @@ def test_odd_files_are_findings_soon(name, tmp_path):
     assert all(str(finding).isprintable() for finding in report.findings)
 
 
-def test_a_bound_on_work_ends_what_exceeds_it(tmp_path):
-    path = tmp_path / "wide.urdf"
-    path.write_bytes(ODD["wide.urdf"])
-    with at_most(10**9) as work:
-        check(path)
-    with pytest.raises(TooMuchWorkError, match="more than"), at_most(work.lines - 1):
-        check(path)
-    with at_most(work.lines):  # the same each time
-        check(path)
-
-
 def test_many_findings_end_somewhere(tmp_path):
     path = tmp_path / "wide.urdf"
     path.write_bytes(ODD["wide.urdf"])
@@ -946,3 +812,74 @@ def test_collecting_leaves_nothing_behind(tmp_path):
     assert check(path).errors == 2
     with pytest.raises(crane.CraneError, match="'kp' of control of 'crank' is -50"):
         crane.load(path)
+
+
+# --- strokes ------------------------------------------------------------------------------------
+
+
+VIA = (
+    "tasks:\n  out:\n    via:\n      - {{time: 0, lift_stroke: 0.4}}\n"
+    "      - {{time: 2, lift_stroke: {}}}\n"
+)
+
+
+def boom(folder, limits="", more=""):
+    path = misfit_linkages.LINKAGES["boom"].write(folder)
+    urdf = folder / "linkage.urdf"
+    if limits:
+        urdf.write_text(urdf.read_text().replace('lower="-9" upper="9"', limits))
+    path.write_text(path.read_text() + more)
+    return path
+
+
+def told(path):
+    return [finding.message for finding in check(path).findings]
+
+
+def test_a_via_point_beyond_the_stroke_is_told(tmp_path):
+    path = boom(tmp_path, 'lower="0.1" upper="0.6"', VIA.format(800))
+    assert told(path) == [
+        "task 'out' has 'lift_stroke' at 800 m at t = 2 s, beyond its limits 0.1 to 0.6 m, choose "
+        "a position within them"
+    ]
+    assert told(boom(tmp_path, 'lower="0.1" upper="0.6"', VIA.format(0.5))) == []
+
+
+def test_a_tip_beyond_all_links_is_told(tmp_path):
+    tip = "tip: boom_eye\ntasks:\n  out:\n    via:\n      - {time: 0, x: 1, y: 0, z: 1.3}\n"
+    path = boom(
+        tmp_path, 'lower="0.1" upper="0.6"', tip + "      - {time: 1, x: 800, y: 0, z: 0}\n"
+    )
+    (line,) = told(path)
+    assert line.startswith("task 'out' has its tip 800 m from the root at t = 1 s")
+
+
+def test_the_part_of_the_strokes_that_does_not_close_is_told(tmp_path):
+    """A triangle of pins 0.7616 and 1.2 m closes up to their sum, by hand."""
+    pin, base, eye = (0.0, 0.8), (0.3, 0.2), (1.0, 1.3)
+    longest = math.dist(pin, base) + math.dist(pin, eye) - 0.9
+    shortest = abs(math.dist(pin, base) - math.dist(pin, eye)) - 0.9
+    lower, upper = 0.1, 1.5
+    path = boom(tmp_path, f'lower="{lower}" upper="{upper}"')
+    (line,) = told(path)
+    share = (upper - longest + max(0.0, shortest - lower)) / (upper - lower)
+    found = re.match(r"(\d+) % of the strokes within the limits of lift_stroke lie beyond", line)
+    assert abs(float(found[1]) - 100 * share) < 1.5
+    last = float(re.search(r"closes is at lift_stroke = ([\d.]+)", line)[1])
+    assert last == pytest.approx(longest, abs=1e-4) and "loop 'eye'" in line
+
+
+@pytest.mark.parametrize("name", bundled_machines())
+def test_bundled_machines_close_all_over_their_strokes(name):
+    assert not [line for line in told(name) if "strokes" in line or "task" in line]
+
+
+def test_a_dead_centre_in_the_way_of_a_phase_is_named(tmp_path):
+    """The boom's pins are 2.5463 m and 0.9657 m from its cylinder's: it ends at their sum."""
+    machine = crane.load("excavator", changes={"X_boom.upper": 3.0})
+    up = Phase("up", {"X_boom": 1.0}, {"X_boom": 2.5}, 0.3)
+    with pytest.raises(SimulationError) as caught:
+        crane.simulate(machine, LeverPhases(machine, [up]), step=1e-2)
+    text = str(caught.value)
+    assert "'up' has not ended within 0.3 s" in text and "a dead centre is in between" in text
+    assert "loop 'boom_eye' cannot be closed at" in text and "give a position before it" in text

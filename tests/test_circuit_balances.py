@@ -1,9 +1,10 @@
-"""Oil and energy balances of a circuit with all components, and agreement of the methods."""
+"""Oil and energy of whole circuits: bundled components, all methods, and random circuits."""
 
 import numpy as np
 import pytest
 from full_circuit import SIGNALS, TIMES, everything, gaps
 from hydraulic_rig import rig
+from random_circuits import bounded
 
 import crane
 from crane.control import ValveSignals
@@ -76,3 +77,17 @@ def test_other_methods_agree(whole, method, backend, tolerance):
     for name in ("x_a", "x_b", "y_a", "z_a", "w_b", "supply", "second", "warm", "quick"):
         one, two = other.channels[f"pressure_{name}"], run.channels[f"pressure_{name}"][:n]
         assert np.abs(one - two).max() < 1e-6 * np.abs(two).max(), name
+
+
+# --- random circuits ----------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "first", [0, *(pytest.param(x, marks=pytest.mark.long) for x in (10, 20, 30))]
+)
+def test_random_circuits_balance(first):
+    """Oil and energy to 1e-6 of what went through, within a minute each."""
+    found = [bounded(seed) for seed in range(first, first + 10)]
+    assert not [one for one in found if one.bad]
+    assert sum(one.what == "runs" for one in found) > 5

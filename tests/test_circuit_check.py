@@ -1,17 +1,16 @@
 """`crane check` on circuits: unconnected ports, return lines, regulators, units."""
 
 import re
-import warnings
 from dataclasses import fields
 
-import numpy as np
 import pytest
 import yaml
 from command_line import typed
 from hydraulic_rig import COMPENSATED, ORIFICE, rig
+from warned import without_a_word
 
 import crane
-from crane.common.errors import CraneWarning, DescriptionError
+from crane.common.errors import DescriptionError
 from crane.common.plausible_ranges import (
     PLAUSIBLE_RANGES,
     RANGES_BY_COMPONENT,
@@ -177,9 +176,7 @@ def test_what_is_odd_is_a_warning(base, circuit, where, line):
 )  # fmt: skip
 def test_what_makes_sense_is_not_told(base, circuit):
     assert findings(base, **circuit) == []
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", CraneWarning)
-        crane.load(base[0] / "changed.yaml")
+    without_a_word(crane.load, base[0] / "changed.yaml")
 
 
 def test_what_nothing_relieves_rises_as_far_as_is_told(base):
@@ -282,70 +279,27 @@ def test_defaults_are_usual(kind):
                 assert not text, (kind, entry.name)
 
 
-@pytest.mark.parametrize("key", sorted(RANGES_BY_COMPONENT))
-def test_proposals_of_parts_are_usual(key):
-    kind, name = key
-    for value in np.logspace(-12, 14, 80):
-        text = implausible_value_text(name, float(f"{value:.3g}"), False, kind)
-        for words in text.split("write ")[1:]:
-            assert not implausible_value_text(name, float(words.split()[0]), False, kind), text
-
-
-def joint_parts(kind, numbers):
-    return {kind: {"x": numbers}}
-
-
 UNITS = [
     ("supply", SENSING | {"margin": 20}, "'margin' of 'supply' is 20 Pa", "bar, write 20e5"),
-    ("supply", SENSING | {"standby": 25}, "'standby' of 'supply' is 25 Pa", "bar, write 25e5"),
-    ("supply", SENSING | {"flow": 180}, "'flow' of 'supply' is 180 m3/s", "l/min, write 0.003"),
     ("supply", SENSING | {"relief": 320}, "relief of the supply is 320 Pa", "bar, write 320e5"),
-    ("supply", SENSING | {"relief": 3.2e9}, "'relief' of 'supply' is 3.2e+09", "at its unit"),
-    ("supply", SENSING | {"power": 90}, "'power' of 'supply' is 90 W", "kW, write 90e3"),
-    ("supply", SENSING | {"drag": 2.5}, "'drag' of 'supply' is 2.5 W", "kW, write 2.5e3"),
-    ("supply", SENSING | {"response": 120}, "'response' of 'supply'", "ms, write 120e-3"),
     ("supply", SENSING | {"slip": 0.01}, "'slip' of 'supply'", "l/min per bar, write 1.667e-12"),
     ("supplies", {"second": {"pressure": 350, "flow": 1e-3}}, "is 350 Pa", "bar, write 350e5"),
     ("engine", {"speed": 1800, "torque": 600, "inertia": 2}, "'speed' of 'engine' is 1800 rad/s",
      "rpm, write 188.5"),
-    ("engine", {"speed": 188, "torque": 0.06, "inertia": 2}, "'torque' of 'engine'", "kN m"),
     ("engine", {"speed": 188, "torque": 600, "inertia": 2, "speed_droop": 100},
      "'speed_droop' of 'engine' is 100 rad/s", "rpm, write 10.47"),
-    ("engine", {"speed": 188, "torque": 600, "inertia": 2, "fuel": 210}, "'fuel' of 'engine'",
-     "g/kWh, write 5.833e-08"),
-    ("engine", {"speed": 188, "torque": 600, "inertia": 2, "idle": 2}, "'idle' of 'engine'",
-     "kg/h"),
     ("lines", {"back": {"volume": 0.5}}, "'volume' of line 'back' is 0.5 m3", "l, write 0.5e-3"),
     ("accumulators", {"store": GAS | {"volume": 0.75}}, "'volume' of accumulator 'store'",
      "l, write 0.75e-3"),
-    ("accumulators", {"store": GAS | {"precharge": 80}}, "'precharge' of accumulator 'store'",
-     "bar, write 80e5"),
-    ("elements", {"e": {"type": "relief", "from": "x.a", "to": "tank", "gain": 10,
-                        "pressure": 2e7}}, "'gain' of element 'e' is 10", "l/min per bar"),
-    ("elements", {"e": {"type": "relief", "from": "x.a", "to": "tank", "gain": 1e-9,
-                        "pressure": 210}}, "'pressure' of element 'e' is 210 Pa",
-     "bar, write 210e5"),
     ("elements", {"e": {"type": "check", "from": "x.a", "to": "tank", "coefficient": 12}},
      "'coefficient' of element 'e'", "l/min per root of bar"),
-    ("oil", {"bulk_modulus": 14000}, "'bulk_modulus' of 'oil'", "bar, write 14000e5"),
     ("oil", {"air": 1}, "'air' of 'oil' is 1", "percent, write 1e-2"),
-    ("cylinders", {"x": {"area_a": 7854, "area_b": 5.4e-3, "hose_a": 1e-4, "hose_b": 1e-4}},
-     "'area_a' of cylinder of 'x' is 7854 m2", "mm2, write 7854e-6"),
-    ("cylinders", {"x": {"area_a": 7.8e-3, "area_b": 5.4e-3, "hose_a": 1e-4, "hose_b": 1e-4,
-                         "rupture_a": 80}}, "'rupture_a' of cylinder of 'x'", "l/min"),
-    ("cylinders", {"x": {"area_a": 7.8e-3, "area_b": 5.4e-3, "hose_a": 1e-4, "hose_b": 1e-4,
-                         "cross_relief": 150}}, "'cross_relief' of cylinder of 'x'",
-     "bar, write 150e5"),
     ("motors", {"displacement": 28, "volume": 1e-4}, "'displacement' of motor of 'x' is 28",
      "cm3 per turn, write 4.456e-06"),
-    ("motors", {"displacement": 4.5e-6, "volume": 0.2}, "'volume' of motor of 'x' is 0.2",
-     "l, write 0.2e-3"),
     ("motors", {"displacement": 4.5e-6, "volume": 1e-4, "relief": 250},
      "relief of the cylinder of 'x' is 250 Pa", "bar, write 250e5"),
     ("valves", {"x": ORIFICE | {"centre": 40}}, "'centre' of valve of 'x' is 40",
      "l/min per root of bar"),
-    ("valves", {"x": COMPENSATED | {"flow": 40}}, "'flow' of valve of 'x'", "l/min"),
-    ("valves", {"x": ORIFICE | {"demand": 50}}, "'demand' of valve of 'x'", "percent"),
 ]  # fmt: skip
 
 
@@ -365,13 +319,6 @@ def test_units_that_people_write_are_told(base, key, numbers, what, unit):
     texts = [x.message for x in findings(base, **changed)]
     (told,) = [text for text in texts if what in text]
     assert unit in told
-
-
-@pytest.mark.parametrize(
-    "name", ["excavator", "excavator_ls", "excavator_two_pumps", "patu655_ls"]
-)
-def test_the_bundled_circuits_are_not_told_of(name):
-    assert check(name).findings == ()
 
 
 def test_the_note_on_a_bundled_circuit():

@@ -1,15 +1,18 @@
 """Circuits in machine files: reading, writing, changes, locked joints, linear models, errors."""
 
-import warnings
+import re
+import textwrap
+from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import typed
 from full_circuit import ALL, SIGNALS, TIMES, everything, gaps
 from hydraulic_rig import rig
+from warned import without_a_word
 
 import crane
-from crane.common.errors import DescriptionError, InputError
+from crane.common.errors import CraneError, DescriptionError, InputError
 from crane.control import ValveSignals
 from crane.recordings import timeseries
 
@@ -30,9 +33,7 @@ def test_everything_is_written_and_read_to_the_last_bit(tmp_path):
 
 
 def test_all_numbers_are_named_and_can_be_changed(tmp_path):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        machine = everything(tmp_path)
+    machine = without_a_word(everything, tmp_path)
     told = typed("info", tmp_path / "rig.yaml", "--names")
     assert told.returncode == 0, told.stderr
     for name in (
@@ -127,24 +128,11 @@ def test_linear_model_of_two_pumps_at_rest_and_moving(tmp_path):
         tmp_path, supply=PUMP | {"response": 0.1, "least": 0.01}, axis="1 0 0",
         elements={"leak": LEAK | {"gain": 2e-12}},
     )  # fmt: skip
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        model = crane.linearize(tmp_path / "rig.yaml")
+    model = without_a_word(crane.linearize, tmp_path / "rig.yaml")
     # V / B p' = Q e - (gain) p with its own time constant, e' = -e / T beside its least
     values = np.linalg.eigvals(model.A)
     for wanted in (-2e-12 * 1.2e9 / 2e-3, -10.0):
         assert np.abs(values - wanted).min() < 1e-9 * abs(wanted)
-
-
-def test_linear_model_moves_on_a_load_sensing_pump(tmp_path):
-    machine = rig(
-        tmp_path, supply=PUMP | {"response": 0.1, "drag": 300.0}, axis="1 0 0",
-        friction={"viscous": 1e5},
-        engine={"speed": 190.0, "torque": 100.0, "inertia": 1.0, "speed_droop": 10.0},
-    )  # fmt: skip
-    model = crane.linearize(machine, [0.2], velocity=[0.05])
-    assert {"share_supply", "engine"} <= set(model.states)
-    assert np.isfinite(model.A).all()
 
 
 def test_what_knows_cylinders_alone_says_so(tmp_path):
@@ -331,3 +319,94 @@ def test_everything_is_all_that_there_is():
     assert {"supplies", "engine", "lines", "accumulators", "elements", "motors"} <= ALL.keys()
     kinds = {x["type"] for x in ALL["elements"].values()}
     assert kinds == {"orifice", "check", "relief", "leak"}
+
+
+# --- short forms --------------------------------------------------------------------------------
+
+
+MANUAL = Path(__file__).parents[1] / "docs" / "machine_file.md"
+
+
+@pytest.fixture
+def crane_of(tmp_path):
+    """The PATU 655 with another circuit."""
+    (tmp_path / "bare.yaml").write_text(
+        "extends: patu655\nname: bare\nhydraulics: null\ntasks: null\n"
+    )
+
+    def load(text):
+        path = tmp_path / "own.yaml"
+        path.write_text(f"extends: bare.yaml\nname: own\n{textwrap.dedent(text)}")
+        return crane.load(path)
+
+    return load
+
+
+def test_the_crane_of_the_manual_is_ten_lines_and_moves(crane_of):
+    text = MANUAL.read_text().split("described in ten lines:\n\n")[1].split("\n\n")[0]
+    assert len(text.splitlines()) == 10
+    machine = crane_of(text)
+    circuit = machine.hydraulics
+    assert circuit.joints == machine.active == ("slew", "X_lift", "X_tilt", "X_ext")
+    bores = {"X_lift": (0.11, 0.06), "X_tilt": (0.10, 0.056), "X_ext": (0.063, 0.036)}
+    for joint, (bore, rod) in bores.items():
+        cylinder = circuit.cylinders[joint]
+        assert cylinder.area_a == pytest.approx(np.pi / 4 * bore**2, rel=1e-15)
+        assert cylinder.area_b == pytest.approx(np.pi / 4 * (bore**2 - rod**2), rel=1e-15)
+        assert (cylinder.hose_a, cylinder.relief) == (2e-4, 2.3e7)
+    assert circuit.cylinders["slew"].area_a == 60 * 5e-5
+    assert all(valve.sharing and valve.bandwidth == 30 for valve in circuit.valves.values())
+    levers = {"X_lift": [(0, 0), (1, 0.4), (3, 0.4), (3.2, 0)]}
+    run = crane.simulate(machine, crane.joystick(machine, levers), duration=4.0, step=1e-2)
+    flow = 0.0  # c y sqrt(p_S - p_LS) with the margin less what the pump droops by
+    for _ in range(20):
+        flow = 5e-7 * 0.4 * np.sqrt(2e6 - 2e5 * flow / 2.5e-3)
+    speed = flow / circuit.cylinders["X_lift"].area_a
+    assert run.v[250, 1] == pytest.approx(speed, rel=2e-3)
+
+
+def test_what_an_item_says_itself_stands(crane_of):
+    machine = crane_of("""
+        hydraulics:
+          supply: {pressure: 2.0e+7}
+          cylinders:
+            all: {hose_a: 2.0e-4, hose_b: 3.0e-4}
+            X_lift: {bore: 0.1, rod: 0.05, count: 2, hose_b: 1.0e-4}
+            X_tilt: {area_a: 0.01, area_b: 0.005}
+          valves:
+            all: {type: orifice, c1: 1.0e-7, c2: 1.0e-7, c3: 1.0e-7, c4: 1.0e-7}
+            X_tilt: {c3: 2.0e-7, dead_band: 0.2}
+          control:
+            all: {kp: 10, kd: 0.1}
+        """)
+    lift, tilt = machine.hydraulics.cylinders.values()
+    assert (lift.hose_a, lift.hose_b, tilt.hose_b) == (2e-4, 1e-4, 3e-4)
+    assert lift.area_a == pytest.approx(2 * np.pi / 4 * 0.1**2) and tilt.area_a == 0.01
+    one, other = machine.hydraulics.valves.values()
+    assert (one.c3, other.c3, one.dead_band, other.dead_band) == (1e-7, 2e-7, 0.0, 0.2)
+    assert machine.hydraulics.control["X_lift"].kp == 10
+
+
+@pytest.mark.parametrize(
+    ("lift", "line"),
+    [
+        ("bore: 0.05, rod: 0.1", r":7: 'bore' .* more than the rod"),
+        ("bore: 0.1, area_a: 0.1", r":7: 'area_a' stands beside 'bore'"),
+        ("rod: 0.1, area_a: 0.1", r":7: 'rod' .* goes with 'bore'"),
+        ("bore: 0.1, count: 1.5", r":7: 'count' .* a whole number"),
+        ("bore: 0.1, tube: 0.1", r":7: tube of .* is 0.1 m, it must be more than the bore"),
+        ("bor: 0.1", r":7: unknown key 'bor' .*did you mean"),
+    ],
+)  # fmt: skip
+def test_wrong_bores_are_told(crane_of, lift, line):
+    text = f"""
+        hydraulics:
+          supply: {{pressure: 2.0e+7}}
+          cylinders:
+            X_lift: {{{lift}, hose_a: 1.0e-4, hose_b: 1.0e-4}}
+          valves:
+            all: {{type: orifice, c1: 1.0e-7, c2: 1.0e-7, c3: 1.0e-7, c4: 1.0e-7}}
+        """
+    with pytest.raises(CraneError) as caught:
+        crane_of(text)
+    assert re.search(line, str(caught.value)), caught.value

@@ -7,6 +7,7 @@ from dataclasses import replace
 import diagram_circuits as circuits
 import pytest
 from command_line import typed
+from full_circuit import everything
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from test_sketch import overlaps
 
@@ -32,7 +33,7 @@ def counted(folder, kind, count):
 
 BUNDLED = ("patu655", "excavator", "excavator_two_pumps")
 CASES = {
-    "network": circuits.network,
+    "everything": everything,
     "long names": circuits.long_names,
     "tapped": circuits.everything_tapped,
     **{f"{kind} {n}": lambda folder, kind=kind, n=n: counted(folder, kind, n)
@@ -253,12 +254,16 @@ def test_open_centres_are_in_series(tmp_path):
 
 
 def test_words_on_pumps(drawings):
-    _, drawn, _ = drawings["network"]
-    texts = {x.get_gid(): x.get_text() for x in drawn.axes[0].texts}
-    assert texts["label regulator supply"] == "LS" and texts["label regulator second"] == "PFC"
-    assert "label regulator third" not in texts
-    said = {x.get_text() for x in drawn.axes[0].texts}
-    assert {"180 l/min", "max. 280 bar", "LS + 20 bar", "90 kW", "1795 rpm"} <= said
+    texts, others = (
+        {x.get_gid(): x.get_text() for x in drawings[name][1].axes[0].texts}
+        for name in ("everything", "long names")
+    )
+    assert texts["label regulator supply"] == "LS" and texts["label regulator second"] == "NFC"
+    assert others["label regulator C"] == "PFC"
+    assert "label regulator pump_of_the_slewing_gear_motor" not in others
+    said = {x.get_text() for x in drawings["everything"][1].axes[0].texts}
+    assert {"72 l/min", "max. 240 bar", "LS + 20 bar", "1814 rpm"} <= said
+    assert "15 kW of supply, second" in said
 
 
 def test_rods_are_where_chamber_a_is_not(tmp_path):

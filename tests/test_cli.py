@@ -1,6 +1,7 @@
 """The command line: output, errors in one line, imports, interrupts and written files."""
 
 import os
+import pty
 import re
 import shutil
 import signal
@@ -255,12 +256,6 @@ def test_version_and_units_in_help():
     assert re.search("--step SECONDS Step of the recorded samples", text)
 
 
-def test_a_hydraulic_machine_without_signals_stands_on_its_valves(tmp_path):
-    """Without signals the valves stay closed; the machine is not free."""
-    run = typed("simulate", "patu655", "--duration", "0.02", "--out", tmp_path / "run")
-    assert run.stdout.startswith("# patu655: valves at rest\n")
-
-
 def test_without_a_task_a_controller_holds_and_none_lets_go(free_run, tmp_path):
     assert free_run[1].stdout.startswith("# mini_forwarder: free motion\n")
     time = "--duration", "0.02"
@@ -372,27 +367,6 @@ def test_results_are_headed_with_the_machine_s_own_name(tmp_path):
     assert figure.get_suptitle() == "Press No. 1: free motion"
 
 
-def test_check_tells_warnings_by_its_status(tmp_path):
-    path = copy_machine(MINI, tmp_path)
-    path.write_text(path.read_text().replace(", drives: true", ""))
-    result = typed("check", path)
-    assert result.returncode == 1
-    assert "3 degrees of freedom" in result.stdout
-    assert result.stdout.startswith("mini_forwarder.yaml:")
-    assert result.stdout.splitlines()[-2] == "no errors, 1 warning"
-    assert result.stderr == ""
-    assert typed("check", "mini_forwarder").returncode == 0
-    assert typed("check", "ur5_robot").returncode == 0
-
-
-def test_simulate_writes_recording_and_summary(free_run):
-    folder, result = free_run
-    assert sorted(path.name for path in folder.iterdir()) == ["recording.csv", "summary.md"]
-    recording = crane.Recording.from_csv(folder / "recording.csv")
-    assert len(recording.time) == 21 and recording.machine == "mini_forwarder"
-    assert "| X1 |" in result.stdout
-
-
 def test_results_go_to_a_folder_called_as_the_command(tmp_path):
     machine = Path(__file__).parent / "data" / "slider_crank.yaml"
     command = "simulate", machine, "--duration", "0.01"
@@ -401,38 +375,6 @@ def test_results_go_to_a_folder_called_as_the_command(tmp_path):
     assert "simulate: is not empty" in one_error(typed(*command, cwd=tmp_path))
     assert typed("working-range", "excavator", "--frame", "bucket", cwd=tmp_path).returncode == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["simulate", "working_range"]
-
-
-def test_folders_are_made_where_files_are_written(tmp_path):
-    machine = Path(__file__).parent / "data" / "slider_crank.yaml"
-    for command in (
-        ("convert", machine, "a/b/x.urdf"), ("convert", machine, "c/x.xml"),
-        ("convert", machine, "d/e"), ("sketch", machine, "--out", "f/x.png"),
-    ):  # fmt: skip
-        done = typed(*command, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-    assert all((tmp_path / x).is_file() for x in ("a/b/x.urdf", "c/x.xml", "f/x.png"))
-    crane.load(tmp_path / "a" / "b" / "x.urdf")
-
-
-def test_simulate_a_task(tmp_path):
-    result = typed(
-        "simulate", "mini_forwarder", "--task", "lift", "--duration", "0.01",
-        "--controller", "computed-torque", "--out", tmp_path / "run",
-    )  # fmt: skip
-    assert result.returncode == 0, result.stderr
-    recording = crane.Recording.from_csv(tmp_path / "run" / "recording.csv")
-    assert recording.task == "lift" and "reference_X1" in recording.channels
-
-
-def test_nothing_is_overwritten_without_force(free_run):
-    folder, _ = free_run
-    before = (folder / "recording.csv").read_bytes()
-    again = ("simulate", "mini_forwarder", "--duration", "0.01", "--out", folder)
-    assert "is not empty, choose another folder or add --force" in one_error(typed(*again))
-    assert (folder / "recording.csv").read_bytes() == before
-    assert typed(*again, "--force").returncode == 0
-    assert (folder / "recording.csv").read_bytes() != before
 
 
 def test_plot_and_view_of_a_run(free_run, tmp_path):
@@ -446,11 +388,6 @@ def test_plot_and_view_of_a_run(free_run, tmp_path):
     assert "exists already, choose another name or add --force" in one_error(again)
     bad = typed("plot", folder, "--out", tmp_path / "a.xyz")
     assert "a.xyz" in one_error(bad)
-
-
-def test_view_of_a_machine_goes_to_the_working_folder(tmp_path):
-    assert typed("view", "mini_forwarder", "--no-open", cwd=tmp_path).returncode == 0
-    assert (tmp_path / "mini_forwarder.html").is_file()
 
 
 def test_view_of_a_run_whose_machine_has_moved(tmp_path):
@@ -468,17 +405,6 @@ def test_view_of_a_run_whose_machine_has_moved(tmp_path):
     result = typed(*view, "--machine", data / "slider_crank.yaml")
     assert result.returncode == 0, result.stderr
     assert page.is_file()
-
-
-def test_page_of_a_machine_whose_name_is_no_file_name(tmp_path):
-    data = Path(__file__).parent / "data"
-    text = (data / "slider_crank.yaml").read_text().replace("urdf: ", f"urdf: {data}/")
-    assert "name: slider_crank" in text
-    text = text.replace("name: slider_crank", "name: 'a/b: <c>'")
-    (tmp_path / "named.yaml").write_text(text)
-    result = typed("view", "named.yaml", "--no-open", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
-    assert (tmp_path / "a_b_c.html").is_file()
 
 
 @pytest.mark.parametrize(
@@ -593,3 +519,106 @@ def test_help_keeps_its_units():
     for file in (Path(crane.__file__).parent / "cli").glob("*.py"):
         for text in re.findall(r'help="([^"]*)"', file.read_text()):
             assert "[" not in text, text
+
+
+# --- progress -----------------------------------------------------------------------------------
+
+
+PROGRAM = """
+import sys
+import time
+from crane.cli import entry
+from crane.common import progress
+from crane.cli import terminal
+from crane.cli.command import app
+from crane.cli.terminal import progress_bar
+
+progress.REPORT_DELAY, progress.REPORT_INTERVAL = float(sys.argv.pop()), 0.05
+
+@app.command()
+def wait(seconds: float, bar: bool = False, served: bool = False):
+    if served:
+        with terminal.hide_activity_line():
+            time.sleep(seconds)
+        return
+    if bar:
+        with progress_bar("counting") as tell:
+            for share in range(10):
+                time.sleep(seconds / 10)
+                tell(share / 10)
+        return
+    exec(compile("time.sleep(seconds)", "there", "exec"),
+         {"__name__": "crane.closure.there", "time": time, "seconds": seconds})
+    print("half a", end=" ", flush=True)
+    time.sleep(seconds)
+    print("line")
+
+sys.argv = ["crane", "wait", *sys.argv[1:]]
+entry.main()
+"""
+
+
+def on_terminal(*words, out=None, after="0.3"):
+    """What a command writes to a terminal, both streams unless the output goes elsewhere."""
+    ours, theirs = pty.openpty()
+    done = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, *words, after],
+        stdout=theirs if out is None else out,
+        stderr=theirs,
+        env=os.environ | {"TERM": "xterm"},
+    )
+    os.close(theirs)
+    told = b""
+    try:
+        while part := os.read(ours, 4096):
+            told += part
+    except OSError:  # its other end is closed
+        pass
+    finally:
+        os.close(ours)
+    assert done.wait() == 0
+    return told.decode()
+
+
+def left(told):
+    """What stands on the screen in the end: each line from its last erasure on."""
+    return [line.rsplit("\x1b[2K", 1)[-1] for line in told.replace("\r\n", "\n").split("\n")]
+
+
+def test_a_terminal_is_told_what_goes_on_and_the_line_goes():
+    told = on_terminal("0.8")
+    assert "crane wait: closing the loops, " in told
+    assert left(told) == ["half a line", ""]
+
+
+def test_output_into_a_file_stays_as_it_is(tmp_path):
+    with (tmp_path / "out").open("w") as out:
+        told = on_terminal("0.8", out=out)
+    assert "closing the loops" in told and left(told) == [""]
+    assert (tmp_path / "out").read_text() == "half a line\n"
+
+
+def test_what_is_quick_says_nothing():
+    assert on_terminal("0.01", after="60") == "half a line\r\n"
+
+
+def test_a_bar_stands_alone():
+    told = on_terminal("0.9", "--bar", after="0.1")
+    before, after = told.split("counting", 1)
+    assert "crane wait:" in before and "crane wait:" not in after
+    assert left(told)[-1] == ""
+
+
+def test_a_bar_is_only_for_what_takes_a_while():
+    assert "counting" not in on_terminal("0.01", "--bar")
+
+
+def test_what_waits_for_the_user_says_nothing():
+    told = on_terminal("0.8", "--served", after="0.6")
+    assert left(told) == [""] and told.count("crane wait:") == 0
+
+
+def test_pipes_hear_nothing():
+    words = [sys.executable, "-c", PROGRAM, "0.8", "0.3"]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("half a line\n", "")

@@ -5,7 +5,6 @@ import gc
 import math
 import subprocess
 import sys
-import threading
 from decimal import Decimal, localcontext
 
 import numpy as np
@@ -92,18 +91,6 @@ def test_operations_equal_those_of_numpy(name):
     np.testing.assert_allclose(found, wanted, rtol=1e-15, atol=1e-15)
 
 
-@pytest.mark.parametrize("name", ["sin", "cos", "tanh", "sqrt", "abs"])
-def test_functions_equal_those_of_numpy(name):
-    x = [0.0, 1e-300, 1e-8, 0.3, 1.0, 2.0, 25.0, 1e5]
-    if name != "sqrt":
-        x += [-value for value in x]
-    wanted = getattr(np, name)(np.array(x))
-    found = run(lambda x: [apply_function(name, value) for value in x], x)
-    np.testing.assert_allclose(found, wanted, rtol=4e-16, atol=1e-16)
-    folded = run(lambda y: [y[0], *(apply_function(name, value) for value in x)], [0.0])
-    np.testing.assert_allclose(folded[1:], wanted, rtol=4e-16, atol=1e-16)
-
-
 def test_signs_are_copied():
     x = [3.0, -2.0, 0.0, -0.0]
     found = run(lambda x: [copysign(m, s) for m in (*x, 5.0, -5.0, 2) for s in x], x)
@@ -172,7 +159,7 @@ def test_equal_operations_are_done_once():
 def test_constants_and_operations_of_the_same_number_differ():
     """Operation number 1 is not the constant 1."""
 
-    def formulas(x):
+    def formulas(x, largest=maximum, signed=copysign):
         return [
             value
             for k in range(len(x))
@@ -181,26 +168,14 @@ def test_constants_and_operations_of_the_same_number_differ():
                 (x[0] * float(k), x[0] * x[k]),
                 (float(k) - x[3], x[k] - x[3]),
                 (float(k) / x[3], x[k] / x[3]),
-                (maximum(x[0], float(k)), maximum(x[0], x[k])),
-                (copysign(float(k), x[1]), copysign(x[k], x[1])),
+                (largest(x[0], float(k)), largest(x[0], x[k])),
+                (signed(float(k), x[1]), signed(x[k], x[1])),
             )
             for value in pair
         ]
 
     x = [10.5, -20.5, 30.5, 40.5, 50.5]
-    wanted = [
-        value
-        for k in range(len(x))
-        for pair in (
-            (x[0] + k, x[0] + x[k]),
-            (x[0] * k, x[0] * x[k]),
-            (k - x[3], x[k] - x[3]),
-            (k / x[3], x[k] / x[3]),
-            (max(x[0], k), max(x[0], x[k])),
-            (-k, -abs(x[k])),
-        )
-        for value in pair
-    ]
+    wanted = formulas(x, max, math.copysign)
     np.testing.assert_allclose(run(formulas, x), wanted, rtol=1e-15)
     backwards = run(lambda x: formulas(x)[::-1], x)
     np.testing.assert_allclose(backwards, wanted[::-1], rtol=1e-15)
@@ -280,18 +255,6 @@ def test_functions_are_correct_to_one_and_a_half_units(name, count):
     rows = np.resize(x, (-(-len(x) // count), count))  # the first ones again at the end
     found = np.concatenate([function(row) for row in rows])[: len(x)]
     assert units_off(found, wanted) <= 1.5
-
-
-def test_the_reference_of_functions_is_right():
-    """Digits of tables: sin 1, cos 1, tanh 1."""
-    with localcontext(prec=110):
-        for name, digits in (
-            ("sin", "0.84147098480789650665250232163029899962256306079837"),
-            ("cos", "0.54030230586813971740093660744297660373231042061792"),
-            ("tanh", "0.76159415595576488811945828260479359041276859725793"),
-        ):
-            assert abs(EXACT[name](Decimal(1)) - Decimal(digits)) < Decimal("1e-49")
-        assert abs(sine(PI / 6) - Decimal("0.5")) < Decimal("1e-60")
 
 
 @pytest.mark.parametrize("name", ["sin", "cos"])
@@ -685,26 +648,3 @@ assert np.abs(second.inverse(home, rest, rest) - wanted).max() > 0.1
         [sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, timeout=300
     )
     assert done.returncode == 0, done.stderr
-
-
-def test_threads_call_at_once():
-    tape = Tape()
-    value = x = tape.load(0, 0)
-    for k in range(200):
-        value = apply_function("sin", value * 1.1 + k) + 0.5 * x
-    function = Function([value])
-    inputs = np.random.default_rng(0).normal(size=(4, 300))
-    alone = np.array([[function([x])[0] for x in row] for row in inputs])
-    together = np.zeros_like(alone)
-    start = threading.Barrier(4)
-
-    def work(i):
-        start.wait()
-        together[i] = [function([x])[0] for x in inputs[i]]
-
-    threads = [threading.Thread(target=work, args=(i,)) for i in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    np.testing.assert_array_equal(together, alone)

@@ -1,13 +1,13 @@
 """Machine code of a machine against the Pinocchio backend and the closure in numpy."""
 
 import copy
-import threading
 import warnings
 from pathlib import Path
 
 import numpy as np
 import oracles
 import pytest
+from warned import quiet
 
 import crane
 import crane.codegen.program
@@ -356,25 +356,6 @@ def test_guesses_with_opposed_axes_are_refused(tmp_path):
     assert np.abs(closure.solve(machine.home[closure.active]) - machine.home).max() < 1e-12
 
 
-def test_threads_close_loops_at_once(mini):
-    q_a = draw(mini, 400, 11)["q"].reshape(4, 100, 3)
-    alone = np.array([mini.closure.solve(rows) for rows in q_a])
-    together = np.zeros_like(alone)
-    start = threading.Barrier(4)
-
-    def work(i):
-        start.wait()
-        for _ in range(5):
-            together[i] = mini.closure.solve(q_a[i])
-
-    threads = [threading.Thread(target=work, args=(i,)) for i in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert np.abs(together - alone).max() < 1e-12
-
-
 # --- arguments -------------------------------------------------------------------------------
 
 
@@ -518,9 +499,7 @@ def test_answers_do_not_depend_on_history(mini, machines):
 
 def test_long_formulas_are_left_to_pinocchio(mini, monkeypatch):
     samples = draw(mini, 5, 10)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        again = crane.load("mini_forwarder")  # with nothing compiled yet
+    again = quiet(crane.load, "mini_forwarder")  # with nothing compiled yet
     quick = crane.Dynamics(mini)
     wanted = {quantity: ask(quick, quantity, samples) for quantity in QUANTITIES}
     monkeypatch.setattr(crane.codegen.program, "MAX_OPERATIONS", 10)

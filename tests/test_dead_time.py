@@ -95,16 +95,6 @@ def test_a_cylinder_with_dead_time_beside_scipy(tmp_path):
     )  # fmt: skip
 
 
-def test_two_spools_of_different_dead_time(tmp_path):
-    machine = rig(tmp_path, ORIFICE | QUICK | {"delay": LATE, "spool_b": {"delay": 0.05}})
-    run = crane.simulate(
-        machine, ValveSignals(machine, [0.1, 0.2], {"x": [0.0, 0.5]}), duration=0.3
-    )
-    for name, late in (("spool_x", LATE), ("spool_x_b", 0.05)):
-        wanted = 5.0 * (ramp(run.time - 0.1 - late) - ramp(run.time - 0.2 - late))
-        np.testing.assert_allclose(run.channels[name], wanted, atol=1e-7)
-
-
 def test_a_law_is_asked_each_millisecond_and_held(tmp_path):
     """PD over dead time is the program that a control unit runs, written out."""
     machine = rig(tmp_path, ORIFICE | QUICK | {"delay": LATE}, control=GAINS)

@@ -183,16 +183,3 @@ def test_the_tip_is_at_the_end_of_chain_a(mini, postures):
         np.testing.assert_allclose(
             data.oMf[mini.frame("link7_tip")].translation, tip[:3], rtol=0, atol=1e-12
         )
-
-
-@pytest.mark.parametrize(("name", "literal"), [("link3", 2), ("link7", 3)])
-def test_the_index_of_chain_a_counts_links(mini, postures, name, literal):
-    """With A_2^0 the product of two rows, CM3 would not turn with the boom, nor CM7 with q3."""
-    _, last, centre = BODIES[name]
-    off = [
-        np.linalg.norm(
-            (product("A", literal, q) @ [*centre(q), 1])[:3] - body(mini, data, name)[1]
-        )
-        for q, data in postures
-    ]
-    assert last != literal and max(off) > 0.05

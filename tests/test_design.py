@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from command_line import typed
+from urdf_text import body, joint, write
 
 import crane
 from crane.formats.machine_loading import MachineVariants
@@ -16,15 +17,6 @@ from crane.studies.optimization.variant_measures import MeasureOptions, VariantE
 
 pytestmark = pytest.mark.slow
 
-FOUR_BAR = """<robot name="four_bar">
-<link name="ground"/>{links}
-{joints}
-</robot>"""
-LINK = """
-<link name="{}"><inertial><mass value="1"/><inertia ixx="0.1" iyy="0.1" izz="0.1"
-  ixy="0" ixz="0" iyz="0"/></inertial></link>"""
-JOINT = """<joint name="{}" type="{}"><origin xyz="{} 0 0"/><parent link="{}"/><child link="{}"/>
-  <axis xyz="0 0 1"/><limit lower="-7" upper="7" effort="1" velocity="1"/></joint>"""
 FILE = """
 name: four_bar
 source: a test
@@ -68,21 +60,21 @@ def timing(machine):
 '''
 
 
+def bar(name):
+    return body(name, 1, moments=(0.1, 0.1, 0.1))
+
+
 @pytest.fixture
 def four_bar(tmp_path):
-    links = "".join(LINK.format(x) for x in ("crank", "coupler", "rocker"))
-    links += '<link name="coupler_end"/><link name="rocker_end"/>'
-    joints = "".join(
-        JOINT.format(*x)
-        for x in (
-            ("crank", "continuous", 0, "ground", "crank"),
-            ("coupler", "continuous", 0.35, "crank", "coupler"),
-            ("rocker", "continuous", 1.0, "ground", "rocker"),
-            ("coupler_end", "fixed", 0.9, "coupler", "coupler_end"),
-            ("rocker_end", "fixed", 0.85, "rocker", "rocker_end"),
-        )
-    )
-    (tmp_path / "four_bar.urdf").write_text(FOUR_BAR.format(links=links, joints=joints))
+    write(
+        tmp_path, "four_bar", "ground", *(bar(x) for x in ("crank", "coupler", "rocker")),
+        '<link name="coupler_end"/><link name="rocker_end"/>',
+        joint("crank", "ground", "crank", limits=(-7, 7)),
+        joint("coupler", "crank", "coupler", (0.35, 0, 0), limits=(-7, 7)),
+        joint("rocker", "ground", "rocker", (1, 0, 0), limits=(-7, 7)),
+        joint("coupler_end", "coupler", "coupler_end", (0.9, 0, 0), "fixed"),
+        joint("rocker_end", "rocker", "rocker_end", (0.85, 0, 0), "fixed"),
+    )  # fmt: skip
     (tmp_path / "four_bar.yaml").write_text(FILE)
     (tmp_path / "measures.py").write_text(MEASURES)
     return tmp_path / "four_bar.yaml"
@@ -274,24 +266,14 @@ def test_loads_before_and_after_are_drawn(tmp_path):
         assert (tmp_path / "out" / name).read_bytes()[:4] == b"\x89PNG"
 
 
-def test_slopes_of_a_chart_are_written(tmp_path):
-    chart = crane.capacity(crane.load("excavator"), "bucket", radii=[5.0, 6.0], heights=[1.0])
-    chart.derivatives_to_csv(tmp_path / "slopes.csv", ["arm.mass"])
-    lines = [x for x in (tmp_path / "slopes.csv").read_text().splitlines() if x[0] != "#"]
-    assert lines[0].endswith("load [kg],load_by_arm.mass [kg/SI]") and len(lines) == 5
-    wanted = chart.derivatives(["arm.mass"])[0, 0, :, 0]
-    assert [float(x.split(",")[-1]) for x in lines[1:3]] == pytest.approx(wanted)
-
-
 @pytest.fixture
 def pendulum(tmp_path):
     """Two links that hang on each other: without loops a variant is made in little time."""
-    links = "".join(LINK.format(x) for x in ("upper", "lower"))
-    joints = [("a", "continuous", 0, "ground", "upper"), ("b", "continuous", 1, "upper", "lower")]
-    text = FOUR_BAR.format(links=links, joints="".join(JOINT.format(*x) for x in joints))
-    path = tmp_path / "pendulum.urdf"
-    path.write_text(text)
-    return path
+    return write(
+        tmp_path, "pendulum", "ground", bar("upper"), bar("lower"),
+        joint("a", "ground", "upper", limits=(-7, 7)),
+        joint("b", "upper", "lower", (1, 0, 0), limits=(-7, 7)),
+    )  # fmt: skip
 
 
 def test_a_wall_does_not_take_what_was_found(pendulum):

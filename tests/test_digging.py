@@ -12,11 +12,6 @@ PUMP, TANK = 3.5e7, 3.0e5  # of the excavator [Pa]
 LIP = "bucket_lip"
 
 
-@pytest.fixture(scope="module")
-def excavator():
-    return crane.load("excavator")
-
-
 def limit(machine, working, joint, slope):
     """What a cylinder exerts at most against what asks for more with this sign."""
     cylinder = machine.hydraulics.cylinders[joint]

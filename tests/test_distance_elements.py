@@ -8,27 +8,25 @@ import numpy as np
 import oracles
 import pinocchio as pin
 import pytest
-from broken_machines import MACHINE, MINI, assert_refused, case, copy_machine, swap
+from broken_machines import MACHINE, assert_refused, case, copy_machine, swap
 from command_line import typed
 from test_compiled import off
+from urdf_text import body, joint
+from warned import quiet
 
 import crane
 from crane.closure.kinematics_formulas import FormulaConstants, PositionKinematics
 from crane.closure.loop_formulas import LoopFormulas
-from crane.codegen import Program, Tape
-from crane.codegen.differentiation import differentiate
 from crane.common.errors import CraneWarning, InputError
 from crane.description import ForceElement, Rope
 from crane.dynamics.compiled_dynamics import QUANTITIES, STICK_SLIP_QUANTITIES
 from crane.dynamics.dynamics_formulas import DynamicsFormulas
 from crane.identification.mechanics.base_parameters import random_samples
-from crane.identification.mechanics.identification_model import IdentificationModel, default_terms
-from crane.identification.mechanics.identify import identify
+from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.model_terms import (
     GasSpringTerm,
     InertialTerm,
 )
-from crane.identification.signals.signal_processing import Motion
 
 BOOM, STRUT = ("base", "link7"), ("link3_H", "A1_rod")  # of the mini forwarder
 
@@ -262,37 +260,6 @@ def test_the_balance_of_energies(mini):
     np.testing.assert_array_equal(batch.q[0], alone.q)
 
 
-def test_the_jacobian_over_velocities_is_that_of_differences(mini):
-    """As the Rosenbrock method takes it: of gamma^T f by v_A, by formulas."""
-    dynamics = crane.Dynamics(clad(bare(mini), 3))
-    closure, n = mini.closure, 3
-    tape = Tape()
-    q, posture, loops = closure.compiled_closure.trace_kinematics(tape, 0, 2)
-    constants, v_a = (
-        FormulaConstants(tape, 1, dynamics.formula_constants),
-        tape.load_vector(3, 0, n),
-    )
-    sweep = DynamicsFormulas(posture, loops, constants, q, v_a, dynamics.formula_structure)
-    rows = differentiate(sweep.passive_force, v_a)
-    program = Program()
-    program.add_formula("f", 4, [entry for row in rows for entry in row])
-    program.compile()
-    at, v = closure.solve(np.array([0.3, 0.012, 0.02])), np.array([0.4, 0.1, -0.2])
-    found = np.zeros(n * n)
-    program.call(
-        "f", closure.compiled_closure.geometry.constants, dynamics.formula_constants, at, v, found
-    )
-    wanted = [
-        oracles.derivative(
-            lambda t, e=e: dynamics.evaluate_closed("passive", at, v + t * e, v), 1e-2
-        )
-        for e in np.eye(n)
-    ]
-    size = np.abs(wanted).max()
-    assert size > 1e-3
-    np.testing.assert_allclose(found.reshape(n, n), np.transpose(wanted), atol=1e-10 * size)
-
-
 # --- closed forms ----------------------------------------------------------------------------
 
 LIFT = """<robot name="lift"><link name="ground"/>
@@ -456,12 +423,9 @@ def test_machine_files_hold_them(tmp_path):
 
 def test_locks_take_what_they_put_on_one_body(tmp_path):
     path = tmp_path / "arm.yaml"
-    (tmp_path / "lift.urdf").write_text(LIFT.replace("</robot>", "") + (
-        '<joint name="x" type="prismatic"><parent link="ball"/><child link="tool"/>'
-        '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint><link name="tool"><inertial>'
-        '<mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
-        "</link></robot>"
-    ))  # fmt: skip
+    slide = joint("x", "ball", "tool", kind="prismatic", axis=(1, 0, 0), limits=(-1, 1))
+    more = f"{slide}{body('tool', 1)}</robot>"
+    (tmp_path / "lift.urdf").write_text(LIFT.replace("</robot>", more))
     path.write_text(
         "name: arm\nchains: [{name: arm, urdf: lift.urdf}]\nactive: [z, x]\nropes:\n"
         "  - {between: [eye, ball], length: 1, stiffness: 9}\n"
@@ -473,55 +437,39 @@ def test_locks_take_what_they_put_on_one_body(tmp_path):
 
 REFUSED = [
     case(
-        f"element with {name}",
         f"four_bar.yaml:24: {line}",
         swap("{joint: rocker, stiffness: 2, rest: 1.5, damping: 0.1}", f"{{{item}}}"),
     )
-    for name, item, line in (
-        (
-            "unknown frame",
-            "between: [ground, coupler_arn], stiffness: 2",
+    for item, line in (
+        ("between: [ground, coupler_arn], stiffness: 2",
             "the frame 'coupler_arn' is unknown, did you mean 'coupler_arm'?",
         ),
-        (
-            "frames of one body",
-            "between: [ground, pin_B], stiffness: 2",
+        ("between: [ground, pin_B], stiffness: 2",
             "'ground' and 'pin_B' are both on the body 'ground', choose frames of two bodies",
         ),
-        (
-            "one frame",
-            "between: [ground], stiffness: 2",
+        ("between: [ground], stiffness: 2",
             "the force element between 'ground' is between two frames, name two",
         ),
-        (
-            "negative stiffness",
-            "between: [ground, crank_arm], stiffness: -2",
+        ("between: [ground, crank_arm], stiffness: -2",
             "'stiffness' of the force element between 'ground' and 'crank_arm' is -2, give at "
             "least 0",
         ),
-        (
-            "a joint and frames",
-            "joint: rocker, between: [ground, coupler_arm], stiffness: 2",
+        ("joint: rocker, between: [ground, coupler_arm], stiffness: 2",
             "an element is on a joint or between frames, keep one of the two",
         ),
-        (
-            "nothing to do",
-            "between: [ground, coupler_arm]",
+        ("between: [ground, coupler_arm]",
             "the force element between 'ground' and 'coupler_arm' does nothing, give stiffness, "
             "damping or force",
         ),
     )
 ] + [
     case(
-        f"rope with {name}",
         f"four_bar.yaml:27: {line}",
         swap("end_stops:", f"ropes:\n  - {{{item}}}\nend_stops:"),
     )
-    for name, item, line in (
-        ("no frames", "length: 2, stiffness: 3", "a rope has no 'between', add it"),
-        (
-            "no length",
-            "between: [pin_B, coupler_pin], length: 0, stiffness: 3",
+    for item, line in (
+        ("length: 2, stiffness: 3", "a rope has no 'between', add it"),
+        ("between: [pin_B, coupler_pin], length: 0, stiffness: 3",
             "'length' of the rope between 'pin_B' and 'coupler_pin' is 0, give one",
         ),
     )
@@ -556,20 +504,6 @@ def test_wrong_elements_are_told_in_a_line(mini, call, line):
         call(mini)
 
 
-def test_the_command_line_tells_them(tmp_path):
-    path = given(tmp_path)
-    told = typed("info", path).stdout.splitlines()
-    found = [line.split(",")[0] for line in told if line.startswith("  between")]
-    assert found == [
-        "  between     ground and coupler_arm: force element",
-        "  between     pin_B and crank_arm: gas spring",
-        "  between     coupler_pin and pin_B: rope",
-    ]
-    assert "3 elements between frames" in typed("check", path).stdout
-    path.write_text(path.read_text().replace("force: -1", "force: -1, joint: rocker"))
-    assert typed("info", path).stderr.count("\n") == 1
-
-
 def test_meeting_frames_of_a_file_are_told_with_the_section(tmp_path):
     path = given(tmp_path)
     path.write_text(path.read_text().replace("[ground, coupler_arm]", "[rocker_pin, coupler_pin]"))
@@ -596,35 +530,6 @@ def test_columns_of_identification(mini):
     assert scaled.names[-1] == "strut.gas_scale"
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::crane.CraneWarning")
-def test_identified_machines_keep_them(tmp_path):
-    """Elements of locked joints, whose frames belong to one body, are kept as well."""
-    path = copy_machine(MINI, tmp_path)
-    path.write_text(
-        path.read_text()
-        + "\nropes:\n  - {between: [A2_barrel, A2_rod], length: 0.05, stiffness: 300}\n"
-        "forces:\n  - {between: [base, link7], stiffness: 30, rest: 0.2, damping: 2}\n"
-        "gas_springs:\n  strut: {between: [link3_H, A1_rod], area: 2e-5, pressure: 3e5, "
-        "volume: 2e-5, rest: 0.1}\n"
-    )
-    machine, locked = crane.load(path), crane.load(path, lock={"X2": 0.012})
-    assert machine.ropes and not locked.ropes and len(locked.force_elements) == 2
-    time = np.arange(0, 8, 4e-3)[:, None]
-    place, turn = np.array([0.3, 0.015]), np.array([1.0, 0.012])
-    q, v, a = place + turn * np.sin(time), turn * np.cos(time), -turn * np.sin(time)
-    tau = crane.Dynamics(locked).inverse(q, v, a, friction=True)
-    tau += np.random.default_rng(0).normal(size=tau.shape) * np.ptp(tau, axis=0) * 1e-3
-    terms = [*default_terms(locked), GasSpringTerm(locked, "strut")]
-    result = identify(locked, Motion(time[:, 0], q, v, a, tau), terms=terms, feasible=True)
-    scale = result.parameters[result.model.names.index("strut.gas_scale")]
-    written = crane.load(crane.identification.write_identified(result, tmp_path / "out"))
-    assert written.ropes == machine.ropes and written.forces == machine.forces
-    (gas,) = written.gas_springs
-    assert gas.pressure == pytest.approx(3e5 * scale) and gas.between == STRUT
-    assert 0.1 < scale < 10 and scale != 1.0
-
-
 def test_what_mjcf_has_no_place_for_is_told(tmp_path, mini):
     pytest.importorskip("mujoco")
     machine = bare(mini).replace(
@@ -641,31 +546,10 @@ def test_what_mjcf_has_no_place_for_is_told(tmp_path, mini):
     names = "between 'link3_H' and 'A1_rod'"
     assert line.count(f"the constant force of the force element {names}") == 2
     assert f"the damping of the rope {names}" in line
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        again = crane.load(tmp_path / "mini.xml")
+    again = quiet(crane.load, tmp_path / "mini.xml")
     first, second = (x for x in again.forces if x.between)
     assert first.between == BOOM and first.rest == pytest.approx(0.3)  # 30 (l - 0.3)
     assert (second.stiffness, second.rest) == (30.0, 0.0)
     assert again.ropes == (Rope(STRUT, 0.1, 90.0),)
     with pytest.warns(CraneWarning, match=r"springs and forces, ropes"):
         crane.formats.write_urdf_plus(machine, tmp_path / "mini.urdf")
-
-
-def test_operations_of_machines_without_elements_read_none():
-    """Behind those of joints, 10, 22 and 1 each: gravity, whether it moves, what stands, tip."""
-    machine = crane.load("mini_forwarder")
-    dynamics = crane.Dynamics(machine)
-    assert (
-        len(dynamics.formula_constants) == 33 * machine.model.nv + 4 + 7
-        and dynamics.formula_structure.distance_bodies == ()
-    )
-    sizes = [
-        len(crane.Dynamics(machine.replace(ropes=ropes)).formula_constants)
-        for ropes in (
-            (),
-            (Rope(BOOM, 1, 1),),
-            (Rope(BOOM, 1, 1),) * 2,
-        )
-    ]
-    assert [two - one for one, two in pairwise(sizes)] == [28, 28]

@@ -1,19 +1,17 @@
 """Equations of motion against Lagrange's on paper, Pinocchio's constraint solver, and balances."""
 
 import dataclasses
-import warnings
 
 import numpy as np
 import oracles
 import pinocchio as pin
 import pytest
 import scipy.integrate
-from hypothesis import given
-from hypothesis import strategies as st
 from lxml import etree
+from warned import quiet
 
 import crane
-from crane.common.errors import CraneWarning, InputError
+from crane.common.errors import InputError
 
 CRANK = oracles.SliderCrank()
 STROKE = 0.030  # [m]
@@ -265,19 +263,6 @@ def test_parameters_are_the_published_masses(dynamics, bare):
     assert link3[9] == pytest.approx(0.419e-3 + 0.2180 * (0.11**2 + 0.0109**2), rel=1e-12)
 
 
-def test_mass_matrix_is_projected_newton_euler(dynamics, bare):
-    q_a, v_a, _, _ = states(50, seed=9)
-    mass = dynamics.mass_matrix(q_a)
-    assert np.abs(mass - mass.transpose(0, 2, 1)).max() < 1e-13
-    assert np.linalg.eigvalsh(mass).min() > 1e-3
-    for q, found in zip(bare.closure.solve(q_a), mass, strict=True):
-        gamma = bare.closure.gamma(q)
-        assert relative(found, gamma.T @ tree_mass(bare.model, q) @ gamma) < 1e-12
-    kinetic, _ = dynamics.energy(q_a, v_a)
-    by_mass = np.einsum("ni,nij,nj->n", v_a, mass, v_a) / 2
-    assert np.abs(kinetic / by_mass - 1).max() < 1e-12
-
-
 @pytest.mark.parametrize("name", ["mini", "stewart", "slider_crank", "five_bar"])
 def test_tree_is_assembled_depth_first(name, request):
     """Joints have Pinocchio's order, without which its crba is silently wrong."""
@@ -342,31 +327,6 @@ def test_energy_equals_the_sum_over_bodies(name, request):
         assert found[1] == pytest.approx(potential, rel=1e-12)
 
 
-def test_gravity_is_the_derivative_of_potential_energy(dynamics):
-    q_a, _, _, _ = states(40, seed=12)
-    gravity = dynamics.gravity(q_a)
-    for sample, force in zip(q_a, gravity, strict=True):
-        slope = [
-            oracles.derivative(lambda t: dynamics.energy(sample + t * axis, 0 * axis)[1], 1e-4)  # noqa: B023
-            for axis in np.eye(3)
-        ]
-        assert np.abs(slope - force).max() < 1e-9 * np.abs(force).max()
-
-
-def test_bias_comes_from_the_derivatives_of_the_mass_matrix(dynamics):
-    """Lagrange: bias = M' v - grad(v' M v) / 2 + gravity."""
-    q_a, v_a, _, _ = states(40, seed=13)
-    for q, v in zip(q_a, v_a, strict=True):
-        slopes = [
-            oracles.derivative(lambda t: dynamics.mass_matrix(q + t * axis), step)  # noqa: B023
-            for axis, step in zip(np.eye(3), (0.1, 1e-4, 1e-4), strict=True)
-        ]
-        rate = sum(slope * speed for slope, speed in zip(slopes, v, strict=True))
-        exact = rate @ v - np.array([v @ slope @ v for slope in slopes]) / 2
-        found = dynamics.bias(q, v) - dynamics.gravity(q)
-        assert np.abs(found - exact).max() < 1e-8 * np.abs(exact).max()
-
-
 def test_power_of_the_drives_is_the_rate_of_energy_plus_dissipation(loaded):
     dynamics = crane.Dynamics(loaded)
     q_a, v_a, _, tau = states(40, seed=14)
@@ -388,20 +348,6 @@ def test_power_of_the_drives_is_the_rate_of_energy_plus_dissipation(loaded):
         by_hand += 30.0 * speed[loaded.column("X1")] ** 2
         assert lost == pytest.approx(by_hand, rel=1e-12)
         assert force @ v == pytest.approx(rate + lost, abs=1e-8 * (abs(rate) + abs(lost)))
-
-
-@given(st.floats(-3.1, 3.1), st.floats(0, STROKE), st.floats(0, STROKE), st.floats(-2, 2))
-def test_any_state(dynamics, q1, x1, x2, speed):
-    q_a, v_a = np.array([q1, x1, x2]), speed * np.array([0.5, 0.02, -0.01])
-    kinetic, potential = dynamics.energy(q_a, v_a)
-    assert kinetic >= 0 and potential == pytest.approx(
-        oracles.mini_forwarder_potential(np.array([x1]), np.array([x2]))[0], abs=1e-12
-    )
-    tau = np.array([0.1, -20.0, 15.0])
-    a_a = dynamics.forward(q_a, v_a, tau)
-    assert relative(dynamics.inverse(q_a, v_a, a_a), tau) < 1e-11
-    # turned over in time: the same force makes the same acceleration
-    assert relative(dynamics.forward(q_a, -v_a, tau), a_a) < 1e-12
 
 
 # --- friction --------------------------------------------------------------------------------
@@ -538,17 +484,6 @@ def test_gas_follows_its_law_and_stores_its_work(bare, exponent, backend):
         assert gap == pytest.approx(stored(q_a), abs=1e-11)
 
 
-def test_dampers_take_power_out(bare):
-    damper = crane.description.ForceElement("q9", damping=0.7)
-    dynamics = crane.Dynamics(bare.replace(forces=(damper,)))
-    q_a, v_a, _, _ = states(10, seed=17)
-    slope = oracles.mini_forwarder_gamma(*q_a.T[1:])["q9"][:, 0]
-    force = dynamics.passive(q_a, v_a)
-    assert force[:, 1] == pytest.approx(-0.7 * slope**2 * v_a[:, 1], rel=1e-12)
-    assert np.abs(force[:, [0, 2]]).max() < 1e-12
-    assert np.all(dynamics.passive(q_a, 0 * v_a) == 0)
-
-
 def test_end_stops_push_back_and_never_pull(bare):
     dynamics = crane.Dynamics(bare.replace(end_stops=STOPS))
 
@@ -592,9 +527,7 @@ def test_payload_equals_a_link_with_that_mass(mini, tmp_path):
     text = mini.path.read_text().replace("urdf: urdf", f"urdf: {folder}/urdf")
     text = text.replace(f"{folder}/urdf/mini_forwarder/chain_a.urdf", "chain_a.urdf")
     (tmp_path / "heavy.yaml").write_text(text)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        written = crane.load(tmp_path / "heavy.yaml")
+    written = quiet(crane.load, tmp_path / "heavy.yaml")
     carried = mini.with_payload(PAYLOAD)
     q_a, v_a, a_a, _ = states(50, seed=18)
     for machine in (mini, carried):
@@ -604,23 +537,6 @@ def test_payload_equals_a_link_with_that_mass(mini, tmp_path):
     a, b = crane.Dynamics(carried), crane.Dynamics(written)
     assert a.parameters == pytest.approx(b.parameters, rel=1e-12, abs=1e-18)
     assert relative(a.mass_matrix(q_a), b.mass_matrix(q_a)) < 1e-12
-
-
-def test_payload_hangs_on_the_tip_by_its_weight(bare):
-    """Without moment of inertia, at rest: J' m g, J of its COM by differences."""
-    payload = crane.Payload("link6_K", 0.4, com=(0.02, 0.01, 0.0))
-    q_a = np.array([0.4, 0.012, 0.02])
-    rest = np.zeros(3)
-    added = crane.Dynamics(bare.with_payload(payload)).inverse(q_a, rest, rest)
-    added -= crane.Dynamics(bare).inverse(q_a, rest, rest)
-    data = bare.model.createData()
-
-    def height(q_a):
-        pin.framesForwardKinematics(bare.model, data, bare.closure.solve(q_a))
-        return data.oMf[bare.frame("link6_K")].act(np.array(payload.com))[2]
-
-    slope = [oracles.derivative(lambda t: height(q_a + t * axis), 1e-4) for axis in np.eye(3)]  # noqa: B023
-    assert np.abs(added - 0.4 * oracles.GRAVITY * np.array(slope)).max() < 1e-9
 
 
 def test_payloads_add_up_and_leave_the_machine_alone(mini):
@@ -636,29 +552,6 @@ def test_payloads_add_up_and_leave_the_machine_alone(mini):
 
 
 # --- stacks, errors, open chains -------------------------------------------------------------
-
-
-def test_stacks_equal_single_samples(loaded):
-    dynamics = crane.Dynamics(loaded)
-    q_a, v_a, a_a, tau = states(5, seed=19)
-    calls = {
-        "inverse": (q_a, v_a, a_a), "forward": (q_a, v_a, tau), "mass_matrix": (q_a,),
-        "bias": (q_a, v_a), "gravity": (q_a,), "friction": (q_a, v_a), "passive": (q_a, v_a),
-        "energy": (q_a, v_a), "regressor": (q_a, v_a, a_a),
-    }  # fmt: skip
-    shapes = {"mass_matrix": (3, 3), "energy": (), "regressor": (3, 110)}
-    for name, arguments in calls.items():
-        method = getattr(dynamics, name)
-        stack = method(*arguments)
-        alone = [method(*sample) for sample in zip(*arguments, strict=True)]
-        if name == "energy":
-            stack, alone = stack[1], [both[1] for both in alone]
-        assert np.shape(stack) == (5, *shapes.get(name, (3,))), name
-        assert np.shape(alone[0]) == shapes.get(name, (3,)), name
-        assert np.abs(stack - alone).max() <= 1e-11 * np.abs(stack).max(), name
-        assert len(method(*(argument[:1] for argument in arguments))) == (
-            2 if name == "energy" else 1
-        )
 
 
 def test_bad_arguments(mini, dynamics):
@@ -697,112 +590,6 @@ def test_open_arms_equal_pinocchio(name):
 
 
 # --- MuJoCo ----------------------------------------------------------------------------------
-
-
-def mjcf(machine, step):
-    """The machine in MuJoCo's words: its tree of bodies, its loops as stiff connections."""
-    model = machine.model
-    worldbody = etree.Element("worldbody")
-    body_of = [worldbody]
-
-    def numbers(values):
-        return " ".join(repr(float(value)) for value in np.ravel(values))
-
-    def pose(placement):
-        x, y, z, w = pin.Quaternion(placement.rotation).coeffs()
-        return {"pos": numbers(placement.translation), "quat": numbers([w, x, y, z])}
-
-    for i in range(1, model.njoints):
-        name, inertia = model.names[i], model.inertias[i]
-        parent = body_of[model.parents[i]]
-        body = etree.SubElement(
-            parent, "body", name=f"body_{name}", **pose(model.jointPlacements[i])
-        )
-        body_of.append(body)
-        joint, kind = model.joints[i], machine.unit(name)
-        memory = joint.createData()
-        joint.calc(memory, np.zeros(1))
-        axis = memory.S[:3] if kind == "m" else memory.S[3:]
-        extra = {}
-        for element in machine.forces:
-            if element.joint == name:
-                keys = {"stiffness": "stiffness", "springref": "rest", "damping": "damping"}
-                extra = {key: numbers(getattr(element, value)) for key, value in keys.items()}
-        etree.SubElement(
-            body, "joint", name=name, type="slide" if kind == "m" else "hinge",
-            axis=numbers(axis), **extra,
-        )  # fmt: skip
-        t = inertia.inertia
-        etree.SubElement(
-            body, "inertial", mass=numbers(inertia.mass), pos=numbers(inertia.lever),
-            fullinertia=numbers([t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2]]),
-        )  # fmt: skip
-    equality = etree.Element("equality")
-    sites = {end for loop in machine.closure.equations.loops for end in
-             (loop.predecessor, loop.successor)} | {machine.tip}  # fmt: skip
-    for site in sites:
-        frame = model.frames[machine.frame(site)]
-        etree.SubElement(body_of[frame.parentJoint], "site", name=site, **pose(frame.placement))
-    for loop in machine.closure.equations.loops:
-        etree.SubElement(
-            equality, "connect", site1=loop.predecessor, site2=loop.successor,
-            solref=numbers([2 * step, 1.0]), solimp="0.9999 0.9999 0.001",
-        )  # fmt: skip
-    root = etree.Element("mujoco")
-    etree.SubElement(root, "compiler", angle="radian")
-    option = etree.SubElement(
-        root, "option", gravity="0 0 -9.81", integrator="RK4", timestep=numbers(step),
-        tolerance="1e-14",
-    )  # fmt: skip
-    etree.SubElement(option, "flag", contact="disable")
-    root.extend([worldbody, equality])
-    return etree.tostring(root).decode()
-
-
-@pytest.mark.slow
-def test_motion_equals_mujoco(mini):
-    """The crane swings in springs and dampers at its actuators; MuJoCo's loops are soft."""
-    mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (extra 'mjcf')")
-    model = pin.Model(mini.model)
-    for body in range(1, model.njoints):  # MuJoCo refuses the zero moments of slender bodies
-        inertia = model.inertias[body]
-        tensor = inertia.inertia + 1e-7 * np.eye(3)
-        model.inertias[body] = pin.Inertia(inertia.mass, inertia.lever, tensor)
-    middle = np.array([0.0, 0.015, 0.015])
-    weight = crane.Dynamics(mini).gravity(middle)
-    springs = tuple(
-        crane.description.ForceElement(joint, stiffness=k, rest=float(m + w / k), damping=c)
-        for joint, k, c, m, w in zip(
-            mini.active, (0.3, 2000.0, 4000.0), (0.02, 20.0, 20.0), middle, weight, strict=True
-        )
-    )
-    machine = dataclasses.replace(
-        mini, model=model, friction={}, forces=springs, end_stops=(), control={}
-    )
-    q_a, v_a = np.array([0.3, 0.018, 0.012]), np.array([1.0, 0.05, -0.05])
-    duration, step = 1.0, 1e-4
-    recording = crane.simulate(machine, initial=(q_a, v_a), duration=duration, step=1e-3)
-    ours = np.column_stack([recording.channels[f"tip_{axis}"] for axis in "xyz"])
-    assert np.ptp(ours, axis=0).min() > 0.02  # it does move
-
-    simulator = mujoco.MjModel.from_xml_string(mjcf(machine, step))
-    data = mujoco.MjData(simulator)
-    q = machine.closure.solve(q_a)
-    v = machine.closure.gamma(q) @ v_a
-    for joint in machine.joints:
-        address = simulator.joint(joint).qposadr[0], simulator.joint(joint).dofadr[0]
-        data.qpos[address[0]] = q[machine.column(joint)]
-        data.qvel[address[1]] = v[machine.column(joint)]
-    worst = 0.0
-    for i in range(round(duration / step) + 1):
-        if i:
-            mujoco.mj_step(simulator, data)
-        if i % 100 == 0:
-            mujoco.mj_kinematics(simulator, data)
-            gap = data.site(machine.tip).xpos - ours[i // 10]
-            worst = max(worst, np.abs(gap).max())
-    print(f"largest distance of the tips within {duration} s: {worst:.3g} m")
-    assert worst < 1e-5  # the connections give way by micrometres
 
 
 @pytest.mark.parametrize("backend", ["compiled", "pinocchio"])

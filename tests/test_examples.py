@@ -24,6 +24,7 @@ NEEDS = {
     "live_view.py": "viser", "optimal_control.py": "casadi",
     "study_on_a_cluster.py": "distributed",
 }  # fmt: skip
+SHORT = "close_a_loop.py", "first_machine.py", "load_urdf.py"
 
 
 def test_the_index_has_every_program_with_its_question():
@@ -34,7 +35,10 @@ def test_the_index_has_every_program_with_its_question():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("program", sorted(INDEX))
+@pytest.mark.parametrize(
+    "program",
+    [pytest.param(x, marks=() if x in SHORT else pytest.mark.long) for x in sorted(INDEX)],
+)
 def test_programs_print_what_the_index_says(program, tmp_path):
     needed = NEEDS.get(program)
     if needed and not find_spec(needed):

@@ -42,14 +42,6 @@ def test_velocity_and_acceleration_are_derivatives(series):
     assert np.abs((late[1] - early[1]) / (2 * step) - a)[inside].max() < 1e-5
 
 
-def test_velocity_amplitudes_are_the_coefficients(series):
-    """v = sum a cos + b sin, so its Fourier transform gives a - i b back."""
-    time = series.lead + series.period * np.arange(64) / 64
-    spectrum = np.fft.rfft(series(time)[1], axis=0)[1:5] / 32
-    a, b = series.coefficients[1:5], series.coefficients[5:]
-    assert np.abs(spectrum - (a - 1j * b)).max() < 1e-12
-
-
 def test_it_is_periodic_between_rests(series):
     time = series.lead + np.linspace(0, 2 * series.period, 301)
     for now, later in zip(series(time), series(time + series.period), strict=True):

@@ -1,11 +1,10 @@
 """Valve signals for calibration: limits are kept, and the information that they carry."""
 
-import warnings
-
 import numpy as np
 import pytest
 from command_line import typed
 from hydraulic_rig import COMPENSATED, ORIFICE, rig
+from warned import quiet
 
 import crane
 from crane.common.errors import CraneError
@@ -282,9 +281,7 @@ def test_the_command_writes_signals_that_can_be_played(machine, tmp_path):
         "simulate", machine.path, "--inputs", out / "signals.csv", "--out", tmp_path / "run"
     )
     assert played.returncode == 0, played.stderr
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        _, comparison = crane.replay(machine, out / "signals.csv", 0.01)
+    _, comparison = quiet(crane.replay, machine, out / "signals.csv", 0.01)
     assert {channel.name: channel.relative_rms < 1e-3 for channel in comparison.channels} == {
         "x": True, "pressure_x_a": True, "pressure_x_b": True
     }  # fmt: skip

@@ -1,14 +1,13 @@
 """Parallel robots exported by others: they close, hold and fall unchanged."""
 
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import typed
+from warned import quiet
 
 import crane
-from crane.common.errors import CraneWarning
 from crane.control import make_controller
 from crane.motion.trajectory import point_to_point
 
@@ -31,9 +30,7 @@ pytestmark = pytest.mark.skipif(
 
 
 def robot(name):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        return crane.load(ROBOTS / name / "robot.yaml")
+    return quiet(crane.load, ROBOTS / name / "robot.yaml")
 
 
 @pytest.mark.parametrize("name", FREEDOMS)
@@ -72,9 +69,7 @@ def test_computed_torque_holds_home(name):
 @pytest.mark.parametrize("name", EVERY)
 def test_they_fall_without_gain_or_loss(name):
     machine = robot(name)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        run = crane.simulate(machine, duration=FALLS[name], method="DOP853")
+    run = quiet(crane.simulate, machine, duration=FALLS[name], method="DOP853")
     kinetic, potential, work, lost = (
         run.channels[key] for key in ("kinetic", "potential", "work", "dissipated")
     )

@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from command_line import typed
+from urdf_text import body, joint, write
 
 import crane
 from crane.codegen.symbolic import scale_vector
@@ -176,27 +177,6 @@ def test_with_hydraulics_a_pull_is_in_the_chambers():
     assert abs(more[0]) > 1e3
 
 
-@pytest.mark.slow
-def test_the_energy_of_a_load_on_valves_is_kept():
-    machine = crane.load("patu655")
-    pull = crane.Wrench(machine.tip, (0.0, 0.0, -500.0))
-    motion = crane.ValvePD(machine, crane.task_trajectory(machine, "reach"))
-    run, other = (
-        crane.simulate(machine, motion, None, 3.0, loads=[pull, drag])
-        for drag in (
-            Drag(machine.tip, "drag"),
-            crane.description.WrenchFunction(machine.tip, dragged, "drag"),
-        )
-    )
-    assert other.q == pytest.approx(run.q, abs=1e-8)
-    seen = run.channels
-    work = seen["work"] + seen[f"work_{machine.tip}"] + seen["work_drag"]
-    stored = seen["kinetic"] + seen["potential"]
-    gap = work - (stored - stored[0]) - seen["dissipated"]
-    assert np.abs(gap).max() < 1e-7 * np.ptp(work)
-    assert np.ptp(seen[f"work_{machine.tip}"]) > 80.0
-
-
 def test_recorded_loads_are_known_to_identification(tmp_path):
     machine = crane.load("mini_forwarder")
     motion = crane.ComputedTorque(machine, crane.task_trajectory(machine, "lift"))
@@ -290,18 +270,12 @@ MASS = 2.0
 @pytest.fixture
 def pushed(tmp_path):
     """A block that slides along x and, without weight on it, z."""
-    joints = "".join(
-        f'''<joint name="{axis}" type="prismatic"><parent link="{parent}"/><child link="{child}"/>
-        <axis xyz="{way}"/><limit lower="-100" upper="100" effort="1" velocity="1"/></joint>'''
-        for axis, parent, child, way in (
-            ("x", "base", "slide", "1 0 0"), ("z", "slide", "block", "0 0 1"))
+    slide = {"kind": "prismatic", "limits": (-100, 100)}
+    write(
+        tmp_path, "block", "base", '<link name="slide"/>', body("block", MASS),
+        joint("x", "base", "slide", axis=(1, 0, 0), **slide),
+        joint("z", "slide", "block", **slide),
     )  # fmt: skip
-    (tmp_path / "block.urdf").write_text(
-        f'''<robot name="block"><link name="base"/><link name="slide"/>
-        <link name="block"><inertial><mass value="{MASS}"/>
-        <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
-        </link>{joints}</robot>'''
-    )
     path = tmp_path / "pushed.yaml"
     path.write_text(FILE)
     return path

@@ -1,14 +1,14 @@
 """Machines with few digits, whose redundant equations contradict the others by as much."""
 
 import re
-import warnings
 
 import mechanisms
 import numpy as np
 import pytest
+from warned import told
 
 import crane
-from crane.common.errors import CraneWarning, MechanismError
+from crane.common.errors import MechanismError
 
 NUMBER = re.compile(r"-?\d+\.\d{7,}(?:e-?\d+)?")
 PLANAR = ["four_bar", "six_bar", "crane", "bucket", "platform", "scissor", "chain"]
@@ -21,10 +21,7 @@ def written(folder, text):
 
 
 def loaded(path):
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", CraneWarning)
-        machine = crane.load(path)
-    messages = [str(one.message) for one in caught]
+    machine, messages = told(crane.load, path)
     return machine, [message for message in messages if "only to file precision" in message]
 
 

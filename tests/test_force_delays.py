@@ -1,28 +1,19 @@
 """Forces that are late or early: found with their deviation, told, and taken out."""
 
-import warnings
-
 import numpy as np
 import pytest
 import spinning_arm
 from command_line import typed
+from warned import told
 
 import crane
-from crane.common.errors import CraneWarning, InputError
+from crane.common.errors import InputError
 from crane.recordings import shift_columns
 
 
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory):
     return spinning_arm.load(tmp_path_factory.mktemp("arm"))
-
-
-def told(call):
-    """The result of a call, and the lines that it tells."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", CraneWarning)
-        result = call()
-    return result, [str(one.message) for one in caught]
 
 
 @pytest.mark.parametrize("seconds", [-0.06, -0.03, -0.008, 0.008, 0.03])

@@ -9,8 +9,6 @@ import pytest
 import crane
 from crane.dynamics.compiled_dynamics import QUANTITIES
 
-FILES = Path(__file__).parents[1] / "models" / "urdf" / "mini_forwarder"
-
 
 class Lone:
     """One URDF by itself, on a floating base where the machine carries it."""
@@ -44,11 +42,6 @@ class Lone:
         full_a = np.concatenate([second.vector, a[self.columns]])
         tau = pin.rnea(self.model, self.data, full_q, full_v, full_a)
         return tau[:6], tau[6:]
-
-
-@pytest.fixture(scope="module")
-def mini():
-    return crane.load("mini_forwarder")
 
 
 @pytest.fixture(scope="module")

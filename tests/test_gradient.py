@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from executed_lines import at_most
-from test_sensitivities import DAMPING, HYDRAULIC, MASS, STIFFNESS, Ramp, block, swung
+from test_sensitivities import DAMPING, HYDRAULIC, MASS, STIFFNESS, block, swung
 
 import crane
 from crane.common.errors import CraneError
@@ -58,33 +58,6 @@ def test_a_damped_spring_as_its_closed_form(tmp_path):
         true = sum(w * (total(*(at + j * h)) - total(*(at - j * h))) for j, w in ORDER_8)
         assert found.derivative(name) == pytest.approx(true / (3e-3 * at[i]), rel=1e-8), name
     assert found.values == pytest.approx(at)
-
-
-def test_behind_a_stop_everything_depends_on_when_it_stopped(tmp_path):
-    """A block swings on a spring until friction F holds it, at (-1)^n (x0 - 2 n F / k)."""
-    coulomb, x0 = 1.7, 0.3
-    spring = f"forces: [{{joint: x, stiffness: {STIFFNESS}}}]"
-    machine = block(tmp_path, f"{{x: {{coulomb: {coulomb}}}}}", spring)
-    by = ("start.x", "friction.x.coulomb", "spring.x.stiffness", "block.mass")
-    found = crane.simulation.gradient(
-        machine, None, [x0], 4.0, 2e-3, functional=last(), parameters=by, outputs=("x",)
-    )
-    n = round((x0 * STIFFNESS / coulomb - 1.0) / 2.0 + 0.4999)
-    true = (-1) ** n * np.array([1.0, -2 * n / STIFFNESS, 2 * n * coulomb / STIFFNESS**2, 0.0])
-    assert found.derivatives == pytest.approx(true, abs=1e-8)
-
-
-def test_behind_a_start_everything_depends_on_when_it_started(tmp_path):
-    """A growing force c t moves a block from t = F / c on: x = c (t - F / c)^3 / (6 m)."""
-    coulomb = 2.0
-    machine = block(tmp_path, f"{{x: {{coulomb: {coulomb}}}}}")
-    found = crane.simulation.gradient(
-        machine, Ramp(machine), [0.0], 2.0, 2e-3, functional=last(),
-        parameters=("friction.x.coulomb", "block.mass"), outputs=("x",),
-    )  # fmt: skip
-    since = 2.0 - coulomb / 3.0
-    true = [-(since**2) / (2 * MASS), -3.0 * since**3 / (6 * MASS**2)]
-    assert found.derivatives == pytest.approx(true, abs=1e-9)
 
 
 def forwarder():
@@ -157,45 +130,6 @@ def test_it_is_the_transpose_of_sensitivities(made, parted, monkeypatch):
 def test_its_own_choice_of_steps_is_as_good(made):
     back, forward, size, _ = both(*made(), variational_integration.STEP_ACCURACY)
     assert (np.abs(back - forward) <= 1e-6 * size).all(), np.abs(back - forward) / size
-
-
-@pytest.mark.slow
-def test_differences_of_order_8_agree():
-    machine = crane.load("mini_forwarder", changes={
-        f"friction.{joint}.{key}": 0.0
-        for joint in crane.load("mini_forwarder").joints for key in ("coulomb", "stiction")
-    })  # fmt: skip
-    controller = crane.ComputedTorque(machine, crane.task_trajectory(machine, "lift"))
-    variants, outputs = MachineVariants(machine), ("X1", "tip_z", "q2_velocity")
-    by = ("link3.mass", "link3_G.x", "friction.X1.viscous", "link5.mass")
-    found = crane.simulation.gradient(
-        machine,
-        controller,
-        None,
-        0.5,
-        1e-3,
-        functional=squares,
-        parameters=by,
-        outputs=outputs,
-        tolerance=1e-12,
-    )
-
-    def total(name, value):
-        other = variants.machine({name: value})
-        columns = crane.simulate(other, controller, None, 0.5, 1e-3, tolerance=1e-12).columns()
-        q = np.column_stack([columns[joint] for joint in other.joints])
-        v = np.column_stack([columns[joint + "_velocity"] for joint in other.active])
-        rows = other.closure.gamma(q)[:, other.joints.index("q2")]
-        y = np.column_stack([columns["X1"], columns["tip_z"], (rows * v).sum(1)])
-        return squares(None, y)[0]
-
-    for name in by:
-        value = variants.values[name]
-        h = 1e-2 * (abs(value) or 0.1)
-        ways = [(w, total(name, value + j * h) - total(name, value - j * h)) for j, w in ORDER_8]
-        true = sum(w * way for w, way in ways) / h
-        noise = 1e-10 * found.functional_value / h  # of simulations to 1e-12
-        assert found.derivative(name) == pytest.approx(true, rel=1e-7, abs=noise), name
 
 
 @pytest.mark.long

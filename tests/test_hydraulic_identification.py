@@ -8,15 +8,13 @@ from scipy.integrate import solve_ivp
 
 import crane
 from crane.common.errors import InputError, RecordingError
-from crane.hydraulics.components import CounterbalanceValve, Valve
+from crane.hydraulics.components import CounterbalanceValve
 from crane.identification.hydraulics.cylinder_equations import (
     OrificeEquations,
     WeakFormWindows,
     chamber_terms,
     cylinder_signals,
     noise_std,
-    spool_position,
-    valve_opening,
 )
 from crane.identification.hydraulics.cylinder_friction import (
     identify_cylinder_friction,
@@ -291,22 +289,6 @@ def test_intervals_cover_and_nothing_is_biased(machine, quick, method):
     assert (bias[1:] < 1e-3).all() and bias[0] < 0.03
 
 
-def test_noisy_pressures_do_not_shrink_beta(machine, quick):
-    """1 bar of noise: least squares on the same rows loses 13 % of 1/beta (attenuation)."""
-    data = [column[::5] for column in quick]
-    rng, found = np.random.default_rng(1), []
-    for _ in range(40):
-        run = recorded(data, 0.2, rng)
-        noisy = {
-            name: values + 1e5 * rng.standard_normal(len(values)) * name.startswith("pressure")
-            for name, values in run.channels.items()
-        }
-        run = dataclasses.replace(run, channels=noisy)
-        found.append(identify_orifices(machine, run, "boom").values / X - 1)
-    assert abs(np.mean(found, axis=0)[0]) < 0.04
-    assert (np.abs(np.mean(found, axis=0)[1:]) < 2e-3).all()
-
-
 def test_least_squares_on_derivatives_is_biased(machine, quick):
     """Least squares on derivatives is biased, so the weak form is the default.
 
@@ -347,18 +329,6 @@ def test_spool_dynamics(machine):
     np.testing.assert_allclose(found.values, X, rtol=1e-4)
     ignoring = identify_orifices(at_once, run, "boom", "chambers")
     assert np.abs(ignoring.values / X - 1).max() > 0.02
-
-
-def test_table(machine, quick):
-    text = identify_orifices(machine, recorded(quick), "boom").to_text()
-    assert [line.split()[0] for line in text.splitlines()[2:7]] == [
-        "1/beta",
-        "c1",
-        "c2",
-        "c3",
-        "c4",
-    ]
-    assert "recording 1: relative error of (29)" in text
 
 
 def one_way(quick, sense):
@@ -463,39 +433,6 @@ def test_unknown_sensor(machine, quick):
 # --- what it is made of --------------------------------------------------------------------
 
 
-def test_windows_differentiate_and_average():
-    step = 5e-3
-    time = np.arange(2000) * step
-    w = WeakFormWindows.create(2000, step, 0.1)
-    centre = time[w.centres]
-    assert w.phi.shape == (2, 65)  # 64 steps, as 0.1 s are too few
-    # a centred weight of width b passes a slow sine with a factor, slope and mean alike
-    omega = 3.0
-    mean, slope = (
-        w.integrate(w.phi, np.sin(omega * time)),
-        w.integrate(w.phi_derivative, np.sin(omega * time)),
-    )
-    passed = w.integrate(w.phi, np.cos(omega * time))
-    np.testing.assert_allclose(slope, omega * passed, rtol=0, atol=5e-8 * omega)
-    np.testing.assert_allclose(mean[0] / np.sin(omega * centre), mean[1] / np.sin(omega * centre))
-    np.testing.assert_allclose(w.integrate(w.phi_derivative, 4 + 7 * time), 7, rtol=1e-10)
-    np.testing.assert_allclose(w.integrate(w.phi, 4 + 7 * time), [4 + 7 * centre] * 2, rtol=1e-12)
-    # halves share no sample
-    assert (
-        not (w.phi[0] * w.phi[1]).any() and not (w.phi_derivative[0] * w.phi_derivative[1]).any()
-    )
-
-
-def test_spread_is_the_transpose_of_apply():
-    rng = np.random.default_rng(0)
-    w = WeakFormWindows.create(500, 1e-3, 0.1)
-    f, rows = rng.standard_normal(500), rng.standard_normal((2, len(w.centres), 3))
-    forward = np.einsum("hk,hkp->p", w.integrate(w.phi_derivative, f), rows)
-    np.testing.assert_allclose(
-        f @ w.apply_transpose(w.phi_derivative, rows, 500), forward, rtol=1e-10
-    )
-
-
 def test_windows_within_one_label():
     labels = np.zeros(1000)
     labels[430:] = 1
@@ -516,27 +453,6 @@ def test_noise_level_sees_no_signal_and_no_jumps():
     noisy = signal + 2e3 * rng.standard_normal(10000)
     assert noise_std(noisy) == pytest.approx(2e3, rel=0.04)
     assert noise_std(signal) < 1.0
-
-
-def test_spool_follows_a_sine_and_a_ramp():
-    valve = Valve("boom", 1, 1, 1, 1, neutral=6.0, full=3.0, bandwidth=50.0, damping=0.7)
-    time = np.arange(4000) * 1e-3
-    sine = 0.3 * np.sin(10 * time)
-    s = 10j
-    answer = 2500 / (s**2 + 70 * s + 2500)
-    settled = 0.3 * np.imag(answer * np.exp(s * time))
-    found = spool_position(valve, 6.0 - 3.0 * sine, 1e-3)
-    np.testing.assert_allclose(found[1000:], settled[1000:], atol=1e-5)
-    ramp = spool_position(valve, 6.0 - 0.3 * time, 1e-3)  # lags by 2 damping / w
-    np.testing.assert_allclose(ramp[1000:], 0.1 * (time[1000:] - 1.4 / 50), atol=1e-9)
-    at_once = dataclasses.replace(valve, bandwidth=0.0)
-    np.testing.assert_allclose(spool_position(at_once, 6.0 - 3.0 * sine, 1e-3), sine, atol=1e-12)
-
-
-def test_opening_is_the_valve_s(machine):
-    valve = machine.hydraulics.valves["boom"]
-    u = np.linspace(-1.3, 1.3, 53)
-    np.testing.assert_allclose(valve_opening(valve, u), [valve.opening(x) for x in u], atol=1e-15)
 
 
 def test_steady_looks_back():
@@ -638,26 +554,6 @@ def test_valve_leaves_out_what_has_no_margin(compensated):
     found = identify_valve(compensated, served, "boom")
     np.testing.assert_allclose(found.full_flows, FLOW, rtol=3e-3)
     assert abs(identify_valve(compensated, run, "boom").full_flows[1] / FLOW[1] - 1) > 0.1
-
-
-def test_valve_table(compensated):
-    time = np.arange(0, 42, 1e-2)
-    run = driven(staircase(time), time, 5e-4, np.random.default_rng(0))
-    text = identify_valve(compensated, run, "boom").to_text()
-    assert "dead_band" in text and "flow down" in text
-
-
-def test_valve_s_derived_numbers_by_differences(compensated):
-    """Their Jacobian, of which the intervals are made."""
-    time = np.arange(0, 42, 1e-2)
-    run = driven(staircase(time), time, 5e-4, np.random.default_rng(0))
-    found = identify_valve(compensated, run, "boom")
-    _, at, J = found.valve_parameters()
-    for i, size in enumerate(1e-6 * np.abs(found.values)):
-        step = np.zeros(4)
-        step[i] = size
-        moved = dataclasses.replace(found, values=found.values + step).valve_parameters()[1]
-        np.testing.assert_allclose((moved - at) / size, J[:, i], rtol=1e-4, atol=1e-9)
 
 
 @pytest.mark.parametrize("sense", [1, -1])

@@ -179,20 +179,6 @@ def test_torques_are_predicted(plant, motions, model):
     assert (judged < 2.5 * left).all()
 
 
-def test_seven_take_up_what_they_do_not_have(plant, motions):
-    rest = tuple(x for group in mechanics.REST.values() for x in group)
-    learn = motions["learn"]
-    part = mechanics.forces_of(plant.joints, learn, rest)
-    share = np.linalg.norm(part, axis=0) / np.linalg.norm(learn.tau, axis=0)
-    assert 0.08 < share[0] < 0.12 and 0.01 < share[1] < 0.04 and share[2] < 1e-9
-    plain = mechanics.learned(plant.joints, learn, "seven")
-    known = mechanics.learned(plant.joints, mechanics.without(plant.joints, learn, rest), "seven")
-    gaps = [np.abs(one.values[:7] / one.nominal[:7] - 1) for one in (plain, known)]
-    assert gaps[0][1] > 0.2 and gaps[1][1] < 0.08  # m_SL r_SL
-    assert gaps[0][3] > 0.04 and gaps[1][3] < 0.02  # of the telescope
-    assert gaps[0][4] < 0.01 and gaps[1][4] < 0.01  # its mass, which nothing else moves
-
-
 # --- the logger ----------------------------------------------------------------------------
 
 
@@ -214,27 +200,6 @@ def test_the_logger_s_file_comes_back(ideal, tmp_path):
     np.testing.assert_allclose(
         read.channels["pressure_supply"], happened.channels["pressure_supply"], rtol=1e-12
     )
-
-
-def test_its_noise_is_what_is_said(ideal, tmp_path):
-    machine, runs = ideal
-    happened, read = runs["3"], experiment.measured(ideal[0], runs["3"], tmp_path, 4)
-    for name, size in (
-        ("q2", np.radians(0.01)), ("voltage_X_lift", 5e-3),
-        ("pressure_X_lift_b", 1e5 * np.hypot(0.2, 250 / 4096 / np.sqrt(12))),
-    ):  # fmt: skip
-        gap = read.channels[name] - happened.channels[name]
-        assert gap.std() == pytest.approx(size, rel=0.03)
-    assert machine.machine.active == experiment.CYLINDERS
-
-
-def test_motions_stay_in_the_paper_s_ranges():
-    for name, rates in (("set 1", (0.03, 0.1, 0.15)), ("set 2", (0.06, 0.2, 0.15))):
-        motion = experiment.MOTIONS[name]
-        q, v, _ = motion(np.linspace(motion.lead, motion.lead + motion.period, 4001))
-        assert (np.abs(v).max(axis=0) <= rates).all()
-        assert (np.abs(v).max(axis=0) > 0.75 * np.array(rates)).all()
-        assert np.ptp(q, axis=0) == pytest.approx([0.35, 0.6, 0.6], abs=0.06)
 
 
 # --- valve and friction --------------------------------------------------------------------

@@ -308,26 +308,6 @@ def test_no_void_is_measured(tmp_path):
     np.testing.assert_array_equal(start[:2], [0.0, 0.0])
 
 
-def test_frequency_of_a_load_on_oil_and_spring(tmp_path):
-    """Small oscillation of a mass on two springs in series: oil (both chambers) and boom."""
-    for stiffness in (0.0, 8e6):
-        cylinder = {"stiffness": stiffness, "damping": 1e2} if stiffness else {}
-        machine = rig(tmp_path, cylinder=cylinder, friction={"viscous": 1.0}, axis="1 0 0")
-        drive = ValveDrive(
-            machine, ValveSignals(machine, [0.0], {}), {"x": (5e6, 5e6 * AREA_A / AREA_B)}
-        )
-        recording = crane.simulate(machine, drive, ([0.25], [0.002]), duration=1.0)
-        oil = 1.2e9 * (
-            AREA_A**2 / (HOSE + AREA_A * 0.25) + AREA_B**2 / (HOSE + AREA_B * (STROKE - 0.25))
-        )
-        k = oil if not stiffness else 1 / (1 / oil + 1 / stiffness)
-        v = recording.v[:, 0]
-        up = np.flatnonzero((v[:-1] < 0) & (v[1:] >= 0))
-        crossings = up + v[up] / (v[up] - v[up + 1])
-        period = np.mean(np.diff(crossings)) * 1e-3
-        assert period == pytest.approx(2 * np.pi / np.sqrt(k / 2000), rel=2e-3)
-
-
 def test_a_machine_too_large_to_compile_is_integrated_by_scipy(tmp_path, monkeypatch):
     machine = rig(tmp_path, COMPENSATED)
     signals = ValveSignals(machine, [0.0, 0.01, 0.02], {"x": [5.8, 5.8, 5.0]})
@@ -337,22 +317,6 @@ def test_a_machine_too_large_to_compile_is_integrated_by_scipy(tmp_path, monkeyp
     whole = crane.simulate(machine, signals, duration=0.1)
     assert np.abs(large.q - whole.q).max() < 1e-7
     assert np.ptp(whole.q) > 5e-4
-
-
-def test_pump_shares_its_flow(tmp_path):
-    """Two cylinders that ask for 80 l/min of a pump of 50: all of it is used, none is made."""
-    machine = rig(
-        tmp_path, COMPENSATED, supply={"flow": 50 / 6e4}, joints=("x", "y"), axis="1 0 0"
-    )
-    signals = ValveSignals(machine, [0.0, 0.1, 0.2], {"x": [5.8, 5.8, 2.8], "y": [5.8, 5.8, 2.8]})
-    recording = crane.simulate(machine, signals, initial=[0.05, 0.05], duration=2.0)
-    channels = recording.channels
-    drawn = channels["flow_x_a"] + channels["flow_y_a"]
-    assert drawn[-500:].mean() == pytest.approx(50 / 6e4, rel=1e-3)
-    assert channels["pressure_supply"][-1] < 9.25e6 - 2e5
-    alone = ValveSignals(machine, [0.0, 0.1, 0.2], {"x": [5.8, 5.8, 2.8]})
-    recording = crane.simulate(machine, alone, initial=[0.05, 0.05], duration=2.0)
-    assert recording.channels["flow_x_a"][-500:].mean() == pytest.approx(40 / 6e4, rel=1e-3)
 
 
 def test_against_an_independent_simulation(tmp_path):

@@ -28,11 +28,6 @@ pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 FINGERS = {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0}
 
 
-@pytest.fixture(scope="module")
-def mini():
-    return crane.load("mini_forwarder")
-
-
 def inertial(machine):
     return IdentificationModel(machine, [InertialTerm(machine)])
 
@@ -139,9 +134,6 @@ def forwarder(tmp_path, off_line):
     path = tmp_path / "planar.urdf"
     path.write_text(text)
     return crane.load(path), {**numbers, "Gr": (80.0, 0.0, 2.0)}
-
-
-SEVEN = ("FL.Izz", "SL.mx", "SL.m", "TL.mx", "TL.m", "SL.Izz", "FL.mx")
 
 
 def seven(machine):

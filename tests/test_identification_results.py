@@ -3,8 +3,6 @@
 import csv
 import dataclasses
 import re
-import sys
-import warnings
 from functools import partial
 from pathlib import Path
 
@@ -16,9 +14,9 @@ from command_line import typed
 from forwarder_motions import NOISE
 from lxml import etree
 from scipy.interpolate import CubicSpline
+from warned import without_a_word
 
 import crane
-from crane import cli
 from crane.common.errors import CraneWarning, InputError, OutputError, RecordingError
 from crane.identification.mechanics.identification_model import default_terms
 from crane.identification.mechanics.identified_description import divide_locked_bodies
@@ -37,11 +35,6 @@ RAW = HERE / ".." / "shared" / "data" / "patu655" / "lifting_first_half.csv"
 COLUMNS = HERE / "scripts" / "columns" / "patu655.txt"
 pytestmark = [pytest.mark.filterwarnings("ignore::crane.CraneWarning"), pytest.mark.slow]
 motion = partial(forwarder_motions.motion, duration=20.0, noise=1.0)
-
-
-@pytest.fixture(scope="module")
-def mini():
-    return crane.load("mini_forwarder")
 
 
 def as_recording(machine, given):
@@ -101,9 +94,7 @@ def test_the_written_machine_is_the_identified_one(mini, found, tmp_path):
     assert len(noted) > 3 and {float(value) for _, value, _ in noted} <= set(told.values())
     assert written.tasks == mini.tasks and written.end_stops == mini.end_stops
     assert written.friction["X2"].is_driving  # as described, of which nothing is told either
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        crane.load(file)
+    without_a_word(crane.load, file)
     assert abs(written.model.inertias[1].mass - mini.model.inertias[1].mass) > 1e-6
 
 
@@ -598,17 +589,13 @@ def test_a_machine_identified_as_described_is_divided_as_described():
 
 
 @pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
+def run(tmp_path):
     """The command line in this process: exit status, stdout, stderr without warnings."""
-    monkeypatch.chdir(tmp_path)
 
     def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["crane", *map(str, arguments)])
-        with warnings.catch_warnings(), pytest.raises(SystemExit) as ended:
-            cli.main()
-        out, err = capsys.readouterr()
-        lines = [line for line in err.splitlines() if not line.startswith("warning: ")]
-        return ended.value.code, out, lines
+        done = typed(*arguments, cwd=tmp_path)
+        lines = [x for x in done.stderr.splitlines() if not x.startswith("warning: ")]
+        return done.returncode, done.stdout, lines
 
     return call
 
@@ -668,7 +655,6 @@ def test_wrong_recordings_and_arguments_are_one_line(run, mini, tmp_path):
     good = as_recording(mini, motion(mini, duration=8.0))
     good.to_csv(tmp_path / "good.csv")
     text = (tmp_path / "good.csv").read_text()
-    n, scale = len(good.time), np.array([180 / np.pi, 1.0, 1.0])
 
     def other(**changes):
         return dataclasses.replace(good, **changes)
@@ -676,14 +662,12 @@ def test_wrong_recordings_and_arguments_are_one_line(run, mini, tmp_path):
     def few():
         return other(**{k: getattr(good, k)[:20] for k in ("time", "q", "v", "tau")})
 
-    trembling = 1e-6 * np.random.default_rng(0).normal(size=(n, 3))
+    trembling = 1e-6 * np.random.default_rng(0).normal(size=good.q.shape)
     still = other(q=good.q[0] + trembling, v=0 * good.v)
     broken = text.replace(",".join(text.splitlines()[40].split(",")[:2]), "nan,0", 1)
     cases = [
         (without("X1_force", text), "column 'X1_force' is missing"),
         (broken, "column 'time': 'nan' is not a finite number"),
-        (other(q=good.q * scale), "'q1' goes from"),
-        (other(tau=1e3 * good.tau), "it looks 1000-fold, give SI units"),
         (still, "no joint moves, record a motion"),
         (few(), "20 samples are too few, record at least 50"),
     ]
@@ -697,9 +681,7 @@ def test_wrong_recordings_and_arguments_are_one_line(run, mini, tmp_path):
         assert errors[0].startswith("error: ") and message in errors[0]
         assert not (tmp_path / "out").exists()
     for arguments, message in (
-        (["--method", "lsq"], "method 'lsq' is unknown"),
         (["--prior", "-1"], "--prior is '-1', write NAME=STD, as in bodies=10%"),
-        (["--bandwidth", "0"], "the bandwidth is 0.0 Hz"),
         (["--bandwidth", "1e-6"], "the bandwidth is 1e-06 Hz"),
         (["--validation", "none.csv"], "none.csv: no such file"),
     ):

@@ -144,11 +144,6 @@ def tx40():
     return crane.load("tx40")
 
 
-@pytest.fixture(scope="module")
-def kr300():
-    return crane.load("kr300")
-
-
 @pytest.mark.parametrize(("name", "bodies"), [("tx40", tx40_bodies), ("kr300", kr300_bodies)])
 def test_gravity_and_inertia_are_those_of_the_tables(name, bodies):
     machine = crane.load(name)

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+import warned
 from command_line import typed
 from lxml import etree
 from scipy.linalg import null_space
@@ -13,7 +14,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 import crane
-from crane.common.errors import CraneWarning, DescriptionError
+from crane.common.errors import DescriptionError
 from crane.description.kinematic_tree import inertia_problem, nearest_inertia
 from crane.formats.checks import check
 
@@ -23,10 +24,7 @@ FILES = sorted(GRBDA.glob("*.urdf"))
 
 def told(path, **options):
     """The machine of a file, and its warnings of inertias."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        machine = crane.load(path, **options)
-    texts = [str(one.message) for one in caught if issubclass(one.category, CraneWarning)]
+    machine, texts = warned.told(crane.load, path, **options)
     return machine, [
         text for text in texts if "home was searched for" not in text and "loop" not in text
     ]

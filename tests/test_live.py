@@ -1,14 +1,20 @@
-"""Live views: closed loops after every move, limits of the branch, end of the process."""
+"""Live views: closed loops after every move, limits, access, end of the process."""
 
+import asyncio
+import http.client
 import os
 import re
+import shutil
 import signal
+import socket
 import subprocess
 import sys
-import warnings
+import threading
+from functools import partial
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from queue import SimpleQueue
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from command_line import MAIN, typed
 from conftest import DATA
@@ -17,22 +23,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import crane
-from crane.common.errors import CraneWarning, InputError, RecordingError
+from crane.common.errors import InputError, RecordingError
 from crane.recordings.recording import Recording
 from crane.view.live.live_page import readout_html, warning_html
+from crane.view.live.live_server import AccessGuard
 from crane.view.live.live_session import Playback, Session, round_up_to_nice
-
-
-@pytest.fixture(scope="module")
-def patu():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        return crane.load("patu655")
-
-
-@pytest.fixture(scope="module")
-def five_bar():
-    return crane.load(DATA / "five_bar.urdf")
 
 
 @pytest.fixture
@@ -153,15 +148,6 @@ def test_slider_ends(mini, five_bar):
     assert session.max_payload == 1.0  # half of 1.287 kg, rounded up
     np.testing.assert_allclose(Session(five_bar).upper, np.pi)
     assert [round_up_to_nice(x) for x in (0.9, 1.0, 1.1, 23, 0.051)] == [1, 1, 2, 50, 0.1]
-
-
-def test_poses_are_those_of_forward_kinematics(mini):
-    session = Session(mini)
-    posture = session.move("X2", 0.021)
-    data = mini.model.createData()
-    pin.framesForwardKinematics(mini.model, data, posture.configuration)
-    for link, pose in zip(["link3", "base"], session.link_poses(["link3", "base"]), strict=True):
-        np.testing.assert_array_equal(pose, data.oMf[mini.frame(link)].homogeneous)
 
 
 def test_playback_runs_straight_between_samples(mini, recording):
@@ -325,3 +311,195 @@ def test_without_viser_it_says_how_to_get_it():
         "error: a live view needs viser, install it in the repository's folder: "
         "pip install '.[live]'\n"
     )
+
+
+# --- access -------------------------------------------------------------------------------------
+
+
+pytest.importorskip("viser")
+
+
+@pytest.fixture(scope="module")
+def live():
+    """Port, door, page and notes of a view that is served."""
+    from crane.view.live.live_page import LivePage
+    from crane.view.live.live_server import start_server, stop_server
+
+    door, requests = AccessGuard("127.0.0.1"), SimpleQueue()
+    server = start_server(door, 0)
+    page = LivePage(server, Session(crane.load(DATA / "slider_crank.yaml")), None, requests)
+    yield server.get_port(), door, page, requests
+    stop_server(server)
+
+
+def connect(port, path, **headers):
+    """A websocket as a browser or a program opens it."""
+    import viser
+    from websockets.sync.client import connect
+
+    with socket.create_connection(("127.0.0.1", port)) as there:
+        host = headers.pop("Host", f"127.0.0.1:{port}")
+        return connect(
+            f"ws://{host}{path}", sock=there.dup(), max_size=None, open_timeout=10,
+            subprotocols=[f"viser-v{viser.__version__}"], additional_headers=headers,
+        )  # fmt: skip
+
+
+def get(port, path, **headers):
+    """Status of a request."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection.request("GET", path, headers=headers)
+    status = connection.getresponse().status
+    connection.close()
+    return status
+
+
+FOREIGN = {
+    "a page of another origin": ("{path}", {"Origin": "http://elsewhere.example"}),
+    "another port of this computer": ("{path}", {"Origin": "http://127.0.0.1:1"}),
+    "a page without origin": ("{path}", {"Origin": "null"}),
+    "a name made to lead here": (
+        "{path}", {"Host": "rebound.example:{port}", "Origin": "http://rebound.example:{port}"},
+    ),
+    "a name, from a program": ("{path}", {"Host": "rebound.example"}),
+    "no token": ("/", {}),
+    "another token": ("/AAAAAAAAAAAAAAAAAAAAAA/", {}),
+    "a token with more": ("/{token}x/", {}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("who", FOREIGN)
+def test_strangers_get_nothing(live, who):
+    from websockets.exceptions import InvalidStatus
+
+    port, door, _, _ = live
+    said = {"port": port, "token": door.token, "path": f"/{door.token}/"}
+    path, headers = FOREIGN[who]
+    headers = {name: value.format(**said) for name, value in headers.items()}
+    assert get(port, path.format(**said), **headers) == 403
+    with pytest.raises(InvalidStatus, match="403"):
+        connect(port, path.format(**said), **headers)
+
+
+def test_those_with_the_address_come_in(live):
+    port, door, _, _ = live
+    here = f"http://127.0.0.1:{port}"
+    assert door.address(port) == f"{here}/{door.token}/"
+    for headers in ({}, {"Origin": here}):
+        assert get(port, f"/{door.token}/", **headers) == 200
+        with connect(port, f"/{door.token}", **headers) as client:
+            assert client.recv(timeout=10)
+    assert get(port, f"/{door.token}/../../etc/passwd") == 404
+
+
+def test_hosts():
+    inside = AccessGuard("127.0.0.1").authorized_path
+    assert (
+        AccessGuard("0.0.0.0").is_local_only is AccessGuard("crane.example").is_local_only is False
+    )
+    assert AccessGuard("::1").is_local_only is AccessGuard("localhost").is_local_only is True
+    for host, wanted in {
+        "192.0.2.1:80": True,
+        "[2001:db8::1]:80": True,
+        "x.example": False,
+    }.items():
+        door = AccessGuard("0.0.0.0")
+        assert (door.authorized_path(f"/{door.token}/", [host], []) == "/") is wanted
+        assert inside("/", [host], []) is None
+    door = AccessGuard("crane.example")
+    assert door.authorized_path(f"/{door.token}/x", ["crane.example:80"], []) == "/x"
+    assert door.authorized_path(f"/{door.token}/", [], []) is None
+    assert door.authorized_path(f"/{door.token}/", ["[::1"], []) is None
+
+
+BAD = [[1.0, 2.0], "0.1", None, float("nan"), float("inf"), 1e308, -5.0, 10**400, True, {"a": 1}]
+
+
+@pytest.mark.parametrize("value", BAD, ids=range(len(BAD)))
+def test_values_that_mean_nothing_move_nothing(live, value, monkeypatch):
+    from viser._messages import GuiUpdateMessage
+
+    _, _, page, requests = live
+    server = page._server
+    name, slider = next(iter(page._sliders.items()))
+    before, good = float(slider.value), float(0.4 * slider.min + 0.6 * slider.max)
+    monkeypatch.setattr(server.gui, "_resolve_client", lambda _: object())
+    hear, loop = (
+        server._websock_server._handle_incoming_message,
+        server._websock_server._background_event_loop,
+    )
+
+    def say(what):
+        message = GuiUpdateMessage(slider._impl.uuid, what)
+        asyncio.run_coroutine_threadsafe(hear(0, message), loop).result(10)
+
+    say({"value": value})
+    say({"min": 0.0})
+    assert requests.empty() and slider.value == before
+    say({"value": good})
+    assert requests.get(timeout=10) == (name, good)
+    say({"value": before})
+    assert requests.get(timeout=10) == (name, before)
+
+
+def test_a_mistake_does_not_end_it(live, monkeypatch):
+    _, _, page, _ = live
+
+    def wrong(*_):
+        raise TypeError("a mistake")
+
+    with monkeypatch.context() as context:
+        context.setattr(page._session, "move", wrong)
+        page.process_requests([(next(iter(page._sliders)), 0.0)])
+        assert "a mistake" in page._warning_html.content
+    page.process_requests([("home", 1.0)])
+    assert "a mistake" not in page._warning_html.content
+    assert np.isfinite(page._session.readout.configuration).all()
+
+
+class Elsewhere(BaseHTTPRequestHandler):
+    """A page of somebody else that tries to open the socket."""
+
+    def __init__(self, script, *arguments):
+        self._script = script
+        super().__init__(*arguments)
+
+    def do_GET(self):  # noqa: N802
+        self.send_response(200)
+        self.send_header("Content-Type", "text/html")
+        self.end_headers()
+        self.wfile.write(self._script.encode())
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.mark.slow
+def test_a_browser_lets_its_own_page_in_and_no_other(live):
+    import viser
+
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("no chromium in the path")
+    sync_api = pytest.importorskip("playwright.sync_api")
+    port, door, _, _ = live
+    script = (
+        f"<script>const s = new WebSocket('ws://127.0.0.1:{port}/{door.token}', "
+        f"'viser-v{viser.__version__}'); s.onmessage = () => document.title = 'in'; "
+        "s.onerror = () => document.title = 'out'</script>"
+    )
+    other = HTTPServer(("127.0.0.1", 0), partial(Elsewhere, script))
+    threading.Thread(target=other.serve_forever, daemon=True).start()
+    rule = f"--host-resolver-rules=MAP rebound.example 127.0.0.1:{port}"
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=[rule])
+        page = browser.new_page()
+        page.goto(door.address(port))  # with the token even: the origin is what counts
+        page.get_by_text("Active joints").wait_for(timeout=60_000)
+        page.goto(f"http://127.0.0.1:{other.server_port}/")
+        page.wait_for_function("document.title !== ''")
+        assert page.title() == "out"
+        answer = page.goto(f"http://rebound.example:{port}/{door.token}/")
+        assert answer.status == 403
+        browser.close()
+    other.shutdown()

@@ -7,14 +7,9 @@ import pinocchio as pin
 import pytest
 from broken_machines import MINI, copy_machine, swap
 from oracles import (
-    D_IN_2,
-    B,
-    C,
     by_stroke,
     mini_forwarder,
-    mini_forwarder_gamma,
     mini_forwarder_potential,
-    turned,
 )
 
 import crane
@@ -35,71 +30,6 @@ def test_mini_forwarder_is_what_the_paper_describes(mini):
     assert set(mini.tasks) == {"loading", "return", "lift"} and set(mini.control) == {*mini.active}
     assert mini.tip == "link7_tip" and mini.load_name == "mini_forwarder"
     assert pin.computeTotalMass(mini.model) == pytest.approx(1.2874, abs=1e-12)
-
-
-@pytest.mark.parametrize("name", ["mini", "stewart", "slider_crank"])
-def test_tree_has_one_coordinate_per_joint_and_a_frame_per_link(name, request):
-    machine = request.getfixturevalue(name)
-    model = machine.model
-    assert model.nq == model.nv == len(machine.joints)
-    for joint in machine.joints:
-        assert machine.joints[machine.column(joint)] == joint
-    links = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
-    assert len(links) == len(set(links))
-    for loop in machine.closure.equations.loops:
-        assert {loop.predecessor, loop.successor} <= set(links)
-    assert machine.home.shape == (model.nq,)
-    # depth-first: a joint's number is larger than its parent's, and subtrees are unbroken
-    for joint in range(1, model.njoints):
-        subtree = list(model.subtrees[joint])
-        assert subtree == list(range(joint, joint + len(subtree)))
-
-
-def test_joints_turn_the_papers_way(mini):
-    """A positive step of each joint alone, seen from the side: which way does its body turn?"""
-    data = mini.model.createData()
-    bodies = {"q2": "link3", "q4": "A1_barrel", "q9": "link2", "q10": "A2_barrel", "q11": "link5",
-              "q3": "link7", "q6": "link4", "q7": "link6"}  # fmt: skip
-    for joint, link in bodies.items():
-        angle = []
-        for step in (0.0, 0.1):
-            q = mini.home.copy()
-            q[mini.column(joint)] += step
-            pin.framesForwardKinematics(mini.model, data, q)
-            x = data.oMf[mini.frame(link)].rotation[:, 0]
-            assert abs(x[1]) < 1e-15  # stays in the plane of the crane
-            angle.append(np.arctan2(x[2], x[0]))
-        clockwise = joint in ("q3", "q6", "q7")
-        assert angle[1] - angle[0] == pytest.approx(-0.1 if clockwise else 0.1, abs=1e-12), joint
-
-
-def test_one_file_with_loops_equals_chains_and_a_machine_file(slider_crank, tmp_path):
-    """The same slider-crank as one URDF with a <loop>, its active joint marked there."""
-    folder = slider_crank.path.parent / "slider_crank"
-    text = "".join(
-        (folder / f"{name}.urdf")
-        .read_text()
-        .split("<robot", 1)[1]
-        .split(">", 1)[1]
-        .rsplit("<", 1)[0]
-        for name in ("crank", "slider")
-    )
-    text = text.replace('name="theta" type', 'name="theta" independent="true" type')
-    text = text.replace('<link name="rail"/>', "").replace('"rail"', '"guide"')
-    loop = (
-        '<loop name="wrist" type="revolute"><predecessor link="slider"/><successor link="rod">'
-        '<origin xyz="0.3 0 0"/></successor><axis xyz="0 1 0"/></loop>'
-    )
-    path = tmp_path / "single.urdf"
-    path.write_text(f'<robot name="single">{text}{loop}</robot>')
-    single = crane.load(path)
-    assert single.active == ("theta",) and single.joints == slider_crank.joints
-    assert single.home[single.column("theta")] == 0.1  # the limit nearest to zero
-    theta = np.linspace(0.2, 2.9, 20)[:, None]
-    q = slider_crank.closure.solve(theta)
-    assert np.abs(single.closure.solve(theta) - q).max() < 1e-13
-    force = [crane.Dynamics(m).inverse(theta, theta, theta) for m in (single, slider_crank)]
-    assert np.abs(force[0] - force[1]).max() < 1e-12
 
 
 def test_a_machine_cannot_be_changed(mini):
@@ -226,28 +156,6 @@ class TestDrivenBy:
         assert np.abs(q[:, columns] - strokes).max() < 1e-13
         assert np.array_equal(driven.lower, [-np.pi, -np.inf, -np.inf])
         assert not driven.upper.flags.writeable
-
-    def test_rows_of_the_strokes_are_dx_dq(self, mini, strokes):
-        driven = mini.with_active_joints(["q1", "q2", "q3"])
-        gamma = driven.closure.gamma(mini.closure.solve(strokes))
-        slopes = mini_forwarder_gamma(*strokes.T[1:])  # dq/dx
-        expected = np.linalg.inv(np.stack([slopes["q2"], slopes["q3"]], axis=1))
-        rows = gamma[:, [mini.column("X1"), mini.column("X2")]]
-        assert np.abs(rows[:, :, 1:] - expected).max() < 1e-12 * np.abs(expected).max()
-        assert np.abs(rows[:, :, 0]).max() < 1e-14  # slewing moves no cylinder
-
-    def test_lever_of_a_cylinder_in_a_triangle(self, mini):
-        """B, C and the rod eye D, which turns with q9 about C: dX1/dq9 is the arm of D about C."""
-        driven = mini.with_active_joints(["q1", "q9", "q3"])
-        angle = driven.home[driven.column("q9")] + np.linspace(-0.4, 0.4, 41)
-        q3 = np.full_like(angle, driven.home[driven.column("q3")])
-        q = driven.closure.solve(np.column_stack([0 * angle, angle, q3]))
-        arm = turned(angle, D_IN_2)
-        way = C + arm - B
-        length = np.hypot(*way)
-        lever = (way[1] * arm[0] - way[0] * arm[1]) / length
-        assert np.abs(q[:, driven.column("X1")] - (length - 0.0825)).max() < 1e-14
-        assert np.abs(driven.closure.gamma(q)[:, driven.column("X1"), 1] - lever).max() < 1e-14
 
     def test_torques_are_the_forces_times_dx_dq(self, mini, strokes):
         """Equations (18), (19), in any motion; at rest also the slope of the potential."""

@@ -30,7 +30,6 @@ ALLOWED = {
     "div", "style", "p", "img", "table", "thead", "tbody", "tr", "th", "td", "details", "summary",
     "iframe", "pre", "code", "strong", "em", "ul", "li", "h1", "h2",
 }  # fmt: skip
-ATTRIBUTES = {"class", "style", "alt", "src", "width", "title", "sandbox", "srcdoc", "open"}
 
 
 class Parsed(HTMLParser):

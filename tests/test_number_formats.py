@@ -12,7 +12,6 @@ from crane.common.errors import (
     format_one_line,
     prefix_location,
 )
-from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import (
     MAX_COORDINATE,
     MAX_QUANTITY,
@@ -166,34 +165,3 @@ def test_titles():
             [0.0], ("q",), [[0.0]], [[0.0]], [[0.0]], {"q": "rad"}, machine=machine
         )
         assert recorded_machine_name(named) == name
-
-
-def test_what_a_notebook_shows_is_short(mini):
-    run = crane.simulate(mini, duration=0.01)
-    study = crane.study("mini_forwarder", {"link7.mass": [0.1, 0.2]}, ["lift"], ["peak_X1"])
-    space = crane.workspace(mini, 100)
-    for thing, words in (
-        (mini, "Machine('mini_forwarder', 3 degrees of freedom, 11 joints, 4 loops)"),
-        (mini.closure, "Closure of A1_eye, A2_eye, J, K: 8 passive joints from q1, X1, X2"),
-        (crane.Dynamics(mini), "Dynamics of 'mini_forwarder', compiled"),
-        (crane.Kinematics(mini), "Kinematics of 'link7_tip' of 'mini_forwarder'"),
-        (run, "Recording of mini_forwarder, 0.01 s in 11 samples: 21 channels beside q1 [rad], "),
-        (study, "Study of mini_forwarder: 2 variants of link7.mass, 0 not measured; peak_X1"),
-        (space, "Workspace of 'link7_tip' of 'mini_forwarder': "),
-        (space.patches[0], "WorkspacePatch(stroke_pair: 2, held_coordinates=(3,), axes: 2, "),
-    ):
-        assert repr(thing).startswith(words)
-        assert len(repr(thing)) <= 200 and "\n" not in repr(thing)
-
-
-def test_brief_names_shapes():
-    class Thing(OneLineRepr):
-        def __init__(self):
-            self.name, self.values, self.parts, self.other = (
-                "a",
-                np.zeros((3, 2)),
-                (1, 2),
-                object(),
-            )
-
-    assert repr(Thing()) == "Thing(name='a', values=(3, 2), parts: 2)"

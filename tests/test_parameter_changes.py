@@ -22,11 +22,6 @@ pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 POSE = np.array([0.3, 0.021, 0.012])
 
 
-@pytest.fixture(scope="module")
-def mini():
-    return crane.load("mini_forwarder")
-
-
 def tip(machine, q_a=POSE):
     return crane.Kinematics(machine).position(q_a)
 

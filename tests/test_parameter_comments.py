@@ -1,15 +1,14 @@
 """Comments in written machine files, which are read again with identical numbers."""
 
 import re
-import warnings
 
 import numpy as np
 import pytest
 import yaml
 from hydraulic_rig import COMPENSATED, rig
+from warned import quiet
 
 import crane
-from crane.common.errors import CraneWarning
 from crane.description.machine_parameters import parameter_unit
 from crane.description.parameter_changes import parameters
 from crane.formats.machine_file.yaml_text import format_yaml
@@ -17,12 +16,6 @@ from crane.formats.machine_loading import MachineVariants
 
 WORDS = "fitted ±3e-9, 95 % (was -- 1: 2)\n# no"
 SAID = "fitted ±3e-9, 95 % (was -- 1: 2) # no"
-
-
-def line_of(file, words):
-    """The only line of a file with some words."""
-    (line,) = [line for line in file.read_text().splitlines() if words in line]
-    return line
 
 
 def numbers(machine):
@@ -38,9 +31,7 @@ def crane_file(tmp_path_factory):
         "oil.bulk_modulus": 0.9e9, "lift_boom.mass": 150.5, "end_stop.X_lift.stiffness": 3e8,
         "tilt_boom.com.x": 0.7,
     }  # fmt: skip
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        machine = crane.load("patu655", changes=changes, lock={"slew": 0.0, "X_ext": 0.0})
+    machine = quiet(crane.load, "patu655", changes=changes, lock={"slew": 0.0, "X_ext": 0.0})
     folder = tmp_path_factory.mktemp("noted")
     return machine, crane.write_machine(machine, folder, dict.fromkeys(changes, WORDS))
 
@@ -86,9 +77,17 @@ def test_notes_of_whatever_number(tmp_path):
     head = [line for line in file.read_text().splitlines() if line.startswith("# ")]
     rubbed = tuple(f"friction.{joint}." for joint in machine.friction)
     none = [x for x in every if x.startswith("friction.") and not x.startswith(rubbed)]
-    assert head == [f"# {name}: <{name}>" for name in (*none, "payload.mass")]
+    gravity = [
+        f"# gravity.{x} = {y}: <gravity.{x}>"
+        for x, y in zip("xyz", (0.0, 0.0, -9.81), strict=True)
+    ]
+    plain = [f"# {name}: <{name}>" for name in (*none, "payload.mass")]
+    assert head == [*plain[:-1], *gravity, plain[-1]]
     again = crane.load(file)
     assert numbers(again) == numbers(crane.load(crane.write_machine(machine, tmp_path / "plain")))
+    moon = crane.load("patu655", gravity=(0, 0, -1.62))
+    file = crane.write_machine(moon, tmp_path / "moon", {"gravity.z": "of the moon"})
+    assert file.read_text().startswith("# gravity.z = -1.62: of the moon\n")
 
 
 def test_a_number_that_a_lock_moved_is_said_at_the_head(tmp_path):

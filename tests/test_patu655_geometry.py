@@ -121,11 +121,6 @@ def slope(function, *at):
 
 
 @pytest.fixture(scope="module")
-def patu():
-    return crane.load("patu655")
-
-
-@pytest.fixture(scope="module")
 def loaded():
     return crane.load("patu655", {"payload.mass": LOAD})
 
@@ -325,15 +320,6 @@ def test_mass_matrix_is_kinetic_energy(patu):
 
 
 # --- what it does ----------------------------------------------------------------------------
-
-
-def test_slewing_can_be_locked(patu):
-    locked = crane.load("patu655", lock={"slew": 0.0})
-    assert locked.active == ("X_lift", "X_tilt", "X_ext")
-    q_a = draw(5, 8)
-    q_a[:, 0] = 0
-    whole = crane.Dynamics(patu).gravity(q_a)[:, 1:]
-    assert np.abs(crane.Dynamics(locked).gravity(q_a[:, 1:]) - whole).max() < 1e-7
 
 
 @pytest.mark.parametrize("task", ["reach", "swing"])

@@ -21,7 +21,7 @@ def four_bar():
     return crane.load(DATA / "four_bar.yaml")
 
 
-def motion(machine, q, v, a):
+def turning(machine, q, v, a):
     q, v, a = (np.asarray(x)[:, None] for x in (q, v, a))
     tau = crane.Dynamics(machine).inverse(q, v, a, friction=True)
     return Motion(TIME, q, v, a, tau + 1e-4 * np.random.default_rng(0).normal(size=tau.shape))
@@ -30,7 +30,7 @@ def motion(machine, q, v, a):
 @pytest.fixture(scope="module")
 def one_way(four_bar):
     """The crank never turns back: Coulomb friction and its offset are one."""
-    return motion(
+    return turning(
         four_bar,
         0.2 + 0.15 * TIME + 0.02 * np.sin(W * TIME),
         0.15 + 0.02 * W * np.cos(W * TIME),
@@ -46,7 +46,7 @@ def test_what_neither_prior_nor_motion_tells_is_named(four_bar, one_way):
         identify(four_bar, one_way, prior=(IdentificationModel(four_bar).nominal, bodies))
     assert str(caught.value) == (
         "there is no finite prior of crank.coulomb, crank.coulomb_offset, crank.viscous, "
-        "crank.viscous_offset, and this motion does not determine them separately: move the "
+        "crank.viscous_offset, and this turning does not determine them separately: move the "
         "joints both ways and at several speeds, give prior=(means, deviations) with finite "
         "ones for them, or omit the prior to estimate base parameters"
     )

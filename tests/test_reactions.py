@@ -114,52 +114,6 @@ FOUR_BAR = (
 )  # fmt: skip
 
 
-def test_four_bar_by_newton_and_euler_of_each_link(tmp_path):
-    """The nine equations of three links for four forces in pins and the crank's torque."""
-    machine = load(tmp_path, FOUR_BAR, active=["O2"])
-    reactions = Reactions(machine)
-    q = machine.closure.solve([np.radians(60)])
-    v = machine.closure.gamma(q)[:, 0] * 25
-    a = machine.closure.gamma(q)[:, 0] * -40 + machine.closure.drift(q, v)
-    at = {name: machine.column(name) for name in ("O2", "A", "O4")}
-    turns, speeds, rises = (
-        np.array([x[at["O2"]], x[at["O2"]] + x[at["A"]], x[at["O4"]]]) for x in (q, v, a)
-    )
-    # as the book has the linkage's motion, to its digits
-    assert np.allclose(np.degrees(turns), [60, 20.92, 104.41], atol=6e-3)
-    assert np.allclose(speeds, [25, -5.87, 7.93], atol=6e-3)
-    push, torque = 80 * np.exp(1j * np.radians(330)), 120.0
-    ends = np.array([CRANK, COUPLER, ROCKER]) * np.exp(1j * turns)
-    centres = np.array(CENTRES) * np.exp(1j * turns)
-    gains = (1j * rises - speeds**2)[:, None] * np.array([ends, centres]).T
-    gained = np.array([gains[0, 1], gains[0, 0] + gains[1, 1], gains[2, 1]])
-    # unknown: forces on crank at O2, on coupler at A, on rocker at B, on rocker at O4, torque
-    acting = [
-        [(0, -centres[0], 1), (1, ends[0] - centres[0], -1)],
-        [(1, -centres[1], 1), (2, ends[1] - centres[1], -1)],
-        [(2, ends[2] - centres[2], 1), (3, -centres[2], 1)],
-    ]
-    matrix, right = np.zeros((9, 9)), np.zeros(9)
-    for i, forces in enumerate(acting):
-        for k, arm, sign in forces:
-            matrix[3 * i, 2 * k] += sign
-            matrix[3 * i + 1, 2 * k + 1] += sign
-            matrix[3 * i + 2, 2 * k : 2 * k + 2] += sign * np.array([-arm.imag, arm.real])
-        inertial = MASSES[i] * gained[i]
-        right[3 * i : 3 * i + 3] = inertial.real, inertial.imag, INERTIAS[i] * rises[i]
-    matrix[2, 8] = 1
-    arm = 3 * np.exp(1j * (turns[1] + 1.74533))
-    right[3:6] -= push.real, push.imag, (np.conj(arm) * push).imag
-    right[8] -= torque
-    wanted = np.linalg.solve(matrix, right)
-    loads = {"P": [push.real, push.imag, 0, 0, 0, 0], "rocker": [0, 0, 0, 0, 0, torque]}
-    found = dict(zip(reactions.names, reactions.joint_wrenches(q, v, a, loads), strict=True))
-    pins = np.concatenate([found[name][:2] for name in ("O2", "A", "B", "O4")])
-    assert np.allclose(pins, wanted[:8], rtol=1e-9, atol=1e-9)
-    assert np.isclose(found["O2"][5], wanted[8], rtol=1e-9)
-    assert np.allclose([found[x][5] for x in ("A", "B", "O4")], 0, atol=1e-9)
-
-
 def _asked(model, data, body):
     """Momentum's rate less weight of a body, at the world's origin."""
     inertia, spin = model.inertias[body], data.v[body]
@@ -272,41 +226,6 @@ def test_what_floats_is_held_by_nothing(tmp_path):
     a = machine.closure.gamma(q[0]) @ gained + machine.closure.drift(q[0], v[0])
     found = Reactions(machine).joint_wrenches(q[0], v[0], a)
     assert np.abs(found[0]).max() < 1e-9 * np.abs(found).max()
-
-
-def test_multipliers_are_those_of_pinocchio(stewart):
-    """Spherical loops of a Stewart platform in motion, all determined."""
-    reactions = Reactions(stewart)
-    model, equations = pin.Model(stewart.model), stewart.closure.equations
-    assert all(loop.type == "spherical" for loop in equations.loops)
-    contacts = pin.StdVec_RigidConstraintModel()
-    for loop in equations.loops:
-        ends = [model.frames[stewart.frame(x)] for x in (loop.predecessor, loop.successor)]
-        place = [x for end in ends for x in (end.parentJoint, end.placement)]
-        contacts.append(
-            pin.RigidConstraintModel(pin.ContactType.CONTACT_3D, model, *place, pin.LOCAL)
-        )
-    datas = pin.StdVec_RigidConstraintData()
-    for contact in contacts:
-        datas.append(contact.createData())
-    data = model.createData()
-    pin.initConstraintDynamics(model, data, contacts, datas)
-    settings = pin.ProximalSettings(1e-12, 1e-14, 100)
-    _, (q, v, _) = moving(stewart, 4, share=0.05)
-    rng = np.random.default_rng(3)
-    for i in range(len(q)):
-        tau = np.zeros(model.nv)
-        tau[stewart.closure.active] = 300 * rng.normal(size=len(stewart.active))
-        a = pin.constraintDynamics(model, data, q[i], v[i], tau, contacts, datas, settings)
-        drives = reactions.drive_forces(q[i], v[i], a)
-        assert np.allclose(drives, tau[stewart.closure.active], atol=1e-6)
-        found = reactions.joint_wrenches(q[i], v[i], a)[model.njoints - 1 :, :3]
-        lambdas = np.reshape(data.lambda_c, (-1, 3))
-        pin.updateFramePlacements(model, data)
-        for force, wanted, loop in zip(found, lambdas, equations.loops, strict=True):
-            turn = data.oMf[stewart.frame(loop.predecessor)].rotation
-            assert np.allclose(turn @ wanted, -force, atol=1e-6 * np.abs(found).max())
-    assert reactions.statically_determined(q).all()
 
 
 def test_determined_is_what_no_stress_changes(mini):

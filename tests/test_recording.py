@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crane.common.errors import InputError, OutputError, RecordingError
+from crane.common.errors import InputError, RecordingError
 from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import recorded_machine_name
 
@@ -81,12 +81,6 @@ def test_written_file(tmp_path):
     ]
 
 
-def test_round_trip(tmp_path):
-    recording = make()
-    recording.to_csv(tmp_path / "run.csv")
-    assert_equal(Recording.from_csv(tmp_path / "run.csv"), recording)
-
-
 def test_noise_is_as_large_as_asked_for_and_leaves_nothing_exact():
     time = np.arange(0.0, 40.0, 0.01)
     q = np.column_stack([np.sin(time), 0.02 * np.cos(time)])
@@ -129,14 +123,6 @@ def test_noise_that_cannot_be(deviations, message):
     with pytest.raises(InputError) as caught:
         one.with_noise(deviations)
     assert str(caught.value).startswith(message)
-
-
-def test_one_sample_without_channels_or_notes(tmp_path):
-    recording = Recording(
-        time=[2.5], joints=["q1"], q=[[0.1]], v=[[0.0]], tau=[[1e-300]], units={"q1": "rad"}
-    )
-    recording.to_csv(tmp_path / "run.csv")
-    assert_equal(Recording.from_csv(tmp_path / "run.csv"), recording)
 
 
 words = st.text(
@@ -206,28 +192,13 @@ def test_a_machine_s_own_name_is_kept_where_its_file_has_another(tmp_path):
     assert recorded_machine_name(make(machine="/there/my.yaml")) == "my"
 
 
-def test_failed_writing_leaves_nothing(tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="is a file, give the name of a folder"):
-        make().to_csv(tmp_path / "file" / "run.csv")
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
 BROKEN = {
     "q transposed": ({"q": np.zeros((2, 3))}, "q has the shape (2, 3), give (3, 2), a column"),
-    "short v": ({"v": np.zeros((2, 2))}, "v has the shape (2, 2), give (3, 2)"),
-    "flat tau": ({"tau": [1.0, 2.0, 3.0]}, "tau has the shape (3,), give (3, 2)"),
     "time in a column": ({"time": [[0.0], [1.0], [2.0]]}, "time has the shape (3, 1), give (3,)"),
     "text": ({"tau": [["a", "b"]] * 3}, "tau is not an array of numbers, give (3, 2)"),
     "short channel": ({"channels": {"valve": [1.0]}, "channel_units": {}}, "channel 'valve' has"),
     "nan": ({"q": [[0, 0], [0, np.nan], [0, 0]]}, "'X1' is nan at sample 1, give finite numbers"),
-    "inf": ({"v": [[0, 0], [0, 0], [np.inf, 0]]}, "'q1_velocity' is inf at sample 2"),
-    "nan in a channel": (
-        {"channels": {"tip_x": [np.nan, 0, 0]}},
-        "'tip_x' is nan at sample 0, give finite numbers",
-    ),
     "nan in time": ({"time": [0.0, np.nan, 1.0]}, "'time' is nan at sample 1"),
-    "time stands": ({"time": [0.0, 0.1, 0.1]}, "time goes from 0.1 to 0.1 s at sample 2"),
     "time goes back": ({"time": [0.0, -1.0, 2.0]}, "time goes from 0.0 to -1.0 s at sample 1"),
     "no joints": (
         {"joints": (), "units": {}, **dict.fromkeys(("q", "v", "tau"), np.zeros((3, 0)))},
@@ -246,10 +217,6 @@ BROKEN = {
     "a channel named time": (
         {"channels": {"time": [0, 1, 2]}, "channel_units": {}},
         "column 'time' is there twice",
-    ),
-    "a channel named as a joint": (
-        {"channels": {"q1": [0, 1, 2]}, "channel_units": {}},
-        "column 'q1' is there twice",
     ),
     "channels like a joint": (
         {
@@ -338,12 +305,6 @@ def test_units_are_converted(tmp_path):
     assert recording.channel_units == {"pressure_q1_a": "Pa"}
 
 
-def test_single_suffixed_columns_are_channels(tmp_path):
-    recording = from_text(tmp_path, f"{HEAD},wind_force [N],flow_velocity [m/s]\n0,1,2,3,4,5\n")
-    assert recording.joints == ("q1",)
-    assert recording.channel_units == {"wind_force": "N", "flow_velocity": "m/s"}
-
-
 BROKEN_FILES = {
     "no force": (
         "time [s],q1 [rad],q1_velocity [rad/s]\n0,1,2\n",
@@ -353,7 +314,6 @@ BROKEN_FILES = {
         "time [s],q1_velocity [rad/s],q1_force [N m]\n0,1,2\n",
         "column 'q1' is missing beside 'q1_velocity', 'q1_force'",
     ),
-    "no joint": ("time [s],q1 [rad]\n0,1\n", "no active joint among the columns 'time', 'q1'"),
     "gradians": (
         f"{HEAD}\n0,1,2,3\n".replace("[rad]", "[gon]"),
         "column 'q1' is in [gon], give 'q1 [rad]'",
@@ -366,11 +326,6 @@ BROKEN_FILES = {
         f"{HEAD}\n0,1,2,3\n".replace("[rad/s]", "[m/s]"),
         "column 'q1_velocity' is in [m/s], give 'q1_velocity [rad/s]'",
     ),
-    "force of another kind": (
-        f"{HEAD}\n0,1,2,3\n".replace("[N m]", "[N]"),
-        "column 'q1_force' is in [N], give 'q1_force [N m]'",
-    ),
-    "not a number": (f"{HEAD}\n0,1,2,three\n", "line 2, column 'q1_force': 'three' is not a"),
     "tab in a note": (f"# task: a\tb\n{HEAD}\n0,1,2,3\n", "task 'a\\tb' is not one line of text"),
 }
 
@@ -409,22 +364,6 @@ def test_velocities_may_be_missing(tmp_path):
     read = Recording.from_csv(path)
     assert read.joints == ("X1",)
     np.testing.assert_allclose(read.v[1:-1, 0], np.cos(time[1:-1]), atol=1e-5)
-
-
-def test_npz_holds_the_same_as_csv(tmp_path):
-    time = np.linspace(0, 1, 11)
-    columns = {
-        "time [s]": time, "X1 [m]": time**2, "X1_velocity [m/s]": 2 * time,
-        "X1_force [N]": 1 + time, "pressure [Pa]": 1e5 * time,
-    }  # fmt: skip
-    np.savez(tmp_path / "run.npz", **columns)
-    read = Recording.read(tmp_path / "run.npz")
-    read.to_csv(tmp_path / "run.csv")
-    again = Recording.read(tmp_path / "run.csv")
-    for one in (read, again):
-        assert one.joints == ("X1",) and one.channel_units == {"pressure": "Pa"}
-        np.testing.assert_array_equal(one.q[:, 0], time**2)
-        np.testing.assert_array_equal(one.tau[:, 0], 1 + time)
 
 
 @pytest.mark.parametrize(

@@ -1,17 +1,19 @@
-"""Recordings processed in blocks: same results, and bounded memory."""
+"""Recordings in blocks and of an hour: same results, and bounded memory."""
 
-import os
+import json
 import subprocess
 import sys
+import zipfile
 from functools import partial
-from pathlib import Path
 
 import forwarder_motions
 import numpy as np
 import pytest
+from command_line import typed
 from scipy.signal import lfilter
 
 import crane
+from crane.common import scratch_arrays
 from crane.identification.estimation import estimators, regressor
 from crane.identification.estimation.estimators import (
     huber,
@@ -28,15 +30,12 @@ from crane.identification.mechanics.regression_equations import (
     RegressionEquations,
 )
 from crane.identification.signals import kalman_smoother
-from crane.identification.signals.signal_processing import Motion, filter_rows
+from crane.identification.signals.signal_processing import Motion
+from crane.recordings.measured_recordings import read_run
+from crane.recordings.recording import Recording
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 motion = partial(forwarder_motions.motion, period=8.0, duration=16.0, step=2e-3, noise=1.0)
-
-
-@pytest.fixture(scope="module")
-def mini():
-    return crane.load("mini_forwarder")
 
 
 def rows(seed=0, count=3000):
@@ -113,20 +112,6 @@ def test_a_recording_in_blocks_is_that_as_a_whole(mini, monkeypatch, bandwidth):
     np.testing.assert_allclose(found.std, whole.std, rtol=1e-6)
 
 
-def test_the_equations_are_those_of_one_filter(mini, monkeypatch):
-    """Against the whole regressor through the filter at once."""
-    monkeypatch.setattr(regression_equations, "_BLOCK_BYTES", 1 << 19)
-    given, model = motion(mini, duration=8.0), IdentificationModel(mini)
-    found, _ = build_equations(model, [given], bandwidth=10.0)
-    assert len(list(found.blocks())) > 2
-    at = model.samples(given.q, given.v, given.a)
-    W = model.regressor(at)[:, :, found.base.independent]
-    W, tau = filter_rows(W, given.tau, 2e-3, 10.0, 12)
-    blocks = np.concatenate([W for _, W in found.blocks()])
-    assert (np.abs(blocks - W).max(axis=(0, 1)) < 1e-10 * np.abs(W).max(axis=(0, 1))).all()
-    assert np.abs(found.forces - tau).max() < 1e-10 * np.abs(tau).max()
-
-
 def test_what_is_held_does_not_grow_with_the_recording(mini, monkeypatch):
     monkeypatch.setattr(regression_equations, "_BLOCK_BYTES", 1 << 21)
     monkeypatch.setattr(regression_equations, "_CACHE_BYTES", 1 << 20)
@@ -152,31 +137,6 @@ def test_what_is_held_does_not_grow_with_the_recording(mini, monkeypatch):
     assert len(sizes) > 10
 
 
-LONG = """
-import resource, sys, numpy as np, crane
-from test_recording_blocks import motion
-from crane.identification.mechanics.identify import identify
-from crane.identification.signals.signal_processing import Motion
-machine = crane.load("mini_forwarder")
-one = motion(machine, duration=10.0, step=1e-3)
-parts = [np.tile(x, (30, 1)) for x in (one.q, one.v, one.a, one.tau)]
-given = Motion(1e-3 * np.arange(len(parts[0])), *parts)
-identify(machine, given, bandwidth=200.0)
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.long
-def test_five_minutes_at_a_kilohertz_unthinned():
-    """The regressor would take 0.5 GB as a whole."""
-    command = [sys.executable, "-W", "ignore", "-c", LONG]
-    here = Path(__file__).parent
-    paths = os.environ | {"PYTHONPATH": f"{here}{os.pathsep}{here.parent}"}
-    done = subprocess.run(command, env=paths, capture_output=True, text=True, check=True)
-    assert int(done.stdout.split()[-1]) < 1.0e6  # kB
-
-
 def test_smoothing_does_not_depend_on_the_blocks(monkeypatch):
     rng = np.random.default_rng(0)
     y = np.sin(0.01 * np.arange(3000)) + 1e-3 * rng.normal(size=3000)
@@ -191,3 +151,118 @@ def test_progress_goes_up_to_one(mini):
     identify(mini, motion(mini, duration=4.0), prior=0.3, progress=told.append)
     assert len(told) > 3 and told[-1] == 1.0
     assert (np.diff(told) >= 0).all()
+
+
+# --- an hour at 1 ms ----------------------------------------------------------------------------
+
+
+MEASURED = """
+import json, resource, sys
+from crane.cli import main
+import crane.view.page.report_page, crane.view.plots.recording_figure
+import crane.formats, crane.simulation
+base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+try:
+    main()
+finally:
+    print(json.dumps([base, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss]))
+"""
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """Scratch files for short recordings, too, in blocks of a few samples."""
+    monkeypatch.setattr(scratch_arrays, "_MIN_FILE_ELEMENTS", 1)
+    monkeypatch.setattr(scratch_arrays, "BLOCK_SIZE", 64)
+    monkeypatch.setattr("crane.recordings.timeseries.BLOCK_ROWS", 50)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "npz"])
+def test_what_is_in_scratch_files_is_the_same(mini, tmp_path, monkeypatch, request, suffix):
+    control = crane.PI(mini, crane.task_trajectory(mini, "lift"))
+    plain = crane.simulate(mini, control, duration=0.3, label="lift")
+    request.getfixturevalue("small")
+    before = len(scratch_arrays._memory_maps)
+    found = crane.simulate(mini, control, duration=0.3, label="lift")
+    assert len(scratch_arrays._memory_maps) > before
+    path = tmp_path / f"run.{suffix}"
+    getattr(found, f"to_{suffix}")(path)
+    again = Recording.read(path)
+    for other in (found, again):
+        assert list(other.columns()) == list(plain.columns())
+        for one, two in zip(other.columns().values(), plain.columns().values(), strict=True):
+            np.testing.assert_array_equal(one, two)
+        for name in ("units", "channel_units", "machine", "task", "controller", "ideal", "free"):
+            assert getattr(other, name) == getattr(plain, name)
+    del found, again, other, one
+    scratch_arrays.release_pages()
+    assert len(scratch_arrays._memory_maps) == before  # files go with the arrays
+
+
+def test_what_was_released_is_still_there(small):
+    values = scratch_arrays.empty_array(1000, 3)
+    values[:] = np.arange(3000.0).reshape(1000, 3)
+    scratch_arrays.release_pages()
+    np.testing.assert_array_equal(values, np.arange(3000.0).reshape(1000, 3))
+    squares = scratch_arrays.compute_in_blocks(lambda part: values[part] ** 2, 1000)
+    np.testing.assert_array_equal(squares, values**2)
+
+
+def test_where_there_is_no_room_it_is_in_memory(small, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(scratch_arrays.os, "posix_fallocate", full)
+    before = len(scratch_arrays._memory_maps)
+    values = scratch_arrays.empty_array(10, 2)
+    assert (
+        values.shape == (10, 2)
+        and values.flags.f_contiguous
+        and len(scratch_arrays._memory_maps) == before
+    )
+
+
+def test_a_run_as_npz_is_viewed_and_takes_the_place_of_a_csv(tmp_path):
+    out = tmp_path / "run"
+    for option in ([], ["--npz"]):
+        made = typed("simulate", "mini_forwarder", "--task", "lift", "--duration", "0.05",
+                     "--out", out, "--force", *option)  # fmt: skip
+        assert made.returncode == 0, made.stderr
+    assert {path.name for path in out.iterdir()} == {"recording.npz", "summary.md"}
+    with zipfile.ZipFile(out / "recording.npz") as archive:
+        assert archive.comment.decode().splitlines()[:2] == [
+            "# crane recording", "# machine: mini_forwarder",
+        ]  # fmt: skip
+    assert np.load(out / "recording.npz")["q1_velocity [rad/s]"].shape == (51,)
+    recording = read_run(out)
+    assert (recording.machine, recording.task, recording.ideal) == ("mini_forwarder", "lift", True)
+    shown = typed("view", out, "--no-open")
+    assert shown.returncode == 0 and (out / "view.html").is_file()
+    recording.write(out, overwrite=True)
+    assert {path.name for path in out.iterdir()} == {"recording.csv", "summary.md"}
+
+
+def peak(*arguments):
+    """Memory [bytes] that a command takes beside what it is made of."""
+    made = subprocess.run(
+        [sys.executable, "-c", MEASURED, *map(str, arguments)], capture_output=True, text=True
+    )
+    assert made.returncode == 0, made.stderr
+    base, most = json.loads(made.stdout.splitlines()[-1])
+    return 1024 * (most - base)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is counted otherwise here")
+@pytest.mark.long
+def test_memory_grows_by_less_than_a_recording(tmp_path):
+    """Memory grows by 320 bytes per sample of 40 columns."""
+    taken = {}
+    for duration in (90, 270):
+        out = tmp_path / str(duration)
+        made = ("simulate", "mini_forwarder", "--task", "lift", "--duration", duration)
+        taken[duration] = [
+            peak(*made, "--out", out), peak("view", out, "--no-open"), peak("plot", out),
+        ]  # fmt: skip
+    growth = [(long - short) / 180e3 for short, long in zip(*taken.values(), strict=True)]
+    assert max(growth) < 160, growth  # half of that: some columns at a time

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warned
 from rig import Rig, Tolerances
+from warned import quiet
 
 import crane
 from crane.common.errors import CraneWarning, RecordingError
@@ -57,10 +59,7 @@ def clean(mini):
 
 def told(call):
     """Lines that a call tells of the recording's defects, not of what its motion leaves open."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        call()
-    lines = [str(one.message) for one in caught if issubclass(one.category, CraneWarning)]
+    _, lines = warned.told(call)
     return [line for line in lines if not line.startswith("this motion does not determine")]
 
 
@@ -147,9 +146,7 @@ def test_all_defects_at_once(mini, clean):
 
 
 def test_a_locked_joint_has_to_stand(mini, clean):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        locked = crane.load("mini_forwarder", lock={"q1": 0.0})
+    locked = quiet(crane.load, "mini_forwarder", lock={"q1": 0.0})
     text = "'q1' is locked at 0 rad, but goes from -2.* to 1.* rad in the recording"
     with pytest.raises(RecordingError, match=text):
         smoothed_motion(locked, clean)

@@ -5,7 +5,6 @@ mechanics follows from those of the machine as it is by one factor (`scaled_mach
 """
 
 import re
-import warnings
 from functools import cache
 
 import numpy as np
@@ -13,6 +12,7 @@ import pytest
 import test_random_linkages
 from broken_machines import DATA, MODELS
 from scaled_machines import Scale
+from warned import quiet
 
 import crane
 from crane.common.errors import CraneError
@@ -37,12 +37,6 @@ def path_of(name, folder):
 def written(name, scale, folder):
     (folder / "as_it_is").mkdir(parents=True, exist_ok=True)
     return scale.write(path_of(name, folder / "as_it_is"), folder / f"{scale.s:g}_{scale.m:g}")
-
-
-def quiet(call, *arguments, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return call(*arguments, **options)
 
 
 @cache

@@ -5,12 +5,12 @@ import warnings
 import numpy as np
 import pytest
 import singular_linkages
+import urdf_text
 import yaml
 from hydraulic_rig import AREA_A, AREA_B, ORIFICE, rig
+from warned import quiet, without_a_word
 
 import crane
-from crane.codegen import Tape
-from crane.codegen.symbolic import required_operations
 from crane.common.errors import CraneError
 from crane.description.machine_parameters import parameter_unit
 from crane.dynamics import Dynamics
@@ -19,9 +19,6 @@ from crane.formats.machine_loading import MachineVariants
 from crane.hydraulics.circuit_elements import Supply
 from crane.hydraulics.components import Cylinder, Valve
 from crane.hydraulics.hydraulic_circuit import Hydraulics, Oil
-from crane.hydraulics.valve_cylinder_equations import ValveCylinderEquations
-from crane.identification.calibration.calibration_problem import CalibrationProblem
-from crane.recordings import timeseries
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.python_stepper import PythonStepper
 from crane.simulation.integration.rosenbrock import RosenbrockStepper
@@ -34,9 +31,7 @@ METHODS = ("rosenbrock", "DOP853", pytest.param("Radau", marks=pytest.mark.long)
 
 
 def run(*args, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        return crane.simulate(*args, **options)
+    return without_a_word(crane.simulate, *args, **options)
 
 
 def gaps(recording):
@@ -64,11 +59,9 @@ def closed(machine, pressures=None):
 
 def slewing(folder, brake=BRAKE, friction=None, valve=None, inertia=15.0, **cylinder):
     """A pillar that a rotary drive of 1e-3 m3/rad turns about z."""
-    (folder / "slew.urdf").write_text(
-        f"""<robot name="slew"><link name="base"/><link name="pillar"><inertial><mass value="10"/>
-        <inertia ixx="9" ixy="0" ixz="0" iyy="9" iyz="0" izz="{inertia}"/></inertial></link>
-        <joint name="turn" type="revolute"><parent link="base"/><child link="pillar"/>
-        <axis xyz="0 0 1"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint></robot>"""
+    turn = urdf_text.joint("turn", "base", "pillar", kind="revolute", limits=(-2, 2))
+    urdf_text.write(
+        folder, "slew", "base", urdf_text.body("pillar", 10, moments=(9, 9, inertia)), turn
     )
     hoses = dict.fromkeys(("hose_a", "hose_b"), 2e-4)
     parts = dict.fromkeys(("area_a", "area_b"), 1e-3) | hoses | {"brake": brake} | cylinder
@@ -203,16 +196,6 @@ def test_a_brake_stops_what_slews(tmp_path):
     assert gaps(found) < 1e-6
 
 
-def test_levers_that_jump_over_the_dead_band(tmp_path):
-    """The limit jumps with the spool, in an instant: from what holds to nothing."""
-    machine = slewing(tmp_path, seal_friction=2e-5)
-    signals = crane.joystick(machine, {"turn": [(0.3, 0.0), (0.6, 0.4), (0.9, 0.0)]})
-    found = run(machine, signals, None, 1.4, 1e-3)
-    assert (found.q[found.time < 0.3] == 0).all()
-    assert found.q[-1] > 0.02 and (found.v[-200:] == 0).all()
-    assert gaps(found) < 1e-6
-
-
 def test_a_smooth_law_has_the_same_limit(tmp_path):
     """tau_F = F_V v + (F_C + F_K) tanh(v / v_s), with spool and pressures of the recording."""
     for coulomb in (300.0, 0.0):
@@ -314,27 +297,6 @@ def test_machine_code_and_pinocchio_agree_along_a_motion(smoothing):
         assert at.v_a.shape == (n,)
         assert rated == pytest.approx(rate, rel=1e-8, abs=1e-6)
     assert rested > 0 or smoothing
-
-
-@pytest.mark.long
-def test_backends_agree_over_a_motion(tmp_path):
-    """Two loads that share a pump, by rosenbrock in machine code and scipy's BDF on Pinocchio."""
-    machine = rig(tmp_path, ORIFICE | {"dead_band": 0.05}, joints=("x", "y"),
-                  cylinder={"seal_friction": SEAL, "brake": 3000.0}, friction={"coulomb": 100.0},
-                  supply={"flow": 1e-3})  # fmt: skip
-    polygons = {"x": [0, 0.6, -0.5, 0], "y": [0, -0.4, 0.5, 0]}
-    signals = crane.control.ValveSignals(machine, [0.1, 0.3, 0.5, 0.8], polygons)
-    found = run(machine, signals, None, 1.0, 1e-2)
-    other = run(machine, signals, None, 1.0, 1e-2, backend="pinocchio")
-    assert np.ptp(found.q, axis=0).min() > 1e-3
-    assert np.abs(found.q - other.q).max() < 1e-6
-    assert (found.v[-1] == 0).all() and np.abs(other.v[-1]).max() < 1e-15
-    for name in ("friction_x", "rest_y", "dissipated", "hydraulic_loss"):
-        size = np.abs(found.channels[name]).max()
-        assert size > 1.0
-        off = np.abs(found.channels[name] - other.channels[name])
-        assert np.median(off) < 1e-5 * size and off[-1] < 1e-4 * size
-    assert max(gaps(found), gaps(other)) < 1e-5
 
 
 def test_joints_that_hold_share_the_limits_of_the_moment():
@@ -453,39 +415,6 @@ def test_forces_know_no_pressure(tmp_path, method):
     assert np.array_equal(batch.q[0], found.q)
 
 
-def operations(machine):
-    """How many operations forces, grips and rates of a circuit take."""
-    tape = Tape()
-    circuit = closed(machine).circuit
-    numbers = [float(x) if x == 0 else tape.load(0, i) for i, x in enumerate(circuit.constants)]
-    at = circuit.evaluate(
-        numbers,
-        tape.load_vector(1, 0, 1),
-        tape.load_vector(2, 0, 1),
-        tape.load_vector(3, 0, circuit.state_count),
-        tape.load_vector(4, 0, 1),
-        [],
-    )
-    return len(required_operations([*at.forces, *at.circuit_friction, *at.state_rates]))
-
-
-def test_who_has_none_computes_what_was_computed_before(tmp_path, monkeypatch):
-    plain, seals, brakes = (
-        rig(tmp_path, cylinder=cylinder)
-        for cylinder in ({}, {"seal_friction": SEAL}, {"brake": BRAKE})
-    )
-    counts = [operations(machine) for machine in (plain, seals, brakes)]
-    monkeypatch.setattr(ValveCylinderEquations, "circuit_friction", lambda *_: 0.0)
-    assert operations(plain) == counts[0] < min(counts[1:])
-    numbers = [Dynamics(machine).formula_constants.size for machine in (plain, seals)]
-    assert numbers[1] == numbers[0] + 1
-    assert not find_stick_slip_columns(plain) and find_stick_slip_columns(
-        seals
-    ) == find_stick_slip_columns(brakes) == (0,)
-    assert Dynamics(plain).formula_structure.circuit_friction_columns == ()
-    assert closed(plain).circuit_friction(None) == []
-
-
 def test_sensitivities_know_seals_and_brake(tmp_path):
     """Against differences of simulations, of order 4."""
     law = {"coulomb": 300.0, "viscous": 2000.0}
@@ -555,55 +484,12 @@ def test_linear_models_have_seals_that_slide(tmp_path):
     """At a constant speed the trimmed force bears them."""
     machine = rig(tmp_path, axis="1 0 0", cylinder={"seal_friction": SEAL},
                   friction={"viscous": 500.0})  # fmt: skip
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        model = crane.linearize(machine, velocity={"x": 0.05})
+    model = quiet(crane.linearize, machine, velocity={"x": 0.05})
     a, b = (model.x[model.states.index(f"pressure_x_{side}")] for side in "ab")
     force = AREA_A * a - AREA_B * b
     assert force == pytest.approx(
         25.0 + MIN_COULOMB_FRICTION + SEAL * (a + b - 2 * TANK), rel=1e-7
     )
-
-
-@pytest.mark.slow
-def test_calibration_finds_seals(tmp_path, monkeypatch):
-    """Laws of seals are smooth away from rest; here they alone cause stiction."""
-    made, variant = {}, CalibrationProblem.simulated_machine
-
-    def noted(problem, z, smooth):
-        made[smooth > 0] = variant(problem, z, smooth)
-        return made[smooth > 0]
-
-    monkeypatch.setattr(CalibrationProblem, "simulated_machine", noted)
-    machine = rig(tmp_path, axis="1 0 0", cylinder={"seal_friction": SEAL},
-                  friction={"viscous": 900.0})  # fmt: skip
-    time = np.arange(0.0, 4.0, 0.01)
-    levers = 0.4 * np.array([0, 1, 0, -1, 1, -0.5, 0.7, 0])[(time / 0.5).astype(int)]
-    true = run(
-        machine, crane.control.ValveSignals(machine, time, {"x": levers}), [0.2], 3.99, 1e-2
-    )
-    random, columns = np.random.default_rng(3), true.columns()
-    noise = {"x": 1e-4, "pressure_x_a": 1e4, "pressure_x_b": 1e4}
-    values = [columns[name] + size * random.normal(size=len(time)) for name, size in noise.items()]
-    units = {"time": "s", "voltage_x": "V", "x": "m", "pressure_x_a": "Pa", "pressure_x_b": "Pa"}
-    table = timeseries.Table(units, np.column_stack([time, levers, *values]), {})
-    timeseries.write_table(tmp_path / "run.csv", table)
-    start = crane.load(machine.path, {"cylinder.x.seal_friction": 0.5 * SEAL})
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", crane.CraneWarning)
-        found = crane.calibrate(start, tmp_path / "run.csv", ["cylinder.x.seal_friction"])
-    (one,) = found.parameters
-    assert abs(one.value - SEAL) < 2.5 * one.interval_half_width
-    assert one.interval_half_width < 0.05 * SEAL
-    assert (
-        find_stick_slip_columns(made[False]) == (0,) and find_stick_slip_columns(made[True]) == ()
-    )
-    none = crane.load(machine.path, {"cylinder.x.seal_friction": 0.0})
-    zero = {"cylinder.x.seal_friction": (0.0, 0.0, 1e-3)}
-    with pytest.raises(
-        CraneError, match="seal_friction' cannot be varied about 0, where the mach"
-    ):
-        crane.calibrate(none, tmp_path / "run.csv", zero)
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import pytest
 from command_line import typed
+from urdf_text import sliding_block
 
 import crane
 from crane.common.errors import CraneError
@@ -16,13 +17,7 @@ MASS, STIFFNESS, DAMPING = 2.0, 50.0, 0.6
 
 def block(folder, friction="{}", spring=""):
     """A block that slides along x."""
-    (folder / "block.urdf").write_text(
-        f"""<robot name="block"><link name="base"/><link name="block"><inertial>
-        <mass value="{MASS}"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
-        </link><joint name="x" type="prismatic"><parent link="base"/><child link="block"/>
-        <axis xyz="1 0 0"/><limit lower="-100" upper="100" effort="1" velocity="1"/></joint>
-        </robot>"""
-    )
+    sliding_block(folder, MASS)
     (folder / "block.yaml").write_text(
         f"name: block\nchains: [{{name: block, urdf: block.urdf}}]\nloops: []\nactive: [x]\n"
         f"home: {{x: 0}}\nfriction: {friction}\n{spring}"

@@ -1,6 +1,5 @@
 """Derivatives of the dynamics against differences of order 8 and Pinocchio's."""
 
-import warnings
 from functools import cache
 
 import numpy as np
@@ -8,6 +7,7 @@ import pinocchio as pin
 import pytest
 from linkages import MACHINES, loaded
 from test_floating import ARM, states, walker
+from warned import quiet
 
 import crane
 from crane.common.errors import CraneError
@@ -28,9 +28,7 @@ STATES = {"inverse": 3, "forward": 3, "regressor": 3, "mass_matrix": 1, "gravity
 def machine_of(name):
     if name in MACHINES:
         return loaded(name)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return crane.load(name)
+    return quiet(crane.load, name)
 
 
 dynamics_of = cache(crane.Dynamics)
@@ -185,62 +183,6 @@ def test_open_arms_agree_with_pinocchio():
     for name, wanted in (("q_a", by_q), ("v_a", by_v), ("a_a", by_a)):
         scale = np.abs(wanted).max()
         np.testing.assert_allclose(found[name], wanted, rtol=0, atol=1e-11 * scale)
-
-
-@pytest.mark.slow
-def test_closed_machines_agree_with_pinocchios_constraints():
-    """Of ball joints, whose equations of points are independent.
-
-    The first column of Pinocchio's `ddq_dq` (4.1) is not the derivative of its own dynamics.
-    """
-    machine = machine_of("stewart")
-    dynamics, span, q_a, v_a, a_a = state(machine, 6)
-    tau_a = dynamics.inverse(q_a, v_a, a_a)
-    model, data = machine.model.copy(), machine.model.createData()
-    contacts = []
-    for loop in machine.closure.equations.loops:
-        assert loop.type == "spherical"
-        ends = []
-        for link in (loop.predecessor, loop.successor):
-            frame = model.frames[machine.frame(link)]
-            ends += [frame.parentJoint, frame.placement]
-        contacts.append(
-            pin.RigidConstraintModel(
-                pin.ContactType.CONTACT_3D, model, *ends, pin.ReferenceFrame.LOCAL
-            )
-        )
-    states = [contact.createData() for contact in contacts]
-    settings = pin.ProximalSettings(1e-14, 1e-12, 20)
-    pin.initConstraintDynamics(model, data, contacts, states)
-    closure = machine.closure
-    q = closure.solve(q_a)
-    gamma = closure.gamma(q)
-    tau = np.zeros(model.nv)
-    tau[closure.active] = tau_a + dynamics.passive(q_a, v_a)
-
-    def moved(x):
-        return pin.constraintDynamics(
-            model, data, x, gamma @ v_a, tau, contacts, states, settings
-        ).copy()
-
-    first = difference(moved, q, np.eye(model.nv)[0], 1e-3)
-    a = moved(q)
-    np.testing.assert_allclose(a[closure.active], a_a, rtol=0, atol=1e-8 * np.abs(a_a).max())
-    pin.computeConstraintDynamicsDerivatives(model, data, contacts, states, settings)
-    found = dynamics.derivatives("forward", q_a, v_a, tau_a)
-    rows, by_q = closure.active, data.ddq_dq.copy()
-    by_q[:, 0] = first
-    bent = np.array([
-        difference(lambda x: closure.gamma(closure.solve(x)) @ v_a, q_a, unit, 2e-3)
-        for unit in np.eye(len(q_a))
-    ]).T  # fmt: skip
-    for name, wanted in (
-        ("q_a", by_q[rows] @ gamma + data.ddq_dv[rows] @ bent),
-        ("v_a", data.ddq_dv[rows] @ gamma),
-        ("tau_a", data.ddq_dtau[np.ix_(rows, rows)]),
-    ):
-        scale = np.abs(wanted).max()
-        np.testing.assert_allclose(found[name], wanted, rtol=0, atol=1e-8 * scale)
 
 
 def test_every_operation_and_the_formulas_of_their_own_agree(monkeypatch):

@@ -12,7 +12,6 @@ from crane.common.errors import CraneWarning, InputError, RecordingError
 from crane.identification.mechanics.force_comparison import check_forces
 from crane.identification.mechanics.smoothed_motion import (
     check_recording,
-    signal_delay,
 )
 from crane.identification.signals import kalman_smoother
 from crane.identification.signals import signal_processing as signals
@@ -41,28 +40,6 @@ def model(h):
         for s, w in zip((nodes + 1) * h / 2, weights, strict=True)
     ]
     return F, h * np.array(b).T @ np.array(b)
-
-
-def rts(y, h):
-    """Textbook Kalman filter and smoother with a wide prior."""
-    F, Q = model(h)
-    x, P, H = np.zeros(4), np.eye(4) * 1e7, np.eye(1, 4)
-    steps = []
-    for k, measured in enumerate(y):
-        if k:
-            x, P = F @ x, F @ P @ F.T + Q
-        predicted = x, P
-        K = P @ H.T / (P[0, 0] + 1)
-        x = x + K[:, 0] * (measured - x[0])
-        A = np.eye(4) - K @ H
-        P = A @ P @ A.T + K @ K.T
-        steps.append((*predicted, x, P))
-    out = [steps[-1][2:]]
-    for (_, _, x, P), (xp, Pp, _, _) in zip(steps[-2::-1], steps[:0:-1], strict=True):
-        C = P @ F.T @ np.linalg.inv(Pp)
-        xs, Ps = out[-1]
-        out.append((x + C @ (xs - xp), P + C @ (Ps - Pp) @ C.T))
-    return [np.array(part) for part in zip(*out[::-1], strict=True)]
 
 
 def whole(y, h):
@@ -103,18 +80,6 @@ def test_smoother_is_the_solution_of_all_equations_at_once(fixed, h, count):
     units = (h / 0.01) ** np.arange(3)
     np.testing.assert_allclose(states, exact[:, :3] * units, atol=1e-7 * units.max(), rtol=1e-7)
     np.testing.assert_allclose(stds, sigma * np.sqrt(variances[:, :3]) * units, rtol=1e-8)
-
-
-def test_smoother_agrees_with_the_textbook_recursion(fixed):
-    """Within what its wide prior costs in rounding and bias."""
-    h, y = 0.5, np.random.default_rng(2).standard_normal(1500).cumsum()
-    states, stds, sigma, _ = fixed(y, 0.01, h)
-    exact, P = rts(y, h)
-    units = (h / 0.01) ** np.arange(3)
-    np.testing.assert_allclose(states / units, exact[:, :3], atol=1e-4)
-    inner = slice(100, None)
-    variances = np.diagonal(P, axis1=1, axis2=2)[inner, :3]
-    np.testing.assert_allclose(stds[inner] / units / sigma, np.sqrt(variances), rtol=1e-6)
 
 
 def test_likelihood_is_the_density_of_what_polynomials_leave():
@@ -262,13 +227,6 @@ def test_filtered_rows_keep_the_parameters():
     regressor[7, 1, 2] = np.nan
     with pytest.raises(InputError, match="regressor is not finite at sample 7"):
         signals.filter_rows(regressor, regressor @ truth, 1e-3, 20.0, 10)
-
-
-def test_thinning_lets_nothing_fold_back():
-    time = np.arange(20_000) * 1e-3
-    high = np.sin(2 * np.pi * 75.1 * time)[:, None]  # seen as 24.9 Hz at 100 Hz
-    _, y = signals.filter_rows(high[:, None], high, 1e-3, 25.0, 10)
-    assert np.abs(y[100:-100]).max() < 1.6e-4
 
 
 @pytest.mark.parametrize(("cutoff", "decimation"), [(5.0, 50), (5.0, 7), (60.0, 4)])
@@ -454,9 +412,3 @@ def test_forces_come_late():
     )
     with pytest.raises(RecordingError, match="'q1_force' is 200 ms behind its model"):
         check_forces(late, modelled[50:], JOINTS)
-
-
-def test_delay_between_samples():
-    time = np.arange(5000) * 4e-3
-    found = signal_delay(time, movement(time)[1][:, 0], movement(time - 0.0615)[1][:, 0])
-    assert abs(found - 0.0615) < 1e-3

@@ -1,33 +1,23 @@
 """Simulations: outputs, tolerances, start states, errors."""
 
-import warnings
-
 import numpy as np
 import pytest
 from broken_machines import DATA
-from scipy.integrate import solve_ivp
 
 import crane
 from crane.common.errors import CraneWarning, InputError, LimitError, SimulationError
 
 
 @pytest.fixture(scope="module")
-def forwarder():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        return crane.load("mini_forwarder")
-
-
-@pytest.fixture(scope="module")
-def springy(forwarder):
+def springy(mini):
     """Frictionless, carried by a spring at each actuator about the middle of its stroke."""
     middle = np.array([0.0, 0.015, 0.015])
-    weight = crane.Dynamics(forwarder).gravity(middle)
+    weight = crane.Dynamics(mini).gravity(middle)
     springs = tuple(
         crane.description.ForceElement(joint, stiffness=k, rest=float(middle[i] + weight[i] / k))
-        for i, (joint, k) in enumerate(zip(forwarder.active, (0.3, 2000.0, 4000.0), strict=True))
+        for i, (joint, k) in enumerate(zip(mini.active, (0.3, 2000.0, 4000.0), strict=True))
     )
-    return forwarder.replace(friction={}, forces=springs, end_stops=())
+    return mini.replace(friction={}, forces=springs, end_stops=())
 
 
 START = (np.array([0.3, 0.018, 0.013]), np.array([0.5, 0.0, 0.02]))
@@ -59,65 +49,37 @@ def test_energy_is_conserved_and_the_error_falls_with_the_fourth_power(springy):
         assert 3.7 < np.log2(drift[coarse] / drift[coarse / 2]) < 5.3
 
 
-def test_agrees_with_an_adaptive_method_of_another_order(springy):
-    dynamics = crane.Dynamics(springy)
-    n = 3
-
-    def rate(_, state):
-        q_a, v_a = state[:n], state[n:]
-        return np.concatenate([v_a, dynamics.forward(q_a, v_a, np.zeros(n))])
-
-    other = solve_ivp(
-        rate, (0, 0.5), np.concatenate(START), method="DOP853", rtol=1e-11, atol=1e-13
-    )
-    recording = crane.simulate(springy, initial=START, duration=0.5)
-    np.testing.assert_allclose(recording.q[-1], other.y[:n, -1], atol=1e-9)
-    np.testing.assert_allclose(recording.v[-1], other.y[n:, -1], atol=1e-8)
-
-
-def test_power_balance_with_friction_and_control(forwarder):
-    path = crane.task_trajectory(forwarder, "return")
-    recording = crane.simulate(forwarder, crane.PI(forwarder, path), duration=1.5)
+def test_power_balance_with_friction_and_control(mini):
+    path = crane.task_trajectory(mini, "return")
+    recording = crane.simulate(mini, crane.PI(mini, path), duration=1.5)
     assert imbalance(recording) < 1e-6
     assert recording.channels["dissipated"][-1] > 0.1  # [J], so there was something to balance
 
 
-def test_power_balance_at_the_end_stops(forwarder):
-    recording = crane.simulate(forwarder, duration=0.6, step=5e-4)  # falls onto its stops
-    stopped = recording.q[:, 1] > forwarder.upper[1]
+def test_power_balance_at_the_end_stops(mini):
+    recording = crane.simulate(mini, duration=0.6, step=5e-4)  # falls onto its stops
+    stopped = recording.q[:, 1] > mini.upper[1]
     assert stopped.any()
-    assert recording.q[:, 1].max() < forwarder.upper[1] + 0.002
+    assert recording.q[:, 1].max() < mini.upper[1] + 0.002
     assert imbalance(recording) < 1e-4  # the stop's damping jumps, which costs the order
 
 
-def test_loops_stay_closed(forwarder):
-    path = crane.task_trajectory(forwarder, "return")
-    recording = crane.simulate(forwarder, crane.PI(forwarder, path), duration=0.3)
-    columns = [
-        recording.q[:, forwarder.active.index(joint)]
-        if joint in forwarder.active
-        else recording.channels[joint]
-        for joint in forwarder.joints
-    ]
-    assert forwarder.closure.residual(np.column_stack(columns)).max() < 1e-12
-
-
-def test_channels_are_those_of_the_machine(forwarder):
-    path = crane.task_trajectory(forwarder, "lift")
-    recording = crane.simulate(forwarder, crane.PI(forwarder, path), duration=0.4, label="lift")
-    kinematics, dynamics = crane.Kinematics(forwarder), crane.Dynamics(forwarder)
+def test_channels_are_those_of_the_machine(mini):
+    path = crane.task_trajectory(mini, "lift")
+    recording = crane.simulate(mini, crane.PI(mini, path), duration=0.4, label="lift")
+    kinematics, dynamics = crane.Kinematics(mini), crane.Dynamics(mini)
     tip = np.column_stack([recording.channels[f"tip_{axis}"] for axis in "xyz"])
     np.testing.assert_allclose(tip, kinematics.position(recording.q), atol=1e-12)
-    reference = np.column_stack([recording.channels[f"reference_{j}"] for j in forwarder.active])
+    reference = np.column_stack([recording.channels[f"reference_{j}"] for j in mini.active])
     np.testing.assert_array_equal(reference, path(recording.time)[0])
     wanted = np.column_stack([recording.channels[f"reference_tip_{axis}"] for axis in "xyz"])
     np.testing.assert_allclose(wanted, kinematics.position(reference), atol=1e-9)
-    friction = np.column_stack([recording.channels[f"friction_{j}"] for j in forwarder.active])
+    friction = np.column_stack([recording.channels[f"friction_{j}"] for j in mini.active])
     moving = recording.v != 0
     law = dynamics.friction(recording.q, recording.v)
     np.testing.assert_allclose(friction[moving], law[moving], atol=1e-9)
     # at rest it is what keeps the drives there
-    rest = np.column_stack([recording.channels[f"rest_{j}"] for j in forwarder.active])
+    rest = np.column_stack([recording.channels[f"rest_{j}"] for j in mini.active])
     weight = dynamics.gravity(recording.q)
     np.testing.assert_allclose(recording.tau[1], weight[1] + rest[1], atol=1e-9)
     assert 0 < moving.sum() < moving.size
@@ -128,18 +90,7 @@ def test_channels_are_those_of_the_machine(forwarder):
     assert recording.units == {"q1": "rad", "X1": "m", "X2": "m"}
 
 
-def test_survives_the_round_trip_through_a_file(forwarder, tmp_path):
-    recording = crane.simulate(forwarder, duration=0.02)
-    recording.to_csv(tmp_path / "run.csv")
-    back = crane.Recording.from_csv(tmp_path / "run.csv")
-    np.testing.assert_array_equal(back.q, recording.q)
-    np.testing.assert_array_equal(back.tau, recording.tau)
-    assert back.channels.keys() == recording.channels.keys()
-    for name, values in recording.channels.items():
-        np.testing.assert_array_equal(back.channels[name], values)
-
-
-def test_a_function_controls_as_well(forwarder):
+def test_a_function_controls_as_well(mini):
     gain = np.array([15.0, 5500.0, 18000.0])
     target = np.array([0.1, 0.02, 0.012])
     seen = []
@@ -148,32 +99,32 @@ def test_a_function_controls_as_well(forwarder):
         seen.append(time)
         return gain * (target - q_a)
 
-    recording = crane.simulate(forwarder, hold, duration=0.01)
+    recording = crane.simulate(mini, hold, duration=0.01)
     np.testing.assert_array_equal(recording.tau, gain * (target - recording.q))
     assert min(seen) == 0 and max(seen) == pytest.approx(0.01)
 
 
-def test_progress_ends_at_one(forwarder):
+def test_progress_ends_at_one(mini):
     shares = []
-    crane.simulate(forwarder, duration=0.01, progress=shares.append)
+    crane.simulate(mini, duration=0.01, progress=shares.append)
     assert shares == sorted(shares) and shares[-1] == 1.0
 
 
 @pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 def test_a_step_that_is_too_long_is_told(smooth):
-    forwarder = smooth
-    path = crane.task_trajectory(forwarder, "return")
+    mini = smooth
+    path = crane.task_trajectory(mini, "return")
     with pytest.warns(CraneWarning, match="step of 0.005 s is too long"):
-        crane.simulate(forwarder, crane.PI(forwarder, path), duration=0.5, step=5e-3, method="rk4")
-    path = crane.task_trajectory(forwarder, "lift")
+        crane.simulate(mini, crane.PI(mini, path), duration=0.5, step=5e-3, method="rk4")
+    path = crane.task_trajectory(mini, "lift")
     with pytest.raises(SimulationError, match="explodes .* shorten the step"):
-        crane.simulate(forwarder, crane.PI(forwarder, path), duration=0.5, step=5e-3, method="rk4")
+        crane.simulate(mini, crane.PI(mini, path), duration=0.5, step=5e-3, method="rk4")
 
 
 @pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
-def test_a_machine_that_leaves_its_branch_goes_on_and_is_told(forwarder):
+def test_a_machine_that_leaves_its_branch_goes_on_and_is_told(mini):
     """A cylinder pushed through its dead centre, where nothing stops it."""
-    free = forwarder.replace(friction={}, end_stops=())
+    free = mini.replace(friction={}, end_stops=())
     with pytest.warns(CraneWarning) as caught:
         run = crane.simulate(
             free, lambda t, q, v: np.array([0.0, 200.0, 0.0]), duration=0.5, step=2e-4
@@ -189,8 +140,8 @@ def test_a_machine_that_leaves_its_branch_goes_on_and_is_told(forwarder):
     assert np.ptp(balance) < 1e-4 * np.ptp(run.channels["kinetic"])
 
 
-def test_leaving_the_limits_without_an_end_stop_is_told(forwarder):
-    free = forwarder.replace(end_stops=())
+def test_leaving_the_limits_without_an_end_stop_is_told(mini):
+    free = mini.replace(end_stops=())
     with pytest.warns(CraneWarning) as caught:
         run = crane.simulate(free, lambda t, q, v: np.array([0.0, 30.0, 0.0]), duration=0.4)
     (line,) = (str(one.message) for one in caught if "passes its limit" in str(one.message))
@@ -252,9 +203,9 @@ def test_passive_joints_beyond_their_limits_are_told_in_the_same_line(tmp_path):
         ),
     ],
 )
-def test_wrong_arguments_are_one_line(forwarder, arguments, error, text):
+def test_wrong_arguments_are_one_line(mini, arguments, error, text):
     with pytest.raises(error) as caught:
-        crane.simulate(forwarder, **arguments)
+        crane.simulate(mini, **arguments)
     assert text in str(caught.value) and "\n" not in str(caught.value)
 
 
@@ -272,12 +223,12 @@ def test_unknown_method(springy):
         crane.simulate(springy, duration=0.1, method="rk5")
 
 
-def test_steps_by_their_error_do_not_depend_on_what_is_recorded(forwarder):
+def test_steps_by_their_error_do_not_depend_on_what_is_recorded(mini):
     """With a reference, states of the controller and friction; against fixed steps, too."""
-    control = crane.PI(forwarder, crane.task_trajectory(forwarder, "lift"))
-    fine = crane.simulate(forwarder, control, duration=0.28, step=5e-5, method="rk4")
+    control = crane.PI(mini, crane.task_trajectory(mini, "lift"))
+    fine = crane.simulate(mini, control, duration=0.28, step=5e-5, method="rk4")
     for step in (1e-3, 7e-3, 0.07):
-        found = crane.simulate(forwarder, control, duration=0.28, step=step, method="DOP853")
+        found = crane.simulate(mini, control, duration=0.28, step=step, method="DOP853")
         every = round(step / 5e-5)
         np.testing.assert_allclose(found.q, fine.q[::every], rtol=0, atol=1e-12)
         np.testing.assert_allclose(found.v, fine.v[::every], rtol=0, atol=1e-9)
@@ -302,9 +253,9 @@ def test_steps_by_their_error_turn_a_floating_machine_round():
     assert sizes.max() <= np.pi + 1e-9 and np.abs(np.diff(turned, axis=0)).max() > np.pi
 
 
-def test_too_many_steps(forwarder):
+def test_too_many_steps(mini):
     with pytest.raises(InputError, match="1e[+]15 steps of 0.001 s, at most 4000000"):
-        crane.simulate(forwarder, duration=1e12)
+        crane.simulate(mini, duration=1e12)
 
 
 @pytest.mark.filterwarnings("ignore::crane.CraneWarning")

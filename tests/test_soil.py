@@ -1,10 +1,11 @@
 """Soil cutting: force balance of wedges, tables of earth pressure, dissipation, energy."""
 
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
+from urdf_text import body, frame, joint, write
+from warned import quiet
 
 import crane
 from crane.common.errors import CraneError
@@ -203,28 +204,20 @@ def test_it_begins_at_the_surface_without_a_jump():
 @pytest.fixture
 def sled(tmp_path):
     """A blade of 300 kg on a sled along x and z that pitches: x, z, pitch."""
-    inertia = '<inertial><origin xyz="-0.2 0 0.5"/><mass value="300"/><inertia ixx="20" iyy="30"'
-    inertia += ' izz="20" ixy="0" ixz="0" iyz="0"/></inertial>'
-    path = tmp_path / "sled.urdf"
-    path.write_text(
-        f"""<robot name="sled"><link name="world"/><link name="along"/><link name="above"/>
-        <link name="body">{inertia}</link><link name="blade"/>
-        <joint name="x" type="prismatic"><parent link="world"/><child link="along"/>
-        <axis xyz="1 0 0"/><limit lower="-9" upper="9" effort="1e6" velocity="9"/></joint>
-        <joint name="z" type="prismatic"><parent link="along"/><child link="above"/>
-        <axis xyz="0 0 1"/><limit lower="-9" upper="9" effort="1e6" velocity="9"/></joint>
-        <joint name="pitch" type="revolute"><parent link="above"/><child link="body"/>
-        <axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="1e6" velocity="9"/></joint>
-        <joint name="edge" type="fixed"><parent link="body"/><child link="blade"/>
-        <origin xyz="0.1 0 -0.4"/></joint></robot>"""
-    )
+    slides = {"kind": "prismatic", "limits": (-9, 9, 1e6, 9)}
+    path = write(
+        tmp_path, "sled", "world", '<link name="along"/><link name="above"/>',
+        body("body", 300, (-0.2, 0, 0.5), (20, 30, 20)),
+        joint("x", "world", "along", axis=(1, 0, 0), **slides),
+        joint("z", "along", "above", **slides),
+        joint("pitch", "above", "body", (0, 0, 0), "revolute", (0, 1, 0), (-2, 2, 1e6, 9)),
+        frame("blade", "body", (0.1, 0, -0.4)),
+    )  # fmt: skip
     return crane.load(path)
 
 
 def run(machine, loads, initial, duration, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return crane.simulate(machine, None, initial, duration, loads=loads, **options)
+    return quiet(crane.simulate, machine, None, initial, duration, loads=loads, **options)
 
 
 def test_pulled_as_the_equation_says_it_goes_on_at_its_speed(sled, tmp_path):

@@ -1,12 +1,11 @@
 """Reach and stroke ends in studies against closed forms, not against a grid."""
 
-import warnings
-
 import numpy as np
 import pytest
+from warned import quiet
 
 import crane
-from crane.common.errors import ClosureError, CraneWarning
+from crane.common.errors import ClosureError
 from crane.studies.measures import measure_strokes
 
 pytestmark = pytest.mark.slow
@@ -69,9 +68,7 @@ def arm(tmp_path_factory):
     states = f'<group_state name="home">{"".join(home)}</group_state>'
     file = tmp_path_factory.mktemp("arm") / "arm.urdf"
     file.write_text(f'<robot name="arm">{"".join(parts)}{states}</robot>')
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        machine = crane.load(file)
+    machine = quiet(crane.load, file)
     assert machine.active == ("X1", "X2", "X3") and machine.tip == "tip"
     return file
 

@@ -7,7 +7,6 @@ follows a branch is its own: alone, too, each runs in a fresh thread.
 import sys
 import threading
 import time
-import warnings
 from functools import partial
 from pathlib import Path
 
@@ -15,18 +14,10 @@ import numpy as np
 import pytest
 
 import crane
-from crane.common.errors import CraneWarning
 from crane.control import ValveDrive
 from crane.dynamics.tipping_stability import TippingStability
 
 THREADS, SAMPLES = 3, 6
-
-
-@pytest.fixture(scope="module")
-def patu():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        return crane.load("patu655")
 
 
 PACKAGE = str(Path(crane.__file__).parent)

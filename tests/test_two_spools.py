@@ -1,7 +1,6 @@
 """Valves with one spool per chamber against closed forms, scipy and their balances."""
 
 import dataclasses
-import warnings
 
 import numpy as np
 import pytest
@@ -217,30 +216,6 @@ def test_numbers_are_named_changed_written_and_read(tmp_path):
     model = crane.linearize(machine, velocity={"x": 0.05})
     assert model.inputs == ("voltage_x", "voltage_x_b")
     assert np.abs(model.B[:, 1]).max() > 0
-
-
-@pytest.mark.slow
-def test_a_calibration_tells_the_second_spool(tmp_path):
-    """Numbers of the second spool come back from a recording of both."""
-    truth = {"neutral": 0.05, "full": 1.0, "delay": 0.031}
-    (tmp_path / "true").mkdir(), (tmp_path / "file").mkdir()
-    machine = rig(tmp_path / "true", VALVE | {"bandwidth": 60.0, "spool_b": truth}, axis="1 0 0",
-                  friction={"viscous": 5e4})  # fmt: skip
-    time = np.arange(0.0, 1.6, 0.01)
-    signals = {"x": 0.5 * np.sin(8 * time), "x_b": 0.05 + 0.4 * np.sin(8 * time + 0.5)}
-    run = crane.simulate(machine, ValveSignals(machine, time, signals), duration=1.59)
-    path = tmp_path / "run.csv"
-    run.to_csv(path)
-    off = {"neutral": 0.0, "delay": 0.01}
-    start = rig(tmp_path / "file", VALVE | {"bandwidth": 60.0, "spool_b": off}, axis="1 0 0",
-                friction={"viscous": 5e4})  # fmt: skip
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        fit = {"valve.x.spool_b.neutral": (0.0, -0.2, 0.2), "valve.x.spool_b.delay": None}
-        found = crane.calibrate(start, path, fit)
-    second = found.machine.hydraulics.valves["x"].spool_b
-    assert second.neutral == pytest.approx(0.05, abs=2e-3)
-    assert second.delay == pytest.approx(0.031, abs=1e-3)
 
 
 @pytest.mark.parametrize(

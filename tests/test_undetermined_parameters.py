@@ -15,7 +15,6 @@ import crane
 from crane.common.errors import CraneWarning, RecordingError
 from crane.identification.mechanics.feasible_parameters import (
     body_parameters,
-    divergence_hessian_root,
     pseudo_inertia,
     thicken_body,
 )
@@ -26,13 +25,6 @@ from crane.identification.mechanics.smoothed_motion import smoothed_motion
 from crane.identification.signals.signal_processing import Motion
 
 motion = partial(forwarder_motions.motion, period=8.0, duration=16.0)
-
-
-@pytest.fixture(scope="module")
-def mini():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        return crane.load("mini_forwarder")
 
 
 @pytest.fixture(scope="module")
@@ -147,18 +139,6 @@ def test_a_recording_that_tells_all_is_told_without_a_word():
 
 
 # --- standard deviations ---------------------------------------------------------------------
-
-
-def test_curvature_is_the_second_derivative_of_the_divergence():
-    """- log det (P + h L E L^T), P = L L^T, is - log det P - log det (1 + h E): E_ij E_ij."""
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        L = np.tril(rng.normal(size=(4, 4)))
-        E = rng.normal(size=(4, 4))
-        E = E + E.T
-        along = body_parameters(L @ E @ L.T)
-        wanted = np.sum((divergence_hessian_root(body_parameters(L @ L.T)) @ along) ** 2)
-        assert np.sum(E**2) == pytest.approx(wanted, rel=1e-9)
 
 
 @pytest.mark.filterwarnings("ignore::crane.CraneWarning")

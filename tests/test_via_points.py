@@ -4,48 +4,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.interpolate import PPoly, make_interp_spline
-from scipy.spatial.transform import Rotation, Slerp
 
 import crane
 from crane.common.errors import DescriptionError, InputError, UnreachableTipError
 from crane.motion.attitude import InclinationCoordinate, roll_pitch_yaw
 from crane.motion.quintic_splines import PiecewisePolynomial, least_jerk
 
-PLACES = [[0.0, 1.0], [0.5, np.nan], [0.2, 3.0], [1.0, 2.0]]
-TIMES = [0.0, 0.4, 1.5, 2.0]
-
-
-def jerk(path, start, end, count=4000):
-    """The integral of the squared jerk, by differences of the accelerations."""
-    time = np.linspace(start, end, count)
-    rate = np.diff(path(time)[2], axis=0) / np.diff(time)[:, None]
-    return (rate**2).sum(axis=0) * (time[1] - time[0])
-
-
 # --- the spline ------------------------------------------------------------------------------
-
-
-def test_it_passes_the_points_from_rest_to_rest():
-    path = crane.via_points(TIMES, PLACES)
-    q, v, a = path(np.array(TIMES))
-    given = np.isfinite(PLACES)
-    rounding = 20 * np.finfo(float).eps  # of sums of six terms, after a solution by LAPACK
-    np.testing.assert_allclose(q[given], np.array(PLACES)[given], rounding, rounding)
-    assert np.abs(v[[0, -1]]).max() < 1e-13 and np.abs(a[[0, -1]]).max() < 1e-12
-    assert path.duration == 2.0
-    # what is left open follows its own points alone
-    alone = crane.via_points([0.0, 1.5, 2.0], [[1.0], [3.0], [2.0]])
-    time = np.linspace(0, 2, 101)
-    for one, other in zip(path(time), alone(time), strict=True):
-        assert np.abs(one[:, 1] - other[:, 0]).max() < 1e-9
-
-
-def test_two_points_are_a_point_to_point_motion():
-    one = crane.via_points([0.0, 1.7], [[0.1, -2.0], [0.4, 1.0]])
-    other = crane.point_to_point([0.1, -2.0], [0.4, 1.0], 1.7)
-    time = np.linspace(0, 1.7, 50)
-    for x, y in zip(one(time), other(time), strict=True):
-        assert np.abs(x - y).max() < 1e-12
 
 
 def test_one_via_point_is_the_closed_form_of_flash_and_hogan():
@@ -84,54 +49,6 @@ def test_it_is_the_spline_of_scipy():
     assert np.abs(found[:, 2] - spline(time, 2)).max() < 1e-10 * size
 
 
-def test_it_has_the_least_jerk():
-    """Any change that keeps points, ends and rates has more, in second order."""
-    rates = np.full((4, 2), np.nan)
-    rates[2, 0] = -0.7
-    path = crane.via_points(TIMES, PLACES, rates)
-    assert path(1.5)[1][0] == pytest.approx(-0.7, abs=1e-13)
-    least = jerk(path, 0, 2)
-    draw = np.random.default_rng(1)
-    for _ in range(5):
-        knots = np.linspace(0, 2, 12)
-        extra = make_interp_spline(
-            knots, draw.normal(size=12), k=5, bc_type=([(1, 0), (2, 0)], [(1, 0), (2, 0)])
-        )
-        time = np.linspace(0, 2, 4001)
-
-        def bump(order, extra=extra, time=time):
-            """Zero with its rate at all points and ends: times prod (t - t_i)^2."""
-            factor = np.polynomial.polynomial.polyfromroots([*TIMES, *TIMES])
-            factor = np.polynomial.polynomial.polymul(factor, [0, 4, -4, 1])
-            parts = [
-                np.polynomial.polynomial.polyval(time, np.polynomial.polynomial.polyder(factor, k))
-                for k in range(order + 1)
-            ]
-            binomial = {3: [1, 3, 3, 1]}[order]
-            return sum(b * parts[k] * extra(time, order - k) for k, b in enumerate(binomial))
-
-        more = bump(3)
-        third = np.column_stack([np.gradient(path(time)[2][:, i], time) for i in (0, 1)])
-        cross = 2 * np.trapezoid(third * more[:, None], time, axis=0)
-        square = np.trapezoid(more**2, time)
-        # the first variation vanishes, so what is left is the square alone
-        assert np.abs(cross).max() < 2e-2 * np.sqrt(square * least.max())
-
-
-def test_rates_are_those_of_the_positions():
-    path = crane.via_points(TIMES, PLACES)
-    time, step = np.linspace(0.01, 1.99, 50), 1e-4
-    q, v, a = path(time)
-    ahead, back = path(time + step), path(time - step)
-    assert np.abs((ahead[0] - back[0]) / (2 * step) - v).max() < 1e-5
-    assert np.abs((ahead[1] - back[1]) / (2 * step) - a).max() < 1e-3
-    # C4: the fourth derivative does not jump at a point
-    curve = path._polynomials[2]
-    for order in (1, 2):
-        jump = curve(0.4 + 1e-12, order) - curve(0.4 - 1e-12, order)
-        assert np.abs(jump).max() < 1e-6 * np.abs(curve(0.4, order)).max()
-
-
 @pytest.mark.parametrize(
     ("time", "points", "rates", "line"),
     [
@@ -153,16 +70,6 @@ def test_bad_points(time, points, rates, line):
 
 
 # --- attitudes -------------------------------------------------------------------------------
-
-
-def test_two_attitudes_are_joined_by_the_shortest_turn():
-    first, last = [0.4, -0.2, 1.0], [2.0, 0.7, -2.5]
-    path = crane.motion.via_attitudes([0.0, 2.0], [first, last])
-    pace = crane.point_to_point([0.0], [1.0], 2.0)
-    ends = Rotation.from_euler("xyz", [first, last])
-    time = np.linspace(0, 2, 41)
-    wanted = Slerp([0, 1], ends)(pace.position(time)[:, 0]).as_matrix()
-    assert np.abs(path(time)[0] - wanted).max() < 1e-13
 
 
 def test_attitudes_turn_as_they_say():
@@ -200,16 +107,6 @@ def test_attitudes_go_on_beyond_half_a_turn():
 
 
 # --- inverse kinematics ----------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def excavator():
-    return crane.load("excavator")
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return crane.load("kr300")
 
 
 def drawn(machine, count, seed):
@@ -293,7 +190,7 @@ def test_three_drives_in_a_plane_have_position_and_inclination(tmp_path):
 )
 def test_jacobian_and_bias_with_an_attitude(name, attitude, request):
     """Against differences of forward kinematics along a curve q + v s + a s^2/2."""
-    machine = request.getfixturevalue({"kr300": "robot"}.get(name, name))
+    machine = request.getfixturevalue({"kr300": "kr300"}.get(name, name))
     kinematics, draw = crane.Kinematics(machine), np.random.default_rng(2)
     for q_a in drawn(machine, 6, 3):
         v_a, a_a = 0.3 * draw.normal(size=(2, len(q_a)))
@@ -326,8 +223,8 @@ def test_positions_and_inclinations_come_back(excavator):
             assert np.abs((off + np.pi) % (2 * np.pi) - np.pi) < 1e-10
 
 
-def test_positions_and_rotations_come_back(robot):
-    kinematics, drawn_at = crane.Kinematics(robot), drawn(robot, 8, 5)
+def test_positions_and_rotations_come_back(kr300):
+    kinematics, drawn_at = crane.Kinematics(kr300), drawn(kr300, 8, 5)
     positions, rotations = kinematics.position(drawn_at), kinematics.rotation(drawn_at)
     for k, (position, rotation) in enumerate(zip(positions, rotations, strict=True)):
         given = rotation if k % 2 else pin.rpy.matrixToRpy(rotation)
@@ -355,14 +252,14 @@ def test_a_line_with_constant_inclination(excavator):
     assert path.tip is tip and path.attitude is held
 
 
-def test_a_robot_turns_its_flange_on_the_way(robot):
-    kinematics = crane.Kinematics(robot)
+def test_a_robot_turns_its_flange_on_the_way(kr300):
+    kinematics = crane.Kinematics(kr300)
     ends = np.array([[0.2, -1.4, 1.5, 0.3, 0.9, 0.1], [-0.4, -1.2, 1.2, -0.5, 1.2, 0.8]])
-    ends += robot.home[robot.closure.active] - robot.home[robot.closure.active]
+    ends += kr300.home[kr300.closure.active] - kr300.home[kr300.closure.active]
     tip = crane.via_points([0.0, 2.0], kinematics.position(ends))
     angles = [pin.rpy.matrixToRpy(rotation) for rotation in kinematics.rotation(ends)]
     turning = crane.motion.via_attitudes([0.0, 2.0], angles)
-    path = crane.tip_trajectory(robot, tip, ends[0], turning)
+    path = crane.tip_trajectory(kr300, tip, ends[0], turning)
     time = np.random.default_rng(0).uniform(0, 2, 60)
     q_a, v_a, a_a = path(time)
     rotation, rate, second = turning(time)
@@ -423,15 +320,6 @@ def test_bad_attitudes(excavator):
 
 
 # --- tasks of a machine file -----------------------------------------------------------------
-
-VIA = """tasks:
-  reach:
-    description: up and back
-    via:
-      - {time: 0, crank: 1.2}
-      - {time: 0.5, crank: 1.4, rates: {crank: 0.1}}
-      - {time: 2, crank: 1.2}
-"""
 
 
 @pytest.fixture

@@ -11,11 +11,6 @@ COUNT = 31  # values of each stroke in the grid
 
 
 @pytest.fixture(scope="module")
-def excavator():
-    return crane.load("excavator")
-
-
-@pytest.fixture(scope="module")
 def found(excavator):
     return crane.working_range(excavator)
 

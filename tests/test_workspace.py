@@ -136,15 +136,6 @@ def test_five_bar_area_by_counting_points_that_have_inverse_kinematics(five):
     assert five.area == pytest.approx(area, abs=0.01 * area + 3 * error)
 
 
-def test_five_bar_share_by_counting_crank_angles_that_close(five, five_bar):
-    """Box of whole turns: the crank tips are less than 0.5 apart. Everything is connected here."""
-    angles = np.random.default_rng(1).uniform(-np.pi, np.pi, (100_000, 2))
-    angles += five_bar.home[five_bar.closure.active]
-    one, two = (oracles.at_angle(angles[:, k] + turn, 0.3) for k, turn in enumerate((1.4, 1.9)))
-    gap = np.hypot(two[0] + 0.4 - one[0], two[1] - one[1])
-    assert five.closed_share == pytest.approx((gap < 0.5).mean(), abs=0.01)
-
-
 def test_all_postures_close_and_are_of_the_branch(five, five_bar):
     (patch,) = five.patches
     q = patch.configurations[patch.is_closed]

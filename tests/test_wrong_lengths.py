@@ -10,6 +10,7 @@ import misfit_linkages
 import numpy as np
 import pytest
 from command_line import typed
+from warned import quiet, without_a_word
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
@@ -74,9 +75,7 @@ def test_no_wrong_length_turns_a_linkage_over(name, tmp_path):
     for (length, value), share in itertools.product(linkage.lengths().items(), WRONG):
         path = linkage.write(tmp_path, wrong={length: share * value})
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", CraneWarning)
-                machine = crane.load(path)
+            machine = quiet(crane.load, path)
         except CraneError as error:
             refused += 1
             assert " mm open" in str(error) or " m open" in str(error)
@@ -222,9 +221,7 @@ def test_a_geared_rotor_is_no_matter_of_assembly(tmp_path):
     urdf.write_text(urdf.read_text().replace("</robot>", rotor + "</robot>"))
     for said in ("", "  spin: 0.1\n"):
         path.write_text(path.read_text() + said)
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", CraneWarning)
-            machine = crane.load(path)
+        machine = without_a_word(crane.load, path)
         crank, spin = (machine.home[machine.column(x)] for x in ("crank", "spin"))
         assert spin == pytest.approx(50 * crank) and abs(spin) > 32
 

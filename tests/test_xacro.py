@@ -3,15 +3,15 @@
 import importlib
 import shutil
 import sys
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import typed
+from warned import quiet
 
 import crane
-from crane.common.errors import CraneError, CraneWarning, InputError
+from crane.common.errors import CraneError, InputError
 from crane.formats import robot_files
 from crane.formats.xacro_expressions import UnsafeExpressionError, restrict_expressions
 
@@ -49,9 +49,7 @@ ROBOT = """<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">
 
 
 def load(path, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
-        return crane.load(path, **options)
+    return quiet(crane.load, path, **options)
 
 
 @pytest.fixture

@@ -7,6 +7,8 @@ lower end pulls the bucket back by a link.
 
 import math
 
+from urdf_text import body, frame, joint
+
 PIVOT, PIN, LIP = (-0.70, 1.80), (1.45, 0.30), (2.55, 0.02)  # of the boom, the bucket; its edge
 CRANK, EYE, LINK, BUCKET = (0.685, 1.077), (0.80, 1.60), (0.62, 0.52), (1.33, 0.68)
 TOGGLE = (0.78, 0.72)  # pin of bellcrank and link: they are in line as the bucket dumps
@@ -16,42 +18,33 @@ PRESSURE, TANK, RELIEF = 2.5e7, 2.0e5, 2.8e7
 LIFT_AREAS = (2 * math.pi / 4 * 0.11**2, 2 * math.pi / 4 * (0.11**2 - 0.06**2))  # two cylinders
 TILT_AREAS = (math.pi / 4 * 0.13**2, math.pi / 4 * (0.13**2 - 0.07**2))
 
-_BODY = (
-    '<link name="{}"><inertial><origin xyz="{} 0 {}"/><mass value="{}"/><inertia ixx="{}" '
-    'iyy="{}" izz="{}" ixy="0" ixz="0" iyz="0"/></inertial></link>\n'
-)
-_JOINT = (
-    '<joint name="{}" type="{}"><origin xyz="{} 0 {}" rpy="0 {} 0"/><parent link="{}"/>'
-    '<child link="{}"/><axis xyz="{}"/>{}</joint>\n'
-)
-
 
 def _body(name, mass, size, at=(0.0, 0.0)):
-    inertia = mass * size**2 / 12
-    return _BODY.format(name, *at, mass, inertia, inertia, inertia)
+    return body(name, mass, (at[0], 0, at[1]), [mass * size**2 / 12] * 3)
 
 
 def _away(place, base):
     return place[0] - base[0], place[1] - base[1]
 
 
-def _joint(name, parent, child, at, turn=0.0, kind="continuous", axis="0 -1 0", limit=""):
-    return _JOINT.format(name, kind, *at, turn, parent, child, axis, limit)
+def _joint(name, parent, child, at, turn=0.0, **options):
+    options = {"axis": (0, -1, 0)} | options
+    return joint(name, parent, child, (at[0], 0, at[1]), turn=(0, turn, 0), **options)
 
 
 def _frame(name, parent, at):
-    return f'<link name="{name}"/>' + _joint(f"{name}_fixed", parent, name, at, kind="fixed")
+    return frame(name, parent, (at[0], 0, at[1]))
 
 
 def _cylinder(name, base, eye, stroke, length):
     """Barrel and rod from the frame to an eye; the stroke at home, and how long it is."""
     (x, z), pins = _away(eye, base), math.dist(base, eye)
-    limit = f'<limit lower="0" upper="{length}" effort="5e5" velocity="0.4"/>'
+    limits = 0, length, 5e5, 0.4
     return (
         _body(f"{name}_barrel", 45, 0.9, (0.4, 0)) + _body(f"{name}_rod", 30, 0.9, (-0.4, 0))
         + _joint(f"{name}_barrel", "frame", f"{name}_barrel", base, math.atan2(-z, x))
         + _joint(f"X_{name}", f"{name}_barrel", f"{name}_rod", (pins - stroke, 0),
-                 kind="prismatic", axis="1 0 0", limit=limit)
+                 kind="prismatic", axis=(1, 0, 0), limits=limits)
         + _frame(f"{name}_eye", f"{name}_rod", (0, 0))
     )  # fmt: skip
 

@@ -9,7 +9,7 @@ import typer
 import yaml
 from excavators import planar
 from hydraulic_rig import COMPENSATED, rig
-from test_open_loops import five_bar
+from test_add_loops import five_bar
 
 import crane
 from crane.cli import program

@@ -13,6 +13,7 @@ from typer.core import TyperGroup
 
 import crane
 from crane.cli.command import app
+from crane.cli.parsing import parse_gravity
 from crane.cli.terminal import INTERRUPTED, activity_line, print_message
 from crane.common.errors import CraneError, CraneWarning, format_one_line
 from crane.common.package_search import use_load_options
@@ -39,8 +40,8 @@ Simulate, identify, rate and design machines with closed kinematic chains.
 {commands}
 
 crane COMMAND --help shows arguments and options. --version shows the version.
-All commands take --strict (reject physically impossible inertias),
---trust-xacro (allow xacro files to run Python) and --debug.
+All commands take --gravity X,Y,Z (m/s2), --strict (reject physically impossible
+inertias), --trust-xacro (allow xacro files to run Python) and --debug.
 """
 
 
@@ -71,16 +72,18 @@ def main() -> None:
     """Run the command line: errors are one line, exit status 2."""
     gc.set_threshold(_GC_THRESHOLD)
     arguments = [word for word in sys.argv[1:] if word not in _FLAGS]
+    gravity_text = _take_gravity(arguments)
     debug, strict, trust = (word in sys.argv[1:] for word in _FLAGS)
     if isinstance(sys.stdout, io.TextIOWrapper):  # names of files may be no text
         sys.stdout.reconfigure(errors="backslashreplace")
     warnings.showwarning = _show_warning
     warnings.simplefilter("once", CraneWarning)
     try:
+        gravity = None if gravity_text is None else parse_gravity(gravity_text)
         run = program(*arguments[:1])
         with (
             activity_line(" ".join(["crane", *arguments[:1]])),
-            use_load_options(strict=strict, trust_xacro=trust),
+            use_load_options(strict=strict, trust_xacro=trust, gravity=gravity),
         ):
             status = run(args=arguments or ["--help"], standalone_mode=False, prog_name="crane")
         if status == INTERRUPTED:  # what the parser makes of KeyboardInterrupt
@@ -98,6 +101,17 @@ def main() -> None:
     if not arguments:  # the help was shown, but nothing was done
         sys.exit(2)
     sys.exit(status if isinstance(status, int) else 0)
+
+
+def _take_gravity(arguments: list[str]) -> str | None:
+    """Remove the first --gravity from the arguments, and return its value."""
+    for i, word in enumerate(arguments):
+        name, equals, value = word.partition("=")
+        if name == "--gravity":
+            following = [] if equals else arguments[i + 1 : i + 2]
+            del arguments[i : i + 1 + len(following)]
+            return value if equals else "".join(following)
+    return None
 
 
 def _error_text(error: Exception) -> str:

@@ -134,6 +134,19 @@ def parse_numbers(texts: Sequence[str], message: str) -> list[float]:
         raise InputError(message) from None
 
 
+def parse_gravity(text: str) -> tuple[float, ...]:
+    """Acceleration of gravity (3,) [m/s2] from X,Y,Z.
+
+    Raises:
+        InputError: The text has another form.
+    """
+    message = f"--gravity is '{text}', write X,Y,Z in m/s2, as 0,0,-1.62"
+    numbers = parse_numbers(text.split(","), message)
+    if len(numbers) != 3 or not all(map(isfinite, numbers)):
+        raise InputError(message)
+    return tuple(numbers)
+
+
 def parse_slew_angles(text: str) -> list[float]:
     """Angles [deg] in a list with commas.
 

@@ -166,7 +166,7 @@ def propose_active_joints(
     coordinates, effort = equations.coordinates, np.asarray(equations.model.effortLimit)
     names = coordinates.names
     columns = range(len(names)) if candidates is None else candidates
-    is_coupled = (equations.coupling_factors != 0).any(axis=0)
+    is_coupled = equations.is_coupled.any(axis=0)
     free = [i for i in columns if not is_coupled[i]]
     looks_actuated = coordinates.is_translation | (np.isfinite(effort) & (effort > 0))
     actuators = [i for i in free if looks_actuated[i]]

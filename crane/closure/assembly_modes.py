@@ -182,7 +182,7 @@ class _AssemblyModeSearch:
     def independent_rows_of(self, columns: Indices) -> Indices:
         """Independent rows of the loops that contain some joints."""
         involved = (
-            np.vstack([self.equations.sign, self.equations.coupling_factors])[:, columns] != 0
+            np.vstack([self.equations.sign, self.equations.is_coupled])[:, columns] != 0
         ).any(1)
         rows = self.closure.structure.independent_rows
         return rows[involved[self.equations.loop_of_row[rows]]]
@@ -257,7 +257,7 @@ class _AssemblyModeSearch:
         with m = prod 1 / r^2 + 1 and the distance r from a known solution, the Newton step d is
         divided by 1 - (grad m . d) / m, which turns it around near known solutions.
         """
-        q = q.copy()
+        q, coordinates = q.copy(), self.equations.coordinates
         equations, rows = self._equations_of_rows(rows)
         for _ in range(_MAX_ITERATIONS):
             phi, jacobian = equations.evaluate_scaled(q)
@@ -278,14 +278,12 @@ class _AssemblyModeSearch:
             largest = float(np.abs(step).max())
             if not largest < np.inf:
                 return None
-            q[columns] += (
-                self._coordinate_units[columns] * step * min(1.0, _MAX_STEP / max(largest, 1e-300))
-            )
+            q = equations.displace(q, columns, step * min(1.0, _MAX_STEP / max(largest, 1e-300)))
         if not np.abs(equations.evaluate_scaled(q)[0][rows]).max(initial=0.0) < _CLOSED_TOLERANCE:
             return None
-        angles = columns[self._is_rotation[columns]]
+        angles = columns[(self._is_rotation & ~coordinates.is_rotation_vector)[columns]]
         q[angles] = np.remainder(q[angles] + np.pi, 2 * np.pi) - np.pi
-        return q
+        return coordinates.wrap_rotations(q, columns)
 
     def assess_block_solution(self, q: Array, block: int) -> AssemblyMode | None:
         """The assembly mode with another solution of a block, or None."""

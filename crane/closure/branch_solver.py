@@ -246,14 +246,21 @@ def follow_motion(
     Raises:
         ClosureError: The motion does not continue to a sample.
     """
+    coordinates = equations.coordinates
+    passive_columns = np.setdiff1d(np.arange(len(first_configuration)), active_columns)
+
+    def displaced(q: Array, displacement: Array) -> Array:
+        return q + coordinates.coordinate_derivatives(q, displacement)
+
     out = np.empty((len(q_a), len(first_configuration)))
     for k, target in enumerate(q_a):
         if not k:
             out[0] = first_configuration
             continue
-        extrapolated = out[k - 1] if k < 2 else 2 * out[k - 1] - out[k - 2]
+        last, *before = [coordinates.unwrap_rotations(q, out[k - 1]) for q in out[:k][-1:-4:-1]]
+        extrapolated = last if k < 2 else 2 * last - before[0]
         if k > 2:
-            extrapolated = 3 * out[k - 1] - 3 * out[k - 2] + out[k - 3]
+            extrapolated = 3 * last - 3 * before[0] + before[1]
         q, is_weak = extrapolated.copy(), True
         for _ in range(_MAX_ITERATIONS):
             residual, jacobian = equations.evaluate(q)
@@ -261,8 +268,8 @@ def follow_motion(
             normal_step = -np.linalg.lstsq(
                 jacobian * motion_scales, residual, rcond=_SINGULAR_TOLERANCE
             )[0]
-            corrected = q + motion_scales * normal_step
-            active_rows = null_space[active_columns]
+            corrected = displaced(q, motion_scales * normal_step)
+            active_rows = (coordinates.rate_matrix(q) @ null_space)[active_columns]
             remaining = (target - corrected[active_columns]) / motion_scales[active_columns]
             is_weak = bool(
                 np.linalg.svd(active_rows, compute_uv=False).min(initial=1.0)
@@ -274,7 +281,7 @@ def follow_motion(
                 [remaining, weight * (null_space.T @ ((extrapolated - corrected) / motion_scales))]
             )
             step = normal_step + null_space @ np.linalg.lstsq(system, right, rcond=None)[0]
-            q = q + motion_scales * step
+            q = displaced(q, motion_scales * step)
             if np.abs(step).max(initial=0.0) < _STEP_TOLERANCE:
                 break
         residual, _ = equations.evaluate(q)
@@ -287,5 +294,5 @@ def follow_motion(
                 f"sample {k}: the motion does not go on to it, it is {deviation:.2g} of a way "
                 "off: record more samples, or see that zeros and signs are the machine's"
             )
-        out[k] = q
+        out[k] = coordinates.wrap_rotations(q, passive_columns)
     return out

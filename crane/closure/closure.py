@@ -53,7 +53,7 @@ class Closure(BranchSolver, OneLineRepr):
         active: Names of the active joints, in the order of q_A.
         initial_guess: (nq,) active coordinates of the home configuration, and an initial guess of
             the others.
-        couplings: Linear constraints of joints.
+        couplings: Constraints of joints.
         specified: Names of joints whose home coordinate the file specifies. Where the loops do not
             close from the guess, home is searched for with the other joints. None: no search.
         movable: Names of active joints that may move during this search.
@@ -373,6 +373,7 @@ def _has_same_geometry(first: LoopEquations, second: LoopEquations) -> bool:
         [
             x.coupling_factors,
             x.coupling_offsets,
+            x.coupling_powers,
             x.coordinates.lower,
             x.coordinates.upper,
             tree_geometry(x).constants,

@@ -10,20 +10,27 @@ from crane.codegen import Layout, Program
 _MAX_NEWTON_ITERATIONS = 8  # Newton's method converges quadratically
 
 
-def add_closure_routines(program: Program, nq: int, n: int) -> None:
+def add_closure_routines(
+    program: Program, nq: int, n: int, has_partly_active_rotations: bool, wraps_rotations: bool
+) -> None:
     """Add the routines "close", "follow", "close_each" and "gamma_each" to a program.
 
     Args:
         program: Program with the formulas.
         nq: Number of coordinates.
         n: Number of active coordinates.
+        has_partly_active_rotations: Whether to add "project" as well, which closes the loops
+            without a motion of the active joints instead of a change of their coordinates.
+        wraps_rotations: Whether passive rotation vectors are wrapped by the formula "wrap".
     """
-    _add_close(program, nq)
-    _add_follow(program, nq, n)
+    _add_close(program, nq, "close", "newton")
+    if has_partly_active_rotations:
+        _add_close(program, nq, "project", "newton_motion")
+    _add_follow(program, nq, n, wraps_rotations)
     _add_loops_over_configurations(program, nq, n)
 
 
-def _add_close(program: Program, nq: int) -> None:
+def _add_close(program: Program, nq: int, name: str, newton: str) -> None:
     """Add "close": Newton's method in place; 1 if closed on the branch of home, else 0.
 
     A step whose square is below rounding is the last one.
@@ -32,13 +39,13 @@ def _add_close(program: Program, nq: int) -> None:
         "constants": None, "q": None, "result": program.formula_outputs("newton"),
         "tolerances": None,
     }  # fmt: skip
-    with program.add_routine("close", arrays=arrays) as r:
+    with program.add_routine(name, arrays=arrays) as r:
         q, result = r.q, r.result
         rounded, closed, small = (r.new_variable(r.tolerances[i]) for i in range(3))
         before = r.new_variable(np.inf)
         evaluations = r.new_variable(0)
         with r.loop_forever():
-            r.call("newton", r.constants, q, result)
+            r.call(newton, r.constants, q, result)
             residual, step = (r.new_variable(result[name]) for name in ("residual", "step"))
             stalled = (residual <= closed) & (residual > before * 0.25)
             with r.if_then((residual <= rounded) | stalled):
@@ -55,7 +62,7 @@ def _add_close(program: Program, nq: int) -> None:
         r.return_value(0)
 
 
-def _add_follow(program: Program, nq: int, n: int) -> None:
+def _add_follow(program: Program, nq: int, n: int, wraps_rotations: bool) -> None:
     """Add "follow": one Newton continuation step per target.
 
     It stops at the first target where a step fails; `NewtonContinuation` solves that one. "cursor"
@@ -83,6 +90,9 @@ def _add_follow(program: Program, nq: int, n: int) -> None:
             r.call("distance", r.constants, predicted, guess, correction)
             with r.if_then(~(correction["all"] <= move * 0.5 + 0.02)):
                 r.return_value(i)
+            if wraps_rotations:
+                r.copy(predicted.element_pointer("q"), guess, nq)
+                r.call("wrap", predicted, guess)
             r.copy(r.cursor, guess, nq)
             r.copy(r.cursor.element_pointer("gamma"), result.element_pointer("gamma"), entries)
             r.copy(r.out.row_pointer(i, nq), guess, nq)

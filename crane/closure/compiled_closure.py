@@ -20,6 +20,7 @@ from crane.closure.kinematics_formulas import (
 from crane.closure.loop_equations import Cluster, LoopEquations, find_clusters
 from crane.closure.loop_formulas import LoopFormulas
 from crane.closure.newton_continuation import ClosedConfiguration
+from crane.closure.predictor_formulas import PredictorFormulas
 from crane.codegen import Layout, LayoutView, Program, Scalar, Tape, max_abs, maximum
 from crane.codegen.symbolic import minimum
 from crane.common.samples import Array
@@ -83,7 +84,8 @@ class CompiledClosure:
         tolerances: (3,) scaled residual that counts as rounding; that counts as closed if it no
             longer decreases; scaled step whose square is rounding.
         follow_address: Address of the function `follow_targets`, for other machine code.
-        close_address: Address of the function `close`.
+        close_address: Address of the function `close`; of `project` with partly active rotations,
+            for the states of a simulation.
     """
 
     def __init__(
@@ -102,6 +104,9 @@ class CompiledClosure:
         self._gamma_entries = self._find_gamma_entries()
         rows, columns = self._gamma_entries
         self._gamma_entry_pairs = list(zip(rows.tolist(), columns.tolist(), strict=True))
+        self._predictor = PredictorFormulas(
+            self.geometry, active, passive, self._gamma_entry_pairs
+        )
         signs = self._determinant_signs(home)
         key = self._cache_key(signs)
         shared = _SHARED_CODE.get(key)
@@ -113,7 +118,9 @@ class CompiledClosure:
         program, self.programs = shared.closure_program, shared.programs
         self._closure_program = program
         self.follow_address = program.function_address("follow")
-        self.close_address = program.function_address("close")
+        self.close_address = program.function_address(
+            "project" if self._predictor.has_partly_active_rotations else "close"
+        )
         self._home = home
         self.tolerances = np.array([1e-15 * rounding_scale, 1e-13 * rounding_scale, 1e-9])
 
@@ -145,6 +152,7 @@ class CompiledClosure:
             equations.sign,
             equations.coupling_factors,
             equations.coupling_offsets,
+            equations.coupling_powers,
             structure.independent_rows,
             structure.redundant_rows,
             self._active_columns,
@@ -155,6 +163,7 @@ class CompiledClosure:
             geometry.parents,
             geometry.is_revolute,
             geometry.floating_bases,
+            geometry.ball_joints,
             geometry.frame_bodies,
             folding_pattern(geometry.constants),
             tuple(loop.type for loop in equations.loops),
@@ -164,10 +173,18 @@ class CompiledClosure:
         )
 
     def _build(self, program: Program, signs: Array) -> None:
-        self.add_newton_formula(program, signs)
-        self._add_predictor(program)
+        self._add_newton_formula(program, signs, "newton", holds_coordinates=True)
+        if self._predictor.has_partly_active_rotations:
+            self._add_newton_formula(program, signs, "newton_motion", holds_coordinates=False)
+        self._predictor.add_to(program)
         self._add_gamma(program)
-        add_closure_routines(program, self._nq, self._n)
+        add_closure_routines(
+            program,
+            self._nq,
+            self._n,
+            self._predictor.has_partly_active_rotations,
+            self._predictor.wraps_rotations,
+        )
 
     def cached_program(self, key: tuple, build: Callable[[Program], None]) -> Program:
         """A further program of this machine, kept in `programs`; see `Program.from_cache`.
@@ -290,7 +307,9 @@ class CompiledClosure:
             ),
         )
 
-    def add_newton_formula(self, program: Program, signs: Array) -> None:
+    def _add_newton_formula(
+        self, program: Program, signs: Array, name: str, holds_coordinates: bool
+    ) -> None:
         """Add `newton`: one Newton step with residual, gamma and singularity checks.
 
         "regular" is positive on the branch of home away from singular configurations, with
@@ -299,7 +318,7 @@ class CompiledClosure:
         home.
         """
         q, kinematics, loops = self.trace_kinematics(Tape(), 0, 1)
-        steps = loops.newton_step
+        steps = loops.newton_step(holds_coordinates)
         is_translation = [not kinematics.geometry.is_revolute[joint] for joint in steps]
         corrected = [x + steps.get(i, 0.0) for i, x in enumerate(q, start=1)]
         rows = [loops.gamma[loops.passive_joints[row]][k] for row, k in self._gamma_entry_pairs]
@@ -315,7 +334,7 @@ class CompiledClosure:
         for alignment in loops.alignments:
             worst = maximum(worst, -1.0 * alignment)
         program.add_formula(
-            "newton",
+            name,
             2,
             {
                 "residual": [loops.largest_residual()],
@@ -368,43 +387,6 @@ class CompiledClosure:
         )
         return np.array([np.linalg.slogdet(block)[0] for block in blocks])
 
-    def _add_predictor(self, program: Program) -> None:
-        """Add `predict` and `distance`.
-
-        predict(constants, cursor, target) -> q, largest scaled step of a passive joint;
-        distance(constants, q, q') -> largest scaled difference of a passive joint.
-        """
-        is_translation = [
-            not self.geometry.is_revolute[column + 1] for column in self._passive_columns
-        ]
-        tape = Tape()
-        q, n = tape.load_vector(1, 0, self._nq), self._n
-        target = tape.load_vector(2, 0, n)
-        change = [target[k] - q[column] for k, column in enumerate(self._active_columns)]
-        moves: list[Scalar] = [0.0] * len(self._passive_columns)
-        for i, (row, k) in enumerate(self._gamma_entry_pairs):
-            moves[row] = moves[row] + tape.load(1, self._nq + i) * change[k]
-        for column, move in zip(self._passive_columns, moves, strict=True):
-            q[column] = q[column] + move
-        for column, value in zip(self._active_columns, target, strict=True):
-            q[column] = value
-        move = largest_scaled_value(
-            moves, is_translation, self.inverse_characteristic_length(tape)
-        )
-        program.add_formula("predict", 3, {"q": q, "move": [move]})
-        tape = Tape()
-        one, two = tape.load_vector(1, 0, self._nq), tape.load_vector(2, 0, self._nq)
-        differences = [one[i] - two[i] for i in self._passive_columns]
-        program.add_formula(
-            "distance",
-            3,
-            [
-                largest_scaled_value(
-                    differences, is_translation, self.inverse_characteristic_length(tape)
-                )
-            ],
-        )
-
     def inverse_characteristic_length(self, tape: Tape) -> Scalar:
         """One over the characteristic length, from the geometry constants as first argument."""
-        return FormulaConstants(tape, 0, self.geometry.constants)[len(self.geometry.constants) - 1]
+        return self._predictor.inverse_characteristic_length(tape)

@@ -261,6 +261,7 @@ class _ConstraintAnalysis:
         periodic[np.setdiff1d(np.arange(len(home)), self._passive)] = False
         nearby = np.where(np.isinf(lower) | np.isinf(upper), 0.0, home)
         home = remove_revolutions(home, nearby, periodic, lower, upper)
+        home = self._coordinates.wrap_rotations(home, self._passive)
         self._check_closed(
             home, f"at home{self._active_text}", "choose other values or guess more passive joints"
         )

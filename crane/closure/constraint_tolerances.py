@@ -151,7 +151,7 @@ def _close_independent_rows(
             return None
         if not np.abs(change).max() < 1.0:
             return None
-        q += change * equations.coordinate_units
+        q = equations.displace(q, np.arange(len(q)), change)
     return q if np.abs(phi[independent_rows]).max(initial=0.0) < 1e-11 else None
 
 
@@ -215,7 +215,9 @@ class ExactConstraints:
                 break
             scales = self._equations.step_residual_units
             scaled_jacobian = jacobian[:, movable] / scales[:, None] * units
-            q[movable] += least_squares_step(scaled_jacobian, phi / scales) * units
+            step = least_squares_step(scaled_jacobian, phi / scales)
+            step *= units / self._coordinate_units[movable]
+            q = self._equations.displace(q, movable, step)
         return q
 
     def intended_jacobian(self, q: Array) -> Array:
@@ -359,7 +361,7 @@ class RoundedConstraints(ExactConstraints):
             if not np.isfinite(jacobian).all():  # diverged: not closed
                 break
             step = np.linalg.lstsq(jacobian[:, movable], -phi, rcond=_MIN_SINGULAR_VALUE_RATIO)[0]
-            q[movable] += step * self._coordinate_units[movable]
+            q = self._equations.displace(q, movable, step)
             if not 1e-14 < np.abs(step).max(initial=0.0) < 1.0:
                 break
         return q

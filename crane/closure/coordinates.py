@@ -11,25 +11,26 @@ from crane.common.samples import Array
 
 Indices = NDArray[np.intp]
 
-FREE_FLYER = "JointModelFreeFlyer"
+FREE_FLYER, BALL = "JointModelFreeFlyer", "JointModelSpherical"
 
 
 class Coordinates:
     """Names, limits and kinds of the coordinates (nv,), converted to and from Pinocchio's (nq,).
 
-    Both are the same except for floating bases: position and rotation vector here, position and
-    quaternion in Pinocchio; see `crane.description.floating_bases`.
+    Both are the same except for the rotations of ball joints and floating bases: rotation vectors
+    here, quaternions in Pinocchio; see `crane.description.rotation_vectors`.
 
     Args:
-        model: The tree. The coordinates of a floating base B are named B_x, B_y, B_z, B_rx, B_ry,
-            B_rz.
+        model: The tree. The coordinates of a ball joint B are named B_rx, B_ry, B_rz; those of a
+            floating base B_x, B_y, B_z, B_rx, B_ry, B_rz.
 
     Attributes:
         names: (nv,) in the order of Pinocchio's velocities.
         joints: (nv,) index of Pinocchio's joint of each coordinate.
         floating_base_columns: First column of each floating base.
-        parents: (nv + 1,) parent bodies, where coordinate i moves body i + 1; the six coordinates
-            of a floating base are a series; 0 is the world.
+        rotation_columns: First column of each rotation vector.
+        parents: (nv + 1,) parent bodies, where coordinate i moves body i + 1; the coordinates of a
+            ball joint or floating base are a series; 0 is the world.
         body_of_joint: Body of each joint of Pinocchio's model in this numbering.
     """
 
@@ -37,13 +38,17 @@ class Coordinates:
         self.model = model
         self.names: tuple[str, ...] = ()
         self.floating_base_columns: tuple[int, ...] = ()
+        self.rotation_columns: tuple[int, ...] = ()
         joint_of_coordinate: list[int] = []
-        configuration_indices: list[int] = []  # in Pinocchio's q; the position of a floating base
+        configuration_indices: list[int] = []  # in Pinocchio's q; of quaternions the vector part
         for i in range(1, model.njoints):
             joint, name = model.joints[i], model.names[i]
             if joint.shortname() == FREE_FLYER:
                 self.floating_base_columns += (joint.idx_v,)
-                self.names += tuple(f"{name}_{part}" for part in ("x", "y", "z", "rx", "ry", "rz"))
+            if joint.shortname() in (FREE_FLYER, BALL):
+                self.rotation_columns += (joint.idx_v + joint.nv - 3,)
+                parts = ("x", "y", "z", "rx", "ry", "rz")[-joint.nv :]
+                self.names += tuple(f"{name}_{part}" for part in parts)
             else:
                 self.names += (name,)
             joint_of_coordinate += [i] * joint.nv
@@ -68,6 +73,12 @@ class Coordinates:
             raise InputError(f"joint '{name}' is unknown, {suggest_names(self.names, name)}")
         return self._columns_by_name[name]
 
+    @property
+    def ball_joint_columns(self) -> tuple[int, ...]:
+        """First column of each ball joint."""
+        floating = {column + 3 for column in self.floating_base_columns}
+        return tuple(column for column in self.rotation_columns if column not in floating)
+
     @cached_property
     def lower(self) -> Array:
         """(nv,) lower limits [m], [rad]."""
@@ -86,8 +97,15 @@ class Coordinates:
             joint = self.model.joints[i]
             if joint.shortname() == FREE_FLYER:
                 found[joint.idx_v : joint.idx_v + 3] = True
-            else:
-                found[joint.idx_v] = joint.shortname().startswith("JointModelP")
+            found[joint.idx_v] |= joint.shortname().startswith("JointModelP")
+        return found
+
+    @cached_property
+    def is_rotation_vector(self) -> NDArray[np.bool_]:
+        """(nv,) whether a coordinate is a component of a rotation vector."""
+        found = np.zeros(len(self.names), dtype=bool)
+        for column in self.rotation_columns:
+            found[column : column + 3] = True
         return found
 
     @cached_property
@@ -127,29 +145,30 @@ class Coordinates:
 
     def configuration(self, q: Array) -> Array:
         """Pinocchio's configuration (nq,) or (N, nq) from coordinates (nv,) or (N, nv)."""
-        if not self.floating_base_columns:
+        if not self.rotation_columns:
             return q
         out = np.zeros((*q.shape[:-1], self.model.nq))
         out[..., self._configuration_indices] = q
-        for column in self.floating_base_columns:
+        for column in self.rotation_columns:
             at = self._configuration_indices[column]
-            r = q[..., column + 3 : column + 6]
+            r = q[..., column : column + 3]
             half = 0.5 * np.linalg.norm(r, axis=-1, keepdims=True)
-            out[..., at + 3 : at + 6] = 0.5 * np.sinc(half / np.pi) * r
-            out[..., at + 6 : at + 7] = np.cos(half)
+            out[..., at : at + 3] = 0.5 * np.sinc(half / np.pi) * r
+            out[..., at + 3 : at + 4] = np.cos(half)
         return out
 
-    def coordinate_derivatives(self, q: Array, v: Array) -> Array:
-        """Time derivatives (nv,) of the coordinates (nv,) at velocities (nv,).
+    def rate_matrix(self, q: Array) -> Array:
+        """N (nv, nv) at coordinates (nv,): time derivatives q' = N v of the coordinates.
 
-        For a floating base p' = R V_lin, r' = (1 + r x / 2 + c (r x)^2) V_ang.
+        The identity but for floating bases, p' = R V_lin, and rotation vectors,
+        r' = (1 + r x / 2 + c (r x)^2) w.
         """
-        if not self.floating_base_columns:
-            return v
-        out = v.copy()
+        out = np.eye(len(q))
         for column in self.floating_base_columns:
-            r, angular = q[column + 3 : column + 6], v[column + 3 : column + 6]
-            out[column : column + 3] = pin.exp3(r) @ v[column : column + 3]
+            out[column : column + 3, column : column + 3] = pin.exp3(q[column + 3 : column + 6])
+        for column in self.rotation_columns:
+            rotation = slice(column, column + 3)
+            r = q[rotation]
             half = 0.5 * float(np.linalg.norm(r))
             # series in t^2 where the closed form suffers from cancellation
             c = (
@@ -157,24 +176,85 @@ class Coordinates:
                 if half > 1e-3
                 else 1 / 12 + half**2 / 180
             )
-            turned = np.cross(r, angular)
-            out[column + 3 : column + 6] = angular + 0.5 * turned + c * np.cross(r, turned)
+            turned = pin.skew(r)
+            out[rotation, rotation] += 0.5 * turned + c * turned @ turned
         return out
 
-    def wrap_rotations(self, q: Array) -> Array:
-        """The same configuration (nv,) with rotation vectors of length pi or less."""
-        if not self.floating_base_columns:
+    def coordinate_derivatives(self, q: Array, v: Array) -> Array:
+        """Time derivatives q' = N v (nv,) of the coordinates (nv,) at velocities (nv,)."""
+        return self.rate_matrix(q) @ v if self.rotation_columns else v
+
+    def wrap_rotations(self, q: Array, columns: Indices | None = None) -> Array:
+        """The same configuration (nv,) with rotation vectors of length pi or less.
+
+        Args:
+            q: (nv,).
+            columns: Columns that may change; all by default.
+        """
+        if not self.rotation_columns:
             return q
         out = q.copy()
-        for column in self.floating_base_columns:
-            r = out[column + 3 : column + 6]
+        for column in self.rotation_columns:
+            if columns is not None and not np.isin(range(column, column + 3), columns).all():
+                continue
+            r = out[column : column + 3]
             length = float(np.linalg.norm(r))
             if length > np.pi:
                 r *= 1 - 2 * np.pi * np.round(length / (2 * np.pi)) / length
         return out
 
+    def cardan_angles(self, q: Array) -> tuple[Array, Array]:
+        """Coordinates (nv,) with Cardan angles R = R_x R_y R_z in place of rotation vectors.
+
+        Returns:
+            The coordinates, and the matrix (nv, nv) of their time derivatives by the velocities,
+            which is singular where the second angle is 90 degrees.
+        """
+        out, rates = q.copy(), np.eye(len(q))
+        for column in self.rotation_columns:
+            rotation = slice(column, column + 3)
+            first, second, third = out[rotation] = cardan_angles(pin.exp3(q[rotation]))
+            s, c = np.sin(third), np.cos(third)
+            # columns: axes of the three angles in the axes of the child
+            axes = [
+                [c * np.cos(second), s, 0],
+                [-s * np.cos(second), c, 0],
+                [np.sin(second), 0, 1],
+            ]
+            rates[rotation, rotation] = np.linalg.pinv(axes)
+        return out, rates
+
+    def has_partial_rotations(self, columns: Indices) -> bool:
+        """Whether columns contain a part of a rotation vector, but not all of it."""
+        return any(
+            0 < np.isin(range(column, column + 3), columns).sum() < 3
+            for column in self.rotation_columns
+        )
+
+    def unwrap_rotations(self, q: Array, nearby: Array) -> Array:
+        """The same configuration (nv,) with the rotation vectors nearest to those of another."""
+        out = q.copy()
+        for column in self.rotation_columns:
+            r, other = out[column : column + 3], nearby[column : column + 3]
+            length = float(np.linalg.norm(r))
+            axis = r if length else other
+            axis = axis / max(float(np.linalg.norm(axis)), 1e-300)
+            r += axis * 2 * np.pi * np.round((axis @ other - length) / (2 * np.pi))
+        return out
+
     def _coordinate_limits(self, joint_limits: Array, unlimited: float) -> Array:
         out = np.asarray(joint_limits, dtype=np.float64)[self._configuration_indices].copy()
         for column in self.floating_base_columns:
-            out[column : column + 6] = unlimited
+            out[column : column + 3] = unlimited
+        for column in self.rotation_columns:
+            out[column : column + 3] = unlimited
         return out
+
+
+def cardan_angles(rotation: Array) -> tuple[float, float, float]:
+    """Angles a, b, c with rotation = R_x(a) R_y(b) R_z(c), of any rotation matrix (3, 3)."""
+    first = np.arctan2(-rotation[1, 2], rotation[2, 2])
+    sine, cosine = np.sin(first), np.cos(first)
+    second = np.arctan2(rotation[0, 2], cosine * rotation[2, 2] - sine * rotation[1, 2])
+    x, y = cosine * rotation[1, :2] + sine * rotation[2, :2]
+    return float(first), float(second), float(np.arctan2(x, y))

@@ -128,7 +128,9 @@ class GammaDerivatives:
                         _power_between_bodies(twice, self.twists[j], loops.rows[r])
                         + 2.0 * _power_between_bodies(once, rate, loops.rows[r])
                         + _power_between_bodies(loops.rows[r].wrench, known, loops.rows[r])
-                    )
+                        + self._curvature_term(loops.rows[r], j, joint_velocities,
+                                               joint_accelerations)
+                    )  # fmt: skip
         solution, _ = loops.solve_passive(
             {joint: [0.0] * n for joint in loops.active_joints}, right_sides
         )
@@ -137,6 +139,22 @@ class GammaDerivatives:
             for cluster, own in zip(self.clusters, self.own, strict=True)
             for j in own
         }
+
+    def _curvature_term(
+        self,
+        row: LoopEquationFormula,
+        coordinate: int,
+        joint_velocities: Sequence[Scalar],
+        joint_accelerations: Sequence[Scalar],
+    ) -> Scalar:
+        """Contribution of the higher powers of a coupling: c'' gamma + 2 c' gamma'."""
+        total: Scalar = 0.0
+        for joint, (curvature, third) in row.curvatures.items():
+            v, a = joint_velocities[joint], joint_accelerations[joint]
+            rate = self.first[coordinate][joint]
+            gamma = self._loops.gamma[joint][coordinate]
+            total = total + (third * v * v + curvature * a) * gamma + 2.0 * curvature * v * rate
+        return total
 
     def _relative_motions(
         self,
@@ -245,6 +263,9 @@ class GammaDerivatives:
             relative_power = _power_between_bodies(
                 row.wrench, twist_changes, row
             ) + _power_between_bodies(rate, self.twists[j], row)
+            for joint, (curvature, _) in row.curvatures.items():
+                gamma = self._loops.gamma[joint]
+                relative_power = relative_power + curvature * gamma[j] * gamma[k]
             right_sides[r] = [-1.0 * relative_power]
         solution, _ = self._loops.solve_passive(
             {joint: [0.0] for joint in self._loops.active_joints}, right_sides

@@ -1,12 +1,13 @@
 """Geometry, position kinematics and constants of one machine as symbolic formulas.
 
 With spatial vectors, pairs of a linear and an angular part, and rotation vectors that are regular
-at zero, see `crane.description.floating_bases`.
+at zero, see `crane.description.rotation_vectors`.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
@@ -141,13 +142,15 @@ class TreeGeometry:
     """The geometry of a machine, which its kinematics formulas depend on.
 
     Joint i (1 to nb) moves body i and turns about or slides along the body's z axis; body 0 is the
-    world. A floating base is a series of six bodies on the world, at the position of the last one,
-    which alone has mass: its velocities are along and about the axes of that body.
+    world. A ball joint is a series of three bodies, a floating base one of six on the world, all
+    at the position of the last one, which alone has mass: the velocities are along and about the
+    axes of that body.
 
     Attributes:
         parents: (nb + 1,) parent bodies.
         is_revolute: (nb + 1,) whether the joint is revolute.
         floating_bases: First body of each floating base.
+        ball_joints: First body of each ball joint.
         body_rotations: (nb + 1, 3, 3) from the axes of the body here to those of Pinocchio's
             joint.
         constants: (12 (nb + frames) + 1,) rotation and origin of every joint frame in its parent
@@ -158,6 +161,7 @@ class TreeGeometry:
     parents: tuple[int, ...]
     is_revolute: tuple[bool, ...]
     floating_bases: tuple[int, ...]
+    ball_joints: tuple[int, ...]
     body_rotations: Array
     constants: Array
     frame_bodies: tuple[int, ...]
@@ -171,17 +175,24 @@ class TreeGeometry:
         """
         if self.parents.count(0) != 2 or 0 in self.frame_bodies:
             return 0
-        return 6 if self.floating_bases else 1
+        return len(self.series_of_body.get(1, (1,)))
+
+    @cached_property
+    def series_of_body(self) -> dict[int, tuple[int, ...]]:
+        """The bodies of the series of each body of a ball joint or floating base."""
+        series = [tuple(range(i, i + 6)) for i in self.floating_bases]
+        series += [tuple(range(i, i + 3)) for i in self.ball_joints]
+        return {i: bodies for bodies in series for i in bodies}
 
     @property
-    def floating_bodies(self) -> frozenset[int]:
-        """All bodies of floating bases."""
-        return frozenset(i + k for i in self.floating_bases for k in range(6))
+    def rotation_bodies(self) -> list[int]:
+        """First of the three bodies of each rotation vector."""
+        return [*(i + 3 for i in self.floating_bases), *self.ball_joints]
 
     @property
     def massless_bodies(self) -> frozenset[int]:
-        """Bodies of floating bases without mass."""
-        return frozenset(i + k for i in self.floating_bases for k in range(5))
+        """Bodies of ball joints and floating bases without mass."""
+        return frozenset(i for i, series in self.series_of_body.items() if i != series[-1])
 
     def supporting_bodies(self, body: int) -> list[int]:
         """A body and the bodies that carry it, except the world."""
@@ -202,9 +213,9 @@ def tree_geometry(equations: LoopEquations) -> TreeGeometry:
     for i in range(1, model.njoints):
         joint = model.joints[i]
         placement = rotations[body_of_joint[model.parents[i]]].inverse() * model.jointPlacements[i]
-        if joint.nv == 6:
-            placements += [placement, *[pin.SE3.Identity()] * 5]
-            rotations += [pin.SE3.Identity()] * 6
+        if joint.nv > 1:
+            placements += [placement, *[pin.SE3.Identity()] * (joint.nv - 1)]
+            rotations += [pin.SE3.Identity()] * joint.nv
             continue
         data = joint.createData()
         joint.calc(data, np.zeros(model.nq))
@@ -225,6 +236,7 @@ def tree_geometry(equations: LoopEquations) -> TreeGeometry:
         parents,
         tuple(revolute),
         tuple(column + 1 for column in coordinates.floating_base_columns),
+        tuple(column + 1 for column in coordinates.ball_joint_columns),
         np.array([turn.rotation for turn in rotations]),
         np.concatenate([*numbers, [1.0 / equations.characteristic_length]]),
         tuple(body_of_joint[body] for body, _ in frames),
@@ -293,14 +305,10 @@ class PositionKinematics:
         self.joint_axes: list[tuple[Vector, Vector]] = [([0.0] * 3, [0.0] * 3)]
         for i, parent in enumerate(geometry.parents[1:], start=1):
             arm: Vector = [0.0] * 3
-            if i in geometry.floating_bodies - set(geometry.floating_bases):
+            if i != geometry.series_of_body.get(i, (i,))[0]:
                 rotation, origin = self.rotation[parent], self.origin[parent]
             else:
-                rotation, arm = (
-                    self._floating_base_placement(i)
-                    if i in geometry.floating_bases
-                    else self._joint_placement(i, q[i - 1])
-                )
+                rotation, arm = self._joint_placement(i)
                 origin = add_vectors(self.origin[parent], arm)
             if geometry.reference_body and parent == 0:
                 inverse_rotation = transpose(rotation)
@@ -324,11 +332,8 @@ class PositionKinematics:
 
     def joint_axis(self, i: int) -> Vector:
         """Axis of joint i."""
-        axis_index = (
-            2
-            if i not in self.geometry.floating_bodies
-            else (i - max(j for j in self.geometry.floating_bases if j <= i)) % 3
-        )
+        series = self.geometry.series_of_body.get(i)
+        axis_index = 2 if series is None else (i - series[0]) % 3
         return [row[axis_index] for row in self.rotation[i]]
 
     def body_motion_axes(self, i: int) -> tuple[Vector, Vector]:
@@ -337,19 +342,21 @@ class PositionKinematics:
         still: Vector = [0.0] * 3
         return (still, along) if self.geometry.is_revolute[i] else (along, still)
 
-    def _floating_base_placement(self, i: int) -> tuple[list[Vector], Vector]:
-        """Rotation and origin of a floating base, from its position and rotation vector."""
-        turn, place = self._constants.placement(i - 1)
-        position, vector = self.q[i - 1 : i + 2], self.q[i + 2 : i + 5]
-        # the world is at the origin, and rotated if the reference body floats
-        return matmul(turn, rotation_matrix(vector)), add_vectors(place, matvec(turn, position))
-
-    def _joint_placement(self, i: int, q: Scalar) -> tuple[list[Vector], Vector]:
+    def _joint_placement(self, i: int) -> tuple[list[Vector], Vector]:
         """Rotation of body i, and its origin relative to its parent's."""
-        parent = self.geometry.parents[i]
+        parent, q = self.geometry.parents[i], self.q[i - 1]
         turn, place = self._constants.placement(i - 1)
+        if i in self.geometry.floating_bases:
+            position, vector = self.q[i - 1 : i + 2], self.q[i + 2 : i + 5]
+            # the world is at the origin, and rotated if the reference body floats
+            return (
+                matmul(turn, rotation_matrix(vector)),
+                add_vectors(place, matvec(turn, position)),
+            )
         rotation = matmul(self.rotation[parent], turn)
         arm = matvec(self.rotation[parent], place)
+        if i in self.geometry.ball_joints:
+            return matmul(rotation, rotation_matrix(self.q[i - 1 : i + 2])), arm
         if self.geometry.is_revolute[i]:
             c, s = apply_function("cos", q), apply_function("sin", q)
             return [[c * x + s * y, c * y - s * x, z] for x, y, z in rotation], arm

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from crane.closure.coordinates import Coordinates, Indices
 from crane.common.errors import MechanismError
@@ -59,12 +60,13 @@ class LoopEquations:
 
     Each row has a wrench w = [a_i; p_2 x a_i] or [0; b_k x a_i] at the world's origin, so that
     phi' = w . (V_2 - V_1) with the spatial velocities V. Columns of joints that carry both frames
-    therefore cancel exactly. Couplings follow, with sum c_j q_j - offset = 0 each.
+    therefore cancel exactly. Couplings follow, with sum c_j q_j + sum (a_j q_j^2 + b_j q_j^3 + d_j
+    q_j^4) - offset = 0 each.
 
     Args:
         model: The spanning tree.
         loops: The loops.
-        couplings: Linear constraints of joints.
+        couplings: Constraints of joints.
 
     Attributes:
         coordinates: Coordinates of the tree.
@@ -115,12 +117,18 @@ class LoopEquations:
         self.couplings = tuple(couplings)
         self.coupling_factors = np.zeros((len(self.couplings), model.nv))
         self.coupling_offsets = np.array([coupling.offset for coupling in self.couplings])
+        self.coupling_powers = np.zeros((3, len(self.couplings), model.nv))  # of squares first
         is_length = []
-        for row, coupling in zip(self.coupling_factors, self.couplings, strict=True):
+        for i, coupling in enumerate(self.couplings):
             for name, factor in coupling.factors.items():
                 column = self.coordinates.column(name)
-                row[column] = factor
+                self.coupling_factors[i, column] = factor
             is_length.append(bool(self.coordinates.is_translation[column]))
+            for name, coefficients in coupling.powers.items():
+                self.coupling_powers[:, i, self.coordinates.column(name)] = coefficients
+        self._has_powers = bool(self.coupling_powers.any())
+        # (c, nv) which joints couplings bind
+        self.is_coupled = (self.coupling_factors != 0) | self.coupling_powers.any(axis=0)
         self.names = (*(loop.name for loop in loops), *(item.name for item in couplings))
         self.loop_of_row = np.concatenate(
             [self._loop_index, len(self.loops) + np.arange(len(self.couplings), dtype=np.intp)]
@@ -145,11 +153,12 @@ class LoopEquations:
     def _find_geared_columns(self) -> list[tuple[int, int]]:
         """Columns in no loop and one coupling, then those in one of the remaining couplings."""
         found: list[tuple[int, int]] = []
-        involved, is_in_loop = self.coupling_factors != 0, (self.sign != 0).any(axis=0)
+        involved, is_in_loop = self.is_coupled, (self.sign != 0).any(axis=0)
+        is_linear = ~self.coupling_powers.any(axis=(0, 2))
         is_left = np.ones(len(involved), dtype=bool)
         while True:
             ends = (involved[is_left].sum(axis=0) == 1) & ~is_in_loop
-            rows = np.flatnonzero(is_left & (involved & ends).any(axis=1))
+            rows = np.flatnonzero(is_left & is_linear & (involved & ends).any(axis=1))
             # a row without any other joint fixes its own
             rows = rows[involved[rows].sum(axis=1) > 1]
             if not len(rows):
@@ -167,7 +176,7 @@ class LoopEquations:
         Returns:
             Group indices of the joints (k,) and of the rows (m,), -1 for rows without such joints.
         """
-        involved = np.vstack([self.sign, self.coupling_factors])[:, columns] != 0
+        involved = np.vstack([self.sign, self.is_coupled])[:, columns] != 0
         group = np.arange(len(columns), dtype=np.intp)
         for row in involved:
             connected = np.isin(group, group[row])
@@ -197,6 +206,7 @@ class LoopEquations:
             self.model.saveToString(),
             loops,
             tuple((x.name, tuple(x.factors.items()), x.offset) for x in self.couplings),
+            self.coupling_powers,
         )
 
     @property
@@ -241,6 +251,21 @@ class LoopEquations:
         wrenches[..., 3:] = _cross(np.where(is_translation[:, None], p2, b), a)
         return wrenches
 
+    def evaluate_couplings(self, q: Array) -> tuple[Array, Array, Array]:
+        """Residuals (c,) of the couplings, their first and second derivatives (c, nv).
+
+        Args:
+            q: (nq,) [m], [rad].
+        """
+        residuals = self.coupling_factors @ q - self.coupling_offsets
+        squares, cubes, fourths = self.coupling_powers
+        if not self._has_powers:
+            return residuals, self.coupling_factors, squares
+        slopes = 2 * squares * q + 3 * cubes * q**2 + 4 * fourths * q**3
+        curvatures = 2 * squares + 6 * cubes * q + 12 * fourths * q**2
+        residuals = residuals + squares @ q**2 + cubes @ q**3 + fourths @ q**4
+        return residuals, self.coupling_factors + slopes, curvatures
+
     def evaluate(self, q: Array) -> tuple[Array, Array]:
         """Residuals and Jacobian.
 
@@ -250,9 +275,9 @@ class LoopEquations:
         Returns:
             phi (m,) [m] for translations, [1] for rotations, and dphi/dq (m, nv).
         """
-        coupling_residuals = self.coupling_factors @ q - self.coupling_offsets
+        coupling_residuals, coupling_jacobian, _ = self.evaluate_couplings(q)
         if not self.loops:
-            return coupling_residuals, self.coupling_factors.copy()
+            return coupling_residuals, coupling_jacobian.copy()
         data, configuration = self.data, self.coordinates.configuration(q)
         # a vector for a single joint
         jacobian = pin.computeJointJacobians(self.model, data, configuration).reshape(6, -1)
@@ -265,7 +290,7 @@ class LoopEquations:
         if not self.couplings:
             return phi, loop_jacobian
         return np.concatenate([phi, coupling_residuals]), np.vstack(
-            [loop_jacobian, self.coupling_factors]
+            [loop_jacobian, coupling_jacobian]
         )
 
     def evaluate_scaled(self, q: Array) -> tuple[Array, Array]:
@@ -282,6 +307,16 @@ class LoopEquations:
         return phi / self.residual_units, jacobian / self.residual_units[
             :, None
         ] * self.coordinate_units
+
+    def displace(self, q: Array, columns: NDArray[Any], step: NDArray[Any]) -> Array:
+        """Configuration (nq,) after a displacement of some columns, scaled by their units.
+
+        Displacements are integrals of velocities: those of a rotation vector are rotations about
+        the axes of the child, see `Coordinates.rate_matrix`.
+        """
+        displacement = np.zeros(len(q))
+        displacement[columns] = step * self.coordinate_units[columns]
+        return q + self.coordinates.coordinate_derivatives(q, displacement)
 
     def name_of_row(self, row: int) -> str:
         """Name of the loop or coupling that an equation belongs to."""
@@ -318,8 +353,9 @@ class LoopEquations:
         Returns:
             (m,).
         """
+        coupling_bias = self.evaluate_couplings(q)[2] @ v**2
         if not self.loops:
-            return np.zeros(len(self.couplings))
+            return coupling_bias
         a, b, _, p2 = self._thread_local.last
         data, configuration = self.data, self.coordinates.configuration(q)
         rate = pin.computeJointJacobiansTimeVariation(self.model, data, configuration, v)
@@ -338,7 +374,7 @@ class LoopEquations:
         loop_bias = np.einsum("ij,ij->i", wrench_rate, relative) + np.einsum(
             "ij,ij->i", self._assemble_wrenches(a, b, p2), bias
         )
-        return np.concatenate([loop_bias, np.zeros(len(self.couplings))])
+        return np.concatenate([loop_bias, coupling_bias])
 
 
 @dataclass(frozen=True)
@@ -374,7 +410,7 @@ def find_clusters(equations: LoopEquations) -> list[Cluster]:
             i = representative[i]
         return i
 
-    for row in (*equations.sign, *equations.coupling_factors):
+    for row in (*equations.sign, *equations.is_coupled):
         tied = (np.flatnonzero(row) + 1).tolist()
         if not tied:
             continue

@@ -1,8 +1,10 @@
 """Loop equations, gamma and velocity kinematics of one machine as symbolic formulas."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
+
+import numpy as np
 
 from crane.closure.constraint_structure import ConstraintStructure
 from crane.closure.constraint_tolerances import CLOSED_TOLERANCE
@@ -12,6 +14,7 @@ from crane.closure.kinematics_formulas import (
     SpatialVector,
     Vector,
     largest_scaled_value,
+    rotation_vector_derivative,
     spatial_dot,
     subtract_spatial,
 )
@@ -41,6 +44,8 @@ class LoopEquationFormula:
         wrench: Wrench w of the row, phi' = w . (V_2 - V_1).
         phi: Residual.
         jacobian: dphi/dq by joint.
+        curvatures: Second and third derivatives of phi by the coordinates of joints, of a coupling
+            with higher powers.
     """
 
     bodies: tuple[int, int]
@@ -51,6 +56,7 @@ class LoopEquationFormula:
     wrench: SpatialVector
     phi: Scalar
     jacobian: dict[int, Scalar]
+    curvatures: Mapping[int, tuple[Scalar, Scalar]] = field(default_factory=dict)
 
     def axis_and_arm_rates(
         self, first_motion: SpatialVector, second_motion: SpatialVector
@@ -122,9 +128,18 @@ class LoopFormulas:
             factors = [float(x) for x in equations.coupling_factors[coupling]]
             derivatives: dict[int, Scalar] = {i: x for i, x in enumerate(factors, start=1) if x}
             phi = dot(factors, kinematics.q) - float(equations.coupling_offsets[coupling])
+            curvatures: dict[int, tuple[Scalar, Scalar]] = {}
+            powers = equations.coupling_powers[:, coupling]
+            for column in np.flatnonzero(powers.any(axis=0)).tolist():
+                a, b, c = powers[:, column].tolist()
+                x, joint = kinematics.q[column], column + 1
+                phi = phi + x * x * (a + x * (b + x * c))
+                slope = x * (2 * a + x * (3 * b + x * (4 * c)))
+                derivatives[joint] = derivatives.get(joint, 0.0) + slope
+                curvatures[joint] = 2 * a + x * (6 * b + x * (12 * c)), 6 * b + x * (24 * c)
             zero: Vector = [0.0] * 3
             return LoopEquationFormula(
-                (0, 0), False, False, zero, zero, (zero, zero), phi, derivatives
+                (0, 0), False, False, zero, zero, (zero, zero), phi, derivatives, curvatures
             )
         one = 2 * int(equations.loop_of_row[row])
         (axes1, origin1), (axes2, origin2) = self._frames[one], self._frames[one + 1]
@@ -208,13 +223,79 @@ class LoopFormulas:
         """Rows of gamma (n,) by joint."""
         return self.gamma_and_determinants[0]
 
-    @cached_property
-    def newton_step(self) -> dict[int, Scalar]:
-        """Newton step of the passive joints, by joint."""
+    def newton_step(self, holds_coordinates: bool) -> dict[int, Scalar]:
+        """Newton step of the coordinates of the passive joints, by joint.
+
+        Args:
+            holds_coordinates: See `coordinate_changes`.
+        """
+        return self.coordinate_changes([row.phi for row in self.rows], holds_coordinates)
+
+    def coordinate_changes(
+        self, gaps: Sequence[Scalar], holds_coordinates: bool = True
+    ) -> dict[int, Scalar]:
+        """Changes of the coordinates of the passive joints that close gaps, to first order.
+
+        Args:
+            gaps: Residuals by row.
+            holds_coordinates: Whether active coordinates that are parts of a rotation vector stay
+                constant; else the active joints do not move, but these coordinates may change.
+        """
         x, _ = self.solve_passive(
-            {joint: [0.0] for joint in self.active_joints}, [[-row.phi] for row in self.rows]
+            {joint: [0.0] for joint in self.active_joints}, [[-gap] for gap in gaps]
         )
-        return {joint: x[joint][0] for joint in self.passive_joints}
+        motion = {joint: row[0] for joint, row in x.items()}
+        steps = self.coordinate_steps(motion)
+        held = self.partly_active_joints
+        if held and holds_coordinates:
+            motions = self.motions_of_coordinates(held, [-1.0 * steps[joint] for joint in held])
+            steps = self.coordinate_steps(
+                {joint: value + motions[joint] for joint, value in motion.items()}
+            )
+        moved = self.passive_joints if holds_coordinates else [*self.passive_joints, *held]
+        return {joint: steps[joint] for joint in moved}
+
+    @cached_property
+    def partly_active_joints(self) -> list[int]:
+        """Active joints of rotation vectors of which only some are active."""
+        return [
+            joint
+            for body in self._kinematics.geometry.rotation_bodies
+            if not {body, body + 1, body + 2} <= set(self.active_joints)
+            for joint in range(body, body + 3)
+            if joint in self.active_joints
+        ]
+
+    def coordinate_steps(self, motion: dict[int, Scalar]) -> dict[int, Scalar]:
+        """Steps of the coordinates along a small motion of the joints, by joint."""
+        steps = dict(motion)
+        for body in self._kinematics.geometry.rotation_bodies:
+            joints, q = range(body, body + 3), self._kinematics.q[body - 1 : body + 2]
+            turned = rotation_vector_derivative(q, [motion[joint] for joint in joints])
+            steps |= dict(zip(joints, turned, strict=True))
+        return steps
+
+    def motions_of_coordinates(
+        self, joints: Sequence[int], steps: Sequence[Scalar]
+    ) -> dict[int, Scalar]:
+        """Motion of all joints along gamma by which coordinates of active joints change.
+
+        Args:
+            joints: Active joints of rotation vectors; the other active joints do not move.
+            steps: Steps of their coordinates.
+        """
+        columns = []
+        for joint in joints:
+            k = self.active_joints.index(joint)
+            columns.append({i: row[k] for i, row in self.gamma.items()})
+        rates = [self.coordinate_steps(column) for column in columns]
+        shares, _ = solve_linear_system(
+            [[rate[joint] for rate in rates] for joint in joints], [[step] for step in steps]
+        )
+        return {
+            i: dot([share[0] for share in shares], [column[i] for column in columns])
+            for i in self.gamma
+        }
 
     def largest_residual(self, redundant: bool = False) -> Scalar:
         """The largest absolute scaled residual of the independent or redundant equations."""
@@ -253,6 +334,8 @@ class VelocityKinematics:
         carriers: Sequence[int],
     ):
         self._kinematics, self._loops = kinematics, loops
+        self._joint_velocities = joint_velocities
+        series_of_body = kinematics.geometry.series_of_body
         self.velocities: list[tuple[Vector, Vector]] = [([0.0] * 3, [0.0] * 3)]
         self.bias_accelerations: list[tuple[Vector, Vector]] = [([-g for g in gravity], [0.0] * 3)]
         for i in range(1, len(kinematics.joint_axes)):
@@ -262,11 +345,10 @@ class VelocityKinematics:
             )
             v, w = self.velocities[parent]
             a, e = self.bias_accelerations[parent]
-            if (
-                i not in kinematics.geometry.floating_bodies
-            ):  # whose columns turn with the last of its bodies
-                a = add_vectors(a, cross(w, linear), cross(v, angular))
-                e = add_vectors(e, cross(w, angular))
+            # the axes of a series turn with its last body: products of its own rates cancel
+            axis_v, axis_w = self.velocities[carriers[series_of_body.get(i, (i,))[0]]]
+            a = add_vectors(a, cross(axis_w, linear), cross(axis_v, angular))
+            e = add_vectors(e, cross(axis_w, angular))
             self.bias_accelerations.append((a, e))
             self.velocities.append((add_vectors(v, linear), add_vectors(w, angular)))
 
@@ -284,6 +366,9 @@ class VelocityKinematics:
         one, two = row.bodies
         first, second = self.velocities[one], self.velocities[two]
         turned = spatial_dot(row.wrench_rate(first, second), subtract_spatial(second, first))
+        for joint, (curvature, _) in row.curvatures.items():
+            rate = self._joint_velocities[joint]
+            turned = turned + curvature * rate * rate
         return turned + spatial_dot(
             row.wrench,
             subtract_spatial(self.bias_accelerations[two], self.bias_accelerations[one]),

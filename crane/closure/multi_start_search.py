@@ -95,10 +95,9 @@ class ClosureResidual:
         joint_jacobians = pin.computeJointJacobians(
             model, data, equations.coordinates.configuration(q)
         ).reshape(6, -1)
-        residuals = [
-            (equations.coupling_factors @ q - equations.coupling_offsets) / self._coupling_units
-        ]
-        jacobians = [equations.coupling_factors / self._coupling_units[:, None]]
+        coupling_residuals, coupling_jacobian, _ = equations.evaluate_couplings(q)
+        residuals = [coupling_residuals / self._coupling_units]
+        jacobians = [coupling_jacobian / self._coupling_units[:, None]]
         for index, locked in enumerate(self._locked_components):
             one, two = (
                 data.oMi[joint] * place for joint, place in equations.frames[2 * index :][:2]
@@ -123,12 +122,10 @@ class ClosureResidual:
 
 
 def periodic_coordinates(equations: LoopEquations) -> NDArray[np.bool_]:
-    """(nv,) joints that a full revolution leaves unchanged: revolute, in no coupling or base."""
+    """(nv,) joints that a full revolution leaves unchanged: revolute, in no coupling."""
     coordinates = equations.coordinates
-    periodic = ~coordinates.is_translation & ~(equations.coupling_factors != 0).any(axis=0)
-    for column in coordinates.floating_base_columns:
-        periodic[column : column + 6] = False
-    return np.asarray(periodic)
+    is_angle = ~coordinates.is_translation & ~coordinates.is_rotation_vector
+    return np.asarray(is_angle & ~equations.is_coupled.any(axis=0))
 
 
 def remove_revolutions(
@@ -371,6 +368,7 @@ class MultiStartSearch:
         q = remove_revolutions(
             q, self.initial_guess, periodic, self._coordinates.lower, self._coordinates.upper
         )
+        q = self._coordinates.wrap_rotations(q, movable)
         return q, float(np.abs(residual).max(initial=0.0))
 
     def _line_search(

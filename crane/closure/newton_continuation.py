@@ -1,6 +1,6 @@
 """Newton's method and continuation along one branch."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +66,8 @@ class NewtonContinuation:
         self._active_columns, self._passive_columns, self._active_ranges = active, passive, ranges
         self._blocks = structure.blocks_by_size()
         units = self._coordinate_units = equations.coordinate_units
+        self._all_columns = np.arange(equations.model.nv)
+        self._has_partly_active_rotations = equations.coordinates.has_partial_rotations(active)
         self._gamma_units = units[passive, None] / units[active]
         model = equations.model
         places = [*model.jointPlacements, *(frame.placement for frame in model.frames)]
@@ -89,11 +91,16 @@ class NewtonContinuation:
         )
 
     def solve_newton(
-        self, q: Array, q_a: Array, max_iterations: int
+        self, q: Array, q_a: Array | None, max_iterations: int
     ) -> ClosedConfiguration | None:
-        """Close the loops at q_A by Newton's method from a nearby q; None if it diverges."""
+        """Close the loops at q_A by Newton's method from a nearby q; None if it diverges.
+
+        Without q_A the active joints do not move, which differs from constant coordinates where
+        they are parts of rotation vectors.
+        """
         q = q.copy()
-        q[self._active_columns] = q_a
+        if q_a is not None:
+            q[self._active_columns] = q_a
         rounding_scale, previous_residual = self.rounding_scale(q), np.inf
         for _ in range(max_iterations):
             phi, jacobian = self._equations.evaluate_scaled(q)
@@ -109,18 +116,45 @@ class NewtonContinuation:
             )
             try:
                 if at_rounding or stalled:
-                    gamma = solve_linear(
-                        jacobian[:, self._passive_columns], -jacobian[:, self._active_columns]
-                    )
+                    gamma = self._scaled_passive_gamma(jacobian)
+                    q_a = q[self._active_columns].copy()
                     return ClosedConfiguration(q, q_a, jacobian, gamma * self._gamma_units)
-                step = solve_linear(jacobian[:, self._passive_columns], -phi)
+                step = np.zeros(len(q))
+                step[self._passive_columns] = solve_linear(
+                    jacobian[:, self._passive_columns], -phi
+                )
+                if q_a is not None and self._has_partly_active_rotations:
+                    moved = self._equations.coordinates.coordinate_derivatives(q, step)
+                    gamma = self._scaled_passive_gamma(jacobian)
+                    step += self._displacement_of(q, gamma, -moved[self._active_columns])
             except np.linalg.LinAlgError:
                 return None
-            if not np.abs(step).max() < 1.0:  # also NaN
+            if not np.abs(step).max(initial=0.0) < 1.0:  # also NaN
                 return None
             previous_residual = residual
-            q[self._passive_columns] += step * self._coordinate_units[self._passive_columns]
+            q = self._equations.displace(q, self._all_columns, step)
         return None
+
+    def _scaled_passive_gamma(self, jacobian: Array) -> Array:
+        return solve_linear(jacobian[:, self._passive_columns], -jacobian[:, self._active_columns])
+
+    def _displacement_of(self, q: Array, passive_gamma: Array, active_step: Array) -> Array:
+        """Scaled displacements (nv,) along which the active coordinates change by a step (n,).
+
+        The coordinates change by N gamma times the displacements of the active joints, with N of
+        `Coordinates.rate_matrix`; this is the identity without rotation vectors.
+
+        Raises:
+            LinAlgError: The active coordinates do not determine a rotation there.
+        """
+        gamma = np.zeros((len(q), len(active_step)))
+        gamma[self._active_columns] = np.eye(len(active_step))
+        gamma[self._passive_columns] = passive_gamma
+        coordinates = self._equations.coordinates
+        if coordinates.rotation_columns:
+            rates = (coordinates.rate_matrix(q) @ gamma)[self._active_columns]
+            active_step = solve_linear(rates, active_step)
+        return gamma @ active_step
 
     def continue_to(
         self, target: Array, known: ClosedConfiguration, sample: str = ""
@@ -286,11 +320,8 @@ class NewtonContinuation:
                 if next_progress == 1.0
                 else start.q_a + next_progress * (target - start.q_a)
             )
-            passive_step = current.passive_gamma @ (q_a - current.q_a)
             # towards a fold Newton only converges linearly
-            corrected = self._predict_and_correct(
-                current, q_a, passive_step, 8 if step > _MIN_STEP * 16 else 40
-            )
+            corrected = self._predict_and_correct(current, q_a, 8 if step > _MIN_STEP * 16 else 40)
             if corrected is None:
                 step /= 2
                 continue
@@ -299,21 +330,28 @@ class NewtonContinuation:
         return current if progress == 1.0 else None, current
 
     def _predict_and_correct(
-        self, current: ClosedConfiguration, q_a: Array, passive_step: Array, max_iterations: int
+        self, current: ClosedConfiguration, q_a: Array, max_iterations: int
     ) -> ClosedConfiguration | None:
         """The configuration at q_A next to the current one, None if the branch changes."""
-        passive = self._passive_columns
-        units = self._coordinate_units[passive]
-        predicted_step = np.abs(passive_step / units).max(initial=0.0)
+        passive, units = self._passive_columns, self._coordinate_units
+        active_step = (q_a - current.q_a) / units[self._active_columns]
+        gamma = current.passive_gamma / self._gamma_units
+        try:
+            step = self._displacement_of(current.q, gamma, active_step)
+        except np.linalg.LinAlgError:
+            return None
+        predicted_step = np.abs(step[passive]).max(initial=0.0)
         if not predicted_step < 1.0:
             return None
-        predicted = current.q.copy()
-        predicted[passive] += passive_step
+        predicted = self._equations.displace(current.q, self._all_columns, step)
         corrected = self.solve_newton(predicted, q_a, max_iterations)
         if corrected is None or self._changed_signs(corrected).any():
             return None
-        correction = np.abs((corrected.q - predicted)[passive] / units).max(initial=0.0)
-        return corrected if correction <= 0.02 + 0.5 * predicted_step else None
+        correction = np.abs((corrected.q - predicted)[passive] / units[passive]).max(initial=0.0)
+        if correction > 0.02 + 0.5 * predicted_step:
+            return None
+        q = self._equations.coordinates.wrap_rotations(corrected.q, self._passive_columns)
+        return replace(corrected, q=q)
 
     def _check_solution(self, solution: ClosedConfiguration, sample: str) -> None:
         """Raise unless every equation holds and the passive joints are determined."""
@@ -336,12 +374,12 @@ class NewtonContinuation:
     ) -> OutOfReachError:
         from scipy.optimize import least_squares  # slow to import
 
-        q, units = last_reached.q.copy(), self._coordinate_units[self._passive_columns]
+        q = last_reached.q.copy()
         q[self._active_columns] = target
 
         def evaluate(passive: Array) -> tuple[Array, Array]:
-            q[self._passive_columns] = passive * units
-            phi, jacobian = self._equations.evaluate_scaled(q)
+            moved = self._equations.displace(q, self._passive_columns, passive)
+            phi, jacobian = self._equations.evaluate_scaled(moved)
             return phi, jacobian[:, self._passive_columns]
 
         def residual(passive: Array) -> Array:
@@ -350,7 +388,7 @@ class NewtonContinuation:
         def jacobian(passive: Array) -> Array:
             return evaluate(passive)[1]
 
-        start = q[self._passive_columns] / units
+        start = np.zeros(len(self._passive_columns))
         phi = evaluate(least_squares(residual, start, jacobian, xtol=1e-12).x)[0]
         worst = int(np.abs(phi).argmax())
         place, last = self._format_values(target), self._format_values(last_reached.q_a)

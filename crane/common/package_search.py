@@ -45,6 +45,7 @@ class LoadOptions:
         floating_root: Whether the root is a floating base.
         strict: Whether elements that are only formally wrong are errors, see `crane.load`.
         trust_xacro: Whether xacro files may run Python and read all files, see `crane.load`.
+        gravity: (3,) acceleration of gravity [m/s2]; None for that of the file.
         found_packages: Packages that were searched for, by name and referring folder.
     """
 
@@ -53,6 +54,7 @@ class LoadOptions:
     floating_root: bool = False
     strict: bool = False
     trust_xacro: bool = False
+    gravity: tuple[float, ...] | None = None
     found_packages: dict[tuple[str, Path], Path | None] = field(default_factory=dict, repr=False)
 
 
@@ -71,6 +73,7 @@ def use_load_options(
     floating: bool = False,
     strict: bool = False,
     trust_xacro: bool | None = None,
+    gravity: tuple[float, ...] | None = None,
 ) -> Iterator[LoadOptions]:
     """Context in which files are read with some options.
 
@@ -81,6 +84,7 @@ def use_load_options(
         strict: Whether elements that are only formally wrong are errors, here and in nested
             contexts.
         trust_xacro: Whether xacro files may run Python; by default as in the context around.
+        gravity: As for `crane.load`; by default as in the context around.
     """
     around = load_options()
     values = {
@@ -88,7 +92,8 @@ def use_load_options(
         for name, value in (arguments or {}).items()
     }
     trust = around.trust_xacro if trust_xacro is None else trust_xacro
-    options = LoadOptions(tuple(packages), values, floating, strict or around.strict, trust)
+    gravity, is_strict = gravity or around.gravity, strict or around.strict
+    options = LoadOptions(tuple(packages), values, floating, is_strict, trust, gravity)
     token = _load_options.set(options)
     try:
         yield options

@@ -71,8 +71,10 @@ _CONTACT_LAW: dict[str, Key] = {
 GROUND = section_schema(
     "'ground'",
     {
-        "height": NumberKey("height of the plane at $x = y = 0$", "m"),
-        "normal": NumberListKey("normal of the plane, upwards", size=3),
+        "height": NumberKey(
+            "height of the plane at $x = y = 0$; of one along z, its distance from the origin", "m"
+        ),
+        "normal": NumberListKey("normal of the plane, upwards; or across z", size=3),
         "profile": RowListKey(
             "points [x, z] with increasing x, instead of a plane", "m", size=2, default_text="none"
         ),

@@ -31,8 +31,9 @@ class Ground:
     """A plane, or a surface whose height varies along x and is constant along y.
 
     Attributes:
-        height: z of a plane at x = y = 0 [m].
-        normal: (3,) of a plane, upwards.
+        height: z of a plane at x = y = 0 [m]; of one along z, its distance from the origin along
+            the normal.
+        normal: (3,) of a plane, upwards, or across z for a machine drawn in x and y.
         profile: Points (x, z) [m] by increasing x, linear in between and level outside; none for a
             plane.
     """
@@ -43,8 +44,11 @@ class Ground:
 
     def __post_init__(self) -> None:
         normal = np.array(self.normal, dtype=np.float64)
-        if normal.shape != (3,) or not np.isfinite(normal).all() or not normal[2] > 0:
-            raise InputError(f"the ground's normal is {self.normal}, give one upwards, z above 0")
+        is_vector = normal.shape == (3,) and bool(np.isfinite(normal).all())
+        if not (is_vector and normal.any() and normal[2] >= 0):
+            raise InputError(
+                f"the ground's normal is {self.normal}, give one upwards, z not below 0"
+            )
         if self.profile:
             points = np.array(self.profile, dtype=np.float64)
             if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
@@ -59,7 +63,10 @@ class Ground:
         if not self.profile:
             length = float(np.linalg.norm(self.normal))
             normal: list[Scalar] = [x / length for x in self.normal]
-            return dot(normal, subtract_vectors(position, [0.0, 0.0, self.height])), normal
+            origin = [0.0, 0.0, self.height]
+            if not self.normal[2]:
+                origin = [x / length * self.height for x in self.normal]
+            return dot(normal, subtract_vectors(position, origin)), normal
         x, z = np.array(self.profile, dtype=np.float64).T
         slopes = np.concatenate([[0.0], np.diff(z) / np.diff(x), [0.0]])
         height: Scalar = float(z[0])
@@ -210,8 +217,11 @@ class Contact(ExternalForce):
         sliding_velocity: list[Scalar],
     ) -> tuple[list[Scalar], list[Scalar]]:
         """Return F_t (3,) and s' (2,)."""
-        normalization = 1.0 / apply_function("sqrt", normal[0] * normal[0] + normal[2] * normal[2])
-        first: list[Scalar] = [normalization * normal[2], 0.0, -1.0 * normalization * normal[0]]
+        first: list[Scalar] = [1.0, 0.0, 0.0]
+        if self.ground.profile or np.any(self.ground.normal[::2]):  # it is not along y
+            square = normal[0] * normal[0] + normal[2] * normal[2]
+            normalization = 1.0 / apply_function("sqrt", square)
+            first = [normalization * normal[2], 0.0, -1.0 * normalization * normal[0]]
         axes = first, cross(normal, first)
         s, max_friction = list(motion.states), self.friction * normal_force
         excess_share = maximum(

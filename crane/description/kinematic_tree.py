@@ -1,9 +1,8 @@
 """The kinematic tree of a machine: links and joints with their values and source locations.
 
 A composite joint J is a series of joints J_x, J_y, ... with one degree of freedom each, and with
-massless links J_1, J_2, ... between them, so that all code for revolute and prismatic joints
-applies. The disadvantage is the singularity of Cardan angles: if the second of three rotations is
-at 90 degrees, the first and third have the same axis, and a closure through the joint is singular.
+massless links J_1, J_2, ... between them. Three rotations become one joint again where the machine
+is assembled, see `crane.description.rotation_vectors`.
 """
 
 import math
@@ -19,7 +18,7 @@ Placement = tuple[Vector, Vector]  # xyz [m], rpy [rad] as URDF has them: R_z(y)
 Freedom = tuple[str, str, Vector]  # of a composite joint: suffix, kind, axis
 
 _X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
-_ROTATIONS: tuple[Freedom, ...] = (
+ROTATIONS: tuple[Freedom, ...] = (
     ("rx", "revolute", _X), ("ry", "revolute", _Y), ("rz", "revolute", _Z),
 )  # fmt: skip
 _TRANSLATIONS: tuple[Freedom, ...] = (
@@ -126,7 +125,7 @@ class Joint:
             square of the gear ratio [kg m2], or [kg] for a prismatic joint.
         is_cut: Whether it closed a cycle and has no ends, while findings are collected.
         floating_joint: Name of the joint with six degrees of freedom that it belongs to, see
-            `crane.description.floating_bases`.
+            `crane.description.rotation_vectors`.
     """
 
     name: str
@@ -231,9 +230,9 @@ def joint_freedoms(kind: str, axis: Sequence[float]) -> tuple[Freedom, ...]:
         axis: Normal of the plane of a planar joint.
     """
     if kind == "spherical":
-        return _ROTATIONS
+        return ROTATIONS
     if kind == "floating":
-        return (*_TRANSLATIONS, *_ROTATIONS)
+        return (*_TRANSLATIONS, *ROTATIONS)
     normal = np.asarray(axis, dtype=np.float64)
     first = np.cross(np.eye(3)[np.argmin(np.abs(normal))], normal)
     first /= np.linalg.norm(first)
@@ -260,7 +259,7 @@ def joint_series(
         end_links: Parent and child link.
         source_location: File and line.
     """
-    floating_joint = name if tuple(freedoms) == (*_TRANSLATIONS, *_ROTATIONS) else ""
+    floating_joint = name if tuple(freedoms) == (*_TRANSLATIONS, *ROTATIONS) else ""
     links = [end_links[0], *(f"{name}_{i}" for i in range(1, len(freedoms))), end_links[1]]
     found: list[Link | Joint] = [
         Link(link, source_location, composite_joint=name) for link in links[1:-1]

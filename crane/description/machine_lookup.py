@@ -77,8 +77,8 @@ def command_line_arguments(
         free: Free joints, if chosen.
         changes: New values of parameters.
         lock: Coordinates of locked joints.
-        options: Packages, arguments, and whether the root floats; the current load options if not
-            given.
+        options: Packages, arguments, gravity, and whether the root floats; the current load
+            options if not given.
     """
     options = load_options() if options is None else options
     words = [str(name)]
@@ -87,6 +87,8 @@ def command_line_arguments(
     for option, joints in {"--active": active, "--free": free}.items():
         words += [] if joints is None else [option, ",".join(joints)]
     words += ["--floating"] * options.floating_root + ["--trust-xacro"] * options.trust_xacro
+    if options.gravity is not None:
+        words += ["--gravity", ",".join(map(repr, options.gravity))]
     words += [x for folder in options.packages for x in ("--packages", folder)]
     words += [x for key, value in options.arguments.items() for x in ("--arg", f"{key}:={value}")]
     return shlex.join(words)

@@ -42,6 +42,7 @@ from crane.hydraulics.hydraulic_circuit import Hydraulics
 
 PAYLOAD_MASS = "payload.mass"
 PINS_PREFIX = "pins."
+GRAVITY_PREFIX = "gravity."
 SPOOL_B = "spool_b"  # second spool of a valve; its parameters are named `valve.JOINT.spool_b.NAME`
 CIRCUIT_FIELDS = {  # field of `Hydraulics` by the prefix of parameter names
     "supply.": "supplies", "line.": "lines", "accumulator.": "accumulators",
@@ -126,6 +127,7 @@ def parameter_paths(spec: Any) -> dict[str, FieldPath]:
             for name in parameter_names(type(value_at(spec.hydraulics, path)))
             if not (prefix.startswith("supply.") and name == "tank")
         }
+    paths |= {f"{GRAVITY_PREFIX}{axis}": ("gravity", i) for i, axis in enumerate("xyz")}
     return paths | {
         f"{PINS_PREFIX}{name}": ("pin_capacities", name) for name in spec.pin_capacities
     }
@@ -144,6 +146,7 @@ def parameters(spec: MachineSpec) -> dict[str, float]:
     - `payload.mass`: a point mass at the tip, or the payload of the machine file, scaled to that
       mass.
     - `pins.JOINT`: the largest force that a pin bears.
+    - `gravity.x`, `.y`, `.z`: the acceleration of gravity, in the axes of the world.
     - Of sensors: `sensor.QUANTITY.zero`, `.scale`, `.delay`, `.noise`. They may be set for any
       quantity.
 
@@ -221,6 +224,8 @@ def parameter_unit(tree: Tree, name: str) -> str:
     owner = rest.rpartition(".")[0]
     if name.startswith(PINS_PREFIX):
         return "N"
+    if name.startswith(GRAVITY_PREFIX):
+        return "m/s2"
     if prefix == "control":  # gains of two kinds of controllers
         return ""
     if prefix not in _SECTIONS:

@@ -2,7 +2,6 @@
 
 from crane.description.circuit_schema import HYDRAULICS
 from crane.description.external_force_schema import CONTACT, CUTTER, GROUND, LOAD, SOIL, TASK_LOAD
-from crane.description.floating_bases import FLOATING_FREEDOMS
 from crane.description.force_elements import EndStop, ForceElement, Friction, GasSpring, Rope
 from crane.description.key_types import (
     REQUIRED,
@@ -18,8 +17,15 @@ from crane.description.key_types import (
     VariantKey,
     section_schema,
 )
+from crane.description.rotation_vectors import FLOATING_FREEDOMS
 from crane.description.sensors import Sensor
-from crane.description.specification import DEFAULT_RAMP_TIME, LOOP_TYPES, TIP_COORDINATES, PIGains
+from crane.description.specification import (
+    DEFAULT_RAMP_TIME,
+    LOOP_TYPES,
+    STANDARD_GRAVITY,
+    TIP_COORDINATES,
+    PIGains,
+)
 
 ALL_ITEM = "all"  # an item whose keys hold for all items beside it
 EXTENDS_KEY = "extends"  # the key that names the file a machine file is a variant of
@@ -64,6 +70,11 @@ COUPLING = section_schema(
             "joint",
             default=REQUIRED,
             attribute="factors",
+        ),
+        "powers": MapKey(
+            "coefficients of the square, cube and fourth power of joints, added to the sum",
+            NumberListKey("", size=3),
+            "joint",
         ),
         "offset": NumberKey("value of the weighted sum", *_COORDINATE, default=0.0),
     },
@@ -312,13 +323,17 @@ MACHINE = section_schema(
         ),
         "name": TextKey("name of the machine", default=REQUIRED),
         "source": TextKey("source of the parameters", default=""),
+        "gravity": NumberListKey(
+            "acceleration of gravity, in the axes of the world; 0, 0, 0 for none", "m/s2", size=3,
+            default=STANDARD_GRAVITY, default_text="0, 0, -9.81, or that of the files of `chains`",
+        ),
         "chains": ListKey("open sub-chains", SectionKey(section=CHAIN), default=REQUIRED),
         "floating": NameListKey(
             "degrees of freedom of the root of the first chain",
             choices=FLOATING_FREEDOMS, default_text="none: fixed to the world",
         ),
         "loops": ListKey("joints that close the chains into loops", SectionKey(section=LOOP)),
-        "couplings": ListKey("linear constraints between joints", SectionKey(section=COUPLING)),
+        "couplings": ListKey("constraints between joints", SectionKey(section=COUPLING)),
         "active": NameListKey(
             "driven joints, in the order of $q_A$; redundant ones share the load",
             default_text="the set with the best condition number, with a warning",

@@ -12,7 +12,6 @@ from crane.common.errors import CraneWarning, InputError, suggest_names
 from crane.common.plausible_ranges import implausible_value_text
 from crane.common.samples import MAX_COORDINATE, as_number
 from crane.description.external_forces import ExternalForce
-from crane.description.floating_bases import convert_locked_rotations
 from crane.description.force_elements import (
     AnyForceElement,
     Friction,
@@ -28,6 +27,7 @@ from crane.description.machine_parameters import (
     unknown_parameter_text,
     value_at,
 )
+from crane.description.rotation_vectors import convert_locked_rotations
 from crane.description.sensors import (
     SENSOR_PREFIX,
     parse_sensor_parameter,
@@ -325,14 +325,20 @@ def _propagate_locks(
     locked, pending, remaining = dict(lock), list(couplings), list(couplings)
     while pending:
         coupling = pending.pop(0)
-        free = {name: x for name, x in coupling.factors.items() if name not in locked}
-        locked_names = coupling.factors.keys() - free.keys()
-        if len(free) > 1 or not locked_names:
-            continue
-        remaining.remove(coupling)
-        residual = coupling.offset - sum(
-            coupling.factors[name] * locked[name] for name in locked_names
+        rest = coupling.without_joints({x: locked[x] for x in coupling.joints if x in locked})
+        free, residual, locked_names = (
+            rest.factors,
+            rest.offset,
+            set(coupling.joints) - set(rest.joints),
         )
+        if len(rest.joints) > 1 or not locked_names:
+            continue
+        if rest.powers:
+            raise InputError(
+                f"coupling '{coupling.name}' has powers of {rest.joints[0]}, lock that joint, "
+                "which determines the others"
+            )
+        remaining.remove(coupling)
         if not free and abs(residual) > 1e-9:
             raise InputError(
                 f"coupling '{coupling.name}' does not allow "
@@ -342,12 +348,7 @@ def _propagate_locks(
         locked |= {name: residual / factor for name, factor in free.items()}
         pending = list(remaining)  # further couplings may determine more joints
     return locked, tuple(
-        dataclasses.replace(
-            coupling,
-            factors=_without(coupling.factors, locked),
-            offset=coupling.offset
-            - sum(x * locked[name] for name, x in coupling.factors.items() if name in locked),
-        )
+        coupling.without_joints({x: locked[x] for x in coupling.joints if x in locked})
         for coupling in remaining
     )
 

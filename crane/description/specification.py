@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from crane.common.errors import InputError, suggest_names
@@ -146,19 +146,39 @@ class LoopSpec:
 
 @dataclass(frozen=True)
 class Coupling:
-    """A linear constraint of joints, sum factor q = offset: a gear, a joint that mimics another.
+    """A constraint of joints: a gear, a joint that mimics another, a cam.
+
+        sum factor q + sum (a q^2 + b q^3 + c q^4) = offset
 
     Attributes:
         name: Its name.
         factors: By joint, the first that of the joint which follows.
         offset: [rad], [m].
         source_location: Where it was written, for errors.
+        powers: Coefficients (a, b, c) of the higher powers by joint; none for a linear constraint.
     """
 
     name: str
     factors: Mapping[str, float]
     offset: float
     source_location: str
+    powers: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Joints that it binds."""
+        return tuple(dict.fromkeys((*self.factors, *self.powers)))
+
+    def without_joints(self, values: Mapping[str, float]) -> "Coupling":
+        """Return what it asks of its other joints with some at coordinates."""
+        offset = self.offset
+        for joint, value in values.items():
+            offset -= self.factors.get(joint, 0.0) * value
+            for power, coefficient in enumerate(self.powers.get(joint, ()), start=2):
+                offset -= coefficient * value**power
+        factors = {joint: x for joint, x in self.factors.items() if joint not in values}
+        powers = {joint: x for joint, x in self.powers.items() if joint not in values}
+        return replace(self, factors=factors, powers=powers, offset=offset)
 
 
 @dataclass(frozen=True)
@@ -377,6 +397,9 @@ class PayloadSpec:
     tree: Tree
 
 
+STANDARD_GRAVITY = (0.0, 0.0, -9.81)  # [m/s2]
+
+
 @dataclass(frozen=True)
 class MachineSpec:
     """A machine as described by its file; see docs/machine_file.md for the keys."""
@@ -410,6 +433,7 @@ class MachineSpec:
     pin_capacities: Mapping[str, float] = field(
         default_factory=dict
     )  # by joint or loop, most force [N]
+    gravity: tuple[float, ...] = STANDARD_GRAVITY  # (3,) [m/s2]
 
     @property
     def force_elements(self) -> tuple[AnyForceElement, ...]:

@@ -201,7 +201,7 @@ def _build_quantity(
     modes, base_quantity = quantity in STICK_SLIP_QUANTITIES, quantity.removeprefix(DERIVATIVES_OF)
     geometry = compiled_closure.geometry
     is_holonomic = (
-        not geometry.floating_bases and formula_structure.motion_parents == geometry.parents
+        not geometry.series_of_body and formula_structure.motion_parents == geometry.parents
     )
     frictionless_quantity = base_quantity.removesuffix(WITH_FRICTION)
     if (
@@ -297,10 +297,8 @@ class CompiledParameterDerivatives:
             for i in np.flatnonzero(geometry_changes).tolist():
                 seeds[tape.load(0, i).index] = tape.load(4, i)
             opened = directional_derivative([row.phi for row in loops.rows], seeds)
-            moving, _ = loops.solve_passive(
-                {joint: [0.0] for joint in loops.active_joints}, [[-1.0 * x] for x in opened]
-            )
-            seeds |= {_tape_index(q[i - 1]): rate for i, (rate,) in moving.items()}
+            changes = loops.coordinate_changes(opened)
+            seeds |= {_tape_index(q[i - 1]): change for i, change in changes.items()}
             for i in np.flatnonzero(constants_change).tolist():
                 seeds[tape.load(1, i).index] = tape.load(5, i)
             program.add_formula("formula", 6, directional_derivative(values, seeds))

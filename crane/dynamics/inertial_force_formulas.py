@@ -197,19 +197,21 @@ class InertialForceFormulas(JointForceFormulas):
     def coordinate_rates(self, joint_velocities: Sequence[Scalar]) -> Vector:
         """Derivatives of the coordinates (nb,) along joint velocities (nb + 1,)."""
         out = list(joint_velocities[1:])
-        for i in self.kinematics.geometry.floating_bases:
-            linear, angular = out[i - 1 : i + 2], out[i + 2 : i + 5]
-            vector = self.q[i + 2 : i + 5]
-            out[i - 1 : i + 2] = matvec(rotation_matrix(vector), linear)
-            out[i + 2 : i + 5] = rotation_vector_derivative(vector, angular)
+        geometry = self.kinematics.geometry
+        for i in geometry.floating_bases:
+            rotation = rotation_matrix(self.q[i + 2 : i + 5])
+            out[i - 1 : i + 2] = matvec(rotation, out[i - 1 : i + 2])
+        for i in geometry.rotation_bodies:
+            rotation_vector = self.q[i - 1 : i + 2]
+            out[i - 1 : i + 2] = rotation_vector_derivative(rotation_vector, out[i - 1 : i + 2])
         return out
 
     @property
     def rate_jacobian(self) -> list[Vector]:
-        """d(rates)/dv_A (nb, n), zero for floating bases."""
+        """d(rates)/dv_A (nb, n), zero for ball joints and floating bases."""
         none: Vector = [0.0] * self._mobility
-        floating = self.kinematics.geometry.floating_bodies
-        return [none if i in floating else self.gamma[i] for i in range(1, self._body_count)]
+        series = self.kinematics.geometry.series_of_body
+        return [none if i in series else self.gamma[i] for i in range(1, self._body_count)]
 
     @cached_property
     def kinetic(self) -> Scalar:

@@ -381,7 +381,8 @@ class Reactions(OneLineRepr):
         rows = equations.constraint_wrenches(*ends)
         scaled_jacobian = np.empty((len(q), len(equations.residual_units), model.nv))
         scaled_jacobian[:, : rows.shape[1]] = self._row_joint_signs * (rows @ columns)
-        scaled_jacobian[:, rows.shape[1] :] = equations.coupling_factors
+        for i, one in enumerate(q if equations.couplings else ()):
+            scaled_jacobian[i, rows.shape[1] :] = equations.evaluate_couplings(one)[1]
         scaled_jacobian *= equations.coordinate_units / equations.residual_units[:, None]
         return _StackKinematics(rotations, origins, columns, ends, rows, scaled_jacobian)
 

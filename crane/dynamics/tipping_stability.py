@@ -65,7 +65,8 @@ class TippingStability:
         mass: Mass of the machine [kg].
 
     Raises:
-        InputError: It has fewer than three supports, or all on one line.
+        InputError: It has fewer than three supports, or all on one line, or gravity does not press
+            it down on them, along -z.
     """
 
     def __init__(self, machine: Machine):
@@ -96,6 +97,11 @@ class TippingStability:
                 f"'{machine.name}' has {len(support_list)} supports and no area between them, "
                 "name three that are not in one line"
             ) from None
+        if not machine.gravity[2] < 0:
+            raise InputError(
+                f"gravity does not press '{machine.name}' down on its supports, along -z: give "
+                "gravity with z below 0"
+            )
         around = [int(i) for i in hull.vertices]
         self.line_indices = list(zip(around, around[1:] + around[:1], strict=True))
         self.line_names = [

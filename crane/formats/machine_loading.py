@@ -19,15 +19,15 @@ from crane.common.package_search import (
     load_options,
     use_load_options,
 )
-from crane.common.samples import read_only_copy
-from crane.description.floating_bases import add_floating_base, check_freedoms
+from crane.common.samples import as_sample, read_only_copy
 from crane.description.machine_lookup import CHANGES_SEPARATOR, find_machine_file
-from crane.description.machine_parameters import parameters
+from crane.description.machine_parameters import GRAVITY_PREFIX, parameters
 from crane.description.parameter_changes import (
     apply_parameter_changes,
     lock_joints,
     set_active_joints,
 )
+from crane.description.rotation_vectors import add_floating_base, check_freedoms
 from crane.description.specification import Coupling, LoopSpec, MachineSpec
 from crane.formats.assembly_warnings import add_remedy, check_home, warn_about_assembly_modes
 from crane.formats.machine_file.machine_reader import read_machine_spec
@@ -52,6 +52,7 @@ def load(
     arguments: Mapping[str, object] | None = None,
     strict: bool = False,
     trust_xacro: bool = False,
+    gravity: Sequence[float] | None = None,
 ) -> Machine:
     """Load a machine, optionally with changed parameters or locked joints.
 
@@ -68,7 +69,7 @@ def load(
             without an active joint are free anyway, with a warning.
         floating: Whether the root floats instead of being fixed to the ground: a vehicle, a
             humanoid. Its six joints, base_x to base_rz, are free, see
-            `crane.description.floating_bases`. For some of these freedoms give their names, such
+            `crane.description.rotation_vectors`. For some of these freedoms give their names, such
             as ("z", "ry") for heave and pitch.
         packages: Folders of the packages that files name by `package://`, `model://` and
             `$(find ...)`, or folders that contain such packages, see
@@ -81,6 +82,9 @@ def load(
             `crane.machine.machine_checks`.
         trust_xacro: Whether a xacro file may run Python in its expressions and read all files and
             environment variables, as by xacro itself; by default as `docs/security.md` says.
+        gravity: (3,) acceleration of gravity in the axes of the world [m/s2], if not that of the
+            file: (0, 0, -1.62) on the moon, (0, -9.81, 0) for a planar machine drawn in x and y.
+            The same as changes of gravity.x, .y and .z.
 
     Returns:
         The machine, closed at home.
@@ -97,8 +101,27 @@ def load(
         use_load_options(package_paths, values, bool(floating), strict, trust_xacro or None),
     ):
         chosen_joints = _check_chosen_joints(active=active, free=free)
+        changes = _with_gravity(changes or {}, gravity)
         spec = _read_spec(name, chosen_joints, floating)
         return _assemble_machine(spec, changes, lock, chosen_joints, floating)
+
+
+def _with_gravity(
+    changes: Mapping[str, float], gravity: Sequence[float] | None
+) -> Mapping[str, float]:
+    """Return the changes with those by the gravity of the caller, or else of the load options.
+
+    Raises:
+        InputError: It is no vector, or the changes have another gravity.
+    """
+    if gravity is None and (gravity := load_options().gravity) is None:
+        return changes
+    values = as_sample(gravity, 3, "gravity").tolist()
+    given = {f"{GRAVITY_PREFIX}{axis}": value for axis, value in zip("xyz", values, strict=True)}
+    for name, value in given.items():
+        if changes.get(name, value) != value:
+            raise InputError(f"{name} is {changes[name]} and {value} at once, give one of them")
+    return {**changes, **given}
 
 
 ClosureProvider = Callable[[pin.Model, Sequence[LoopSpec], Sequence[Coupling]], Closure | None]
@@ -205,8 +228,9 @@ def _assemble_machine(
     if lock:
         spec = lock_joints(spec, lock)
     model = assemble_tree(spec)
+    is_modified = bool(lock) or not all(x.startswith(GRAVITY_PREFIX) for x in changes or ())
     closure = closure_provider(model, spec.loops, spec.couplings) or _build_closure(
-        spec, model, bool(changes or lock)
+        spec, model, is_modified
     )
     _SPEC_BEFORE_CHANGES[closure] = spec_before_changes
     spec, model = replace_infeasible_inertias(spec, model, closure)

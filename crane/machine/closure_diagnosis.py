@@ -215,11 +215,10 @@ def _closing_change(
     changed: ChangedResidual,
 ) -> tuple[float, float] | None:
     """The scaled change of a parameter that closes the loops with least joint motion."""
-    x, units = np.zeros(len(passive) + 1), equations.coordinate_units[passive]
+    x = np.zeros(len(passive) + 1)
     weights = np.append(np.where(specified, 1.0, _FREE_WEIGHT), _FREE_WEIGHT)
     for _ in range(_MAX_ITERATIONS):
-        q = guess.copy()
-        q[passive] += x[:-1] * units
+        q = equations.displace(guess, passive, x[:-1])
         gap, jacobian, derivative = changed(q, float(x[-1]))
         matrix = np.column_stack([jacobian[:, passive], derivative])
         solution = np.linalg.lstsq(matrix / weights, matrix @ x - gap, rcond=1e-12)[0] / weights
@@ -265,9 +264,7 @@ def _nearest(
     from scipy.optimize import least_squares  # slow to import, only needed for open loops
 
     def configuration(x: Array) -> Array:
-        out = q.copy()
-        out[free] += x * equations.coordinate_units[free]
-        return out
+        return equations.displace(q, free, x)
 
     if not len(free):
         return q

@@ -16,7 +16,7 @@ from crane.closure.coordinates import Coordinates
 from crane.closure.loop_equations import LoopEquations
 from crane.common.one_line_repr import format_count
 from crane.common.samples import Array
-from crane.description.floating_bases import floating_series
+from crane.description.rotation_vectors import floating_series
 from crane.description.specification import Drive, MachineSpec
 
 _SECTIONS_OF_ACTIVE_JOINTS = {
@@ -91,7 +91,7 @@ def complete_active_joints(
     """
     basis = null_space_basis(jacobian, equations.motion_scales, DEAD_CENTRE_TOLERANCE)
     names = equations.coordinates.names
-    is_coupled = (equations.coupling_factors != 0).any(axis=0)
+    is_coupled = equations.is_coupled.any(axis=0)
     driven = spec.active or specified_driven_joints(spec)
     undriven = specified_free_joints(spec)
     specified = tuple(dict.fromkeys((*driven, *undriven)))

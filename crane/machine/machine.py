@@ -139,6 +139,17 @@ class Machine(OneLineRepr):
         return self.closure.home
 
     @property
+    def gravity(self) -> tuple[float, ...]:
+        """(3,) acceleration of gravity in the axes of the world [m/s2]."""
+        return tuple(self.model.gravity.linear.tolist())
+
+    @property
+    def up_direction(self) -> Array:
+        """Unit vector (3,) against gravity; z without gravity."""
+        length = float(np.linalg.norm(self.gravity))
+        return -np.array(self.gravity) / length if length else np.array([0.0, 0.0, 1.0])
+
+    @property
     def has_traceable_forces(self) -> bool:
         """Whether all external forces can be compiled."""
         return all(force.is_traceable for force in self.external_forces)
@@ -158,25 +169,17 @@ class Machine(OneLineRepr):
         `free`.
         """
         driven = {
-            *self.free,
-            *self.chosen_joints.get("active", ()),
-            *self.control,
+            *self.free, *self.chosen_joints.get("active", ()), *self.control,
             *(self.hydraulics.joints if self.hydraulics else ()),
-        }
+        }  # fmt: skip
         driven |= {joint for motor in self.explicit_drives for joint in motor.factors}
-        efforts = self.model.effortLimit[self.closure.active]
-        return tuple(
-            joint
-            for joint, effort in zip(self.active, efforts, strict=True)
-            if joint not in driven and not (np.isfinite(effort) and effort > 0)
-        )
+        efforts = zip(self.active, self.model.effortLimit[self.closure.active], strict=True)
+        return tuple(x for x, effort in efforts if x not in driven and not 0 < effort < np.inf)
 
     @cached_property
     def drives(self) -> tuple[Drive, ...]:
         """The drives of the machine: those of the file, or one along each driven active joint."""
-        return self.explicit_drives or tuple(
-            Drive(joint, {joint: 1.0}) for joint in self.driven_joints
-        )
+        return self.explicit_drives or tuple(Drive(x, {x: 1.0}) for x in self.driven_joints)
 
     @property
     def driven_joints(self) -> tuple[str, ...]:
@@ -214,12 +217,10 @@ class Machine(OneLineRepr):
         For example 'patu655 with {"changes": {"payload.mass": 200.0}, "lock": {"slew": 0.0}}'.
         """
         given = {
-            "changes": dict(self.parameter_changes),
-            "lock": dict(self.locked_joints),
-            "floating": self.floating_base,
-            "packages": self.packages,
+            "changes": dict(self.parameter_changes), "lock": dict(self.locked_joints),
+            "floating": self.floating_base, "packages": self.packages,
             "arguments": dict(self.arguments),
-        }
+        }  # fmt: skip
         options = {name: x for name, x in (given | dict(self.chosen_joints)).items() if x}
         return self.load_name + (CHANGES_SEPARATOR + json.dumps(options) if options else "")
 
@@ -445,6 +446,5 @@ class Machine(OneLineRepr):
         load = payload.rigid_body()
         model = pin.Model(self.model)
         model.appendBodyToJoint(frame.parentJoint, load, frame.placement)
-        return dataclasses.replace(
-            self, model=model, tree=add_rigid_load(self.tree, payload.frame, load)
-        )
+        tree = add_rigid_load(self.tree, payload.frame, load)
+        return dataclasses.replace(self, model=model, tree=tree)

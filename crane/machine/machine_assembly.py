@@ -14,9 +14,9 @@ from crane.closure.loop_equations import LoopEquations, frame_id
 from crane.common.errors import CraneWarning, DescriptionError, MechanismError, prefix_location
 from crane.common.samples import Array
 from crane.description.findings import error_recovery, is_strict, report_error
-from crane.description.floating_bases import floating_bases
 from crane.description.kinematic_tree import Joint, Link, Tree, inertia_problem
 from crane.description.pinocchio_conversion import inertia_from_inertial, se3_from_xyz_rpy
+from crane.description.rotation_vectors import ROTATION_COUNT, composite_joints
 from crane.description.specification import LoopSpec, MachineSpec
 from crane.machine.axis_diagnosis import find_wrong_axis
 from crane.machine.drive_selection import (
@@ -77,7 +77,7 @@ def build_closure(
     loops = spec.loops if loops is None else loops
     # while findings are collected, joints that close loops are missing in the tree
     known_names = set(Coordinates(model).names)
-    present_couplings = tuple(x for x in spec.couplings if known_names >= x.factors.keys())
+    present_couplings = tuple(x for x in spec.couplings if known_names.issuperset(x.joints))
     spec = dataclasses.replace(spec, couplings=present_couplings)
     names = specified_active_joints(spec, model)
     try:
@@ -195,6 +195,7 @@ def assemble_tree(spec: MachineSpec) -> pin.Model:
         )
     model = pin.Model()
     model.name = spec.name
+    model.gravity.linear = np.array(spec.gravity)
     root = tree.root_link
     frame = pin.Frame(
         root,
@@ -205,14 +206,14 @@ def assemble_tree(spec: MachineSpec) -> pin.Model:
         inertia_from_inertial(tree.links[root].inertial),
     )
     frames = {root: model.addFrame(frame)}
-    floating_series = {series[0]: (name, series) for name, series in floating_bases(spec).items()}
+    composite = {series[0]: (name, series) for name, series in composite_joints(spec).items()}
     pending = _joints_in_reverse_order(joints_by_parent, root)
     while pending:
         joint = pending.pop()
-        if joint.name in floating_series:
+        if joint.name in composite:
             pending += _joints_in_reverse_order(
                 joints_by_parent,
-                _add_floating_base(model, frames, *floating_series[joint.name], tree),
+                _add_composite_joint(model, frames, *composite[joint.name], tree),
             )
             continue
         mass = inertia_from_inertial(tree.links[joint.child].inertial)
@@ -267,14 +268,15 @@ def _add_joint(model: pin.Model, parent: int, joint: Joint, mass: pin.Inertia) -
     return int(model.addBodyFrame(joint.child, index, pin.SE3.Identity(), frame))
 
 
-def _add_floating_base(
+def _add_composite_joint(
     model: pin.Model, frames: dict[str, int], name: str, series: Sequence[str], tree: Tree
 ) -> str:
-    """Add a free-flyer joint for a series of six joints; returns the link that it moves."""
+    """Add a spherical or free-flyer joint for a series; returns the link that it moves."""
     joints = [tree.joints[part] for part in series]
     parent_frame = model.frames[frames[joints[0].parent]]
     placement = parent_frame.placement * se3_from_xyz_rpy(joints[0].xyz, joints[0].rpy)
-    index = model.addJoint(parent_frame.parentJoint, pin.JointModelFreeFlyer(), placement, name)
+    kind = pin.JointModelFreeFlyer if len(series) > ROTATION_COUNT else pin.JointModelSpherical
+    index = model.addJoint(parent_frame.parentJoint, kind(), placement, name)
     model.addJointFrame(index, frames[joints[0].parent])
     last = joints[-1].child
     model.appendBodyToJoint(
@@ -305,10 +307,10 @@ def _check_body_inertias(spec: MachineSpec, model: pin.Model) -> None:
     joints_with_findings = parent_joints(
         link for link in links.values() if _has_inertia_finding(link)
     )
-    floating = floating_bases(spec)
+    composite = composite_joints(spec)
     for index in range(1, model.njoints):
         name = model.names[index]
-        link = links[spec.tree.joints[floating[name][-1] if name in floating else name].child]
+        link = links[spec.tree.joints[composite[name][-1] if name in composite else name].child]
         if link.composite_joint is not None or index in refused_joints:
             continue
         problem = inertia_problem(model.inertias[index].mass, model.inertias[index].inertia)

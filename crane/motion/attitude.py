@@ -46,8 +46,8 @@ class RotationCoordinates:
 class InclinationCoordinate:
     """Inclination of a frame: elevation of its x axis in its plane of motion.
 
-    With the vertical in the frame, u = R^T e_z, l the axis of the frame (y or z) that is parallel
-    to the axis of the joint that rotates it, and k the other one of the two,
+    With the direction e against gravity (z without gravity), u = R^T e, l the axis of the frame (y
+    or z) that is parallel to the axis of the joint that rotates it, and k the other of the two,
 
         inclination = atan2(u_x, u_k):
 
@@ -91,9 +91,9 @@ class InclinationCoordinate:
                 f"{message_prefix}the joint that turns it is along neither its y axis nor its z "
                 "axis, give roll, pitch and yaw, or a frame that is so"
             )
-        self._k = 3 - axis_candidates[0]
+        self._k, self._up = 3 - axis_candidates[0], machine.up_direction
         rotation_axis = rotation[:, axis_candidates[0]]
-        if abs(rotation_axis[2]) > _MAX_AXIS_TILT:
+        if abs(rotation_axis @ self._up) > _MAX_AXIS_TILT:
             raise InputError(
                 f"{message_prefix}the joint that turns it is upright at home, not level, give "
                 "roll, pitch and yaw"
@@ -105,7 +105,7 @@ class InclinationCoordinate:
         angular_velocities = (
             tree_jacobian.reshape(6, -1)[3:] @ machine.closure.gamma(machine.home)
         )[:, machine.is_driven]
-        axis_tilts = np.cross(angular_velocities, rotation_axis, axisa=0)[:, 2]
+        axis_tilts = np.cross(angular_velocities, rotation_axis, axisa=0) @ self._up
         speeds = np.linalg.norm(angular_velocities, axis=0)
         if (np.abs(axis_tilts) > _MAX_AXIS_TILT * speeds).any():
             raise InputError(
@@ -115,7 +115,8 @@ class InclinationCoordinate:
 
     def value(self, rotation: Array) -> Array:
         """Inclination [rad], from -pi to pi, of rotations R (..., 3, 3)."""
-        return np.asarray(np.arctan2(rotation[..., 2, 0], rotation[..., 2, self._k]))
+        u = self._up @ rotation
+        return np.asarray(np.arctan2(u[..., 0], u[..., self._k]))
 
     def error(self, target: Array, rotation: Array) -> Array:
         """See `RotationCoordinates`."""
@@ -124,7 +125,7 @@ class InclinationCoordinate:
 
     def rates(self, rotation: Array, angular_velocities: Array) -> Array:
         """See `RotationCoordinates`."""
-        u = rotation[2]
+        u = self._up @ rotation
         vertical_rates = -np.cross(rotation.T @ angular_velocities, u, axisa=0, axisc=0)
         return self._angle_derivative(u, vertical_rates)[None]
 
@@ -132,7 +133,7 @@ class InclinationCoordinate:
         self, rotation: Array, angular_velocity: Array, angular_acceleration: Array
     ) -> Array:
         """See `RotationCoordinates`."""
-        u, k, w = rotation[2], self._k, rotation.T @ angular_velocity
+        u, k, w = self._up @ rotation, self._k, rotation.T @ angular_velocity
         vertical_rate = -np.cross(w, u)
         vertical_acceleration = -np.cross(rotation.T @ angular_acceleration, u) - np.cross(
             w, vertical_rate

@@ -88,7 +88,7 @@ class Sway(OneLineRepr):
                 return q_a
         raise InputError(
             f"what {', '.join(self.machine.free)} carry has no stable equilibrium nearby: choose "
-            "a configuration in which it hangs"
+            "a configuration, and gravity, in which it hangs"
         )
 
     def stiffness(self, q_a: Array) -> Array:

@@ -46,8 +46,9 @@ class Transmission(OneLineRepr):
         q = f(q_A),    v = gamma v_A,    f_A = gamma^T tau = gamma^T J^T w,
 
     so that f_A^T v_A = tau^T v. `update` takes the state of the actuators and closes the loops on
-    the branch of home; forces are mapped in the configuration of the last update. The six freedoms
-    of a floating base are not joints here: the base is fixed in its home placement.
+    the branch of home; forces are mapped in the configuration of the last update. A ball joint is
+    three joints here, with Cardan angles R_x R_y R_z and their rates. The six freedoms of a
+    floating base are not joints: the base is fixed in its home placement.
 
     Args:
         machine: The machine.
@@ -138,14 +139,15 @@ class Transmission(OneLineRepr):
         active_coordinates = closure.home[closure.active]
         active_coordinates[self._actuator_columns] = q_a
         q = closure.solve(active_coordinates)
-        gamma = closure.gamma(q)[np.ix_(self._joint_columns, self._actuator_columns)]
+        positions, rates = self.machine.coordinates.cardan_angles(q)
+        gamma = (rates @ closure.gamma(q))[np.ix_(self._joint_columns, self._actuator_columns)]
         effort = np.zeros(len(q))
         effort[closure.active[self._actuator_columns]] = f_a
         velocity, effort = gamma @ v_a, effort[self._joint_columns]
         self._gamma, self._configuration = gamma, q
         self.state = JointState(
             self.joints,
-            q[self._joint_columns],
+            positions[self._joint_columns],
             *(np.empty(0) if np.isnan(x).any() else x for x in (velocity, effort)),
         )
         return self.state

@@ -15,7 +15,7 @@ from crane.common.units import format_quantity
 from crane.dynamics.buckling import Buckling
 from crane.dynamics.statics import StaticsEvaluator
 from crane.machine.machine import Machine
-from crane.motion.workspaces.workspace_section import find_slewing_joint, up_direction
+from crane.motion.workspaces.workspace_section import find_slewing_joint
 from crane.ratings.capacity_report import LoadTable, load_table, to_markdown
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.drive_force_limits import DriveForceLimits, PinForces, drive_force_limits
@@ -144,7 +144,8 @@ class Capacity(RatingChart):
             without the lateral part of gravity on a slope, and the largest change by it over all
             directions of the slope.
         """
-        machine, up, has_load = self.machine, up_direction(self.machine), np.isfinite(self.values)
+        machine, has_load = self.machine, np.isfinite(self.values)
+        up = machine.up_direction
         statics = StaticsEvaluator(machine, self.frame).evaluate(
             machine.closure.solve(np.ascontiguousarray(self.q_a[has_load]))
         )

@@ -12,7 +12,7 @@ from crane.common.samples import Array
 from crane.dynamics.statics import StaticQuantities, StaticsEvaluator
 from crane.dynamics.tipping_stability import TippingStability, has_supports
 from crane.machine.machine import Machine
-from crane.motion.workspaces.workspace_section import WorkspaceSection, up_direction
+from crane.motion.workspaces.workspace_section import WorkspaceSection
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.drive_force_limits import DriveForceLimits, PinForces, drive_force_limits
 from crane.ratings.rating_rules import Rule, UnitAction
@@ -104,7 +104,7 @@ class LoadLimits:
         with_weight: bool = True,
     ):
         machine = self.machine = statics.machine
-        self.action, self._up_direction = action, up_direction(machine)
+        self.action, self._up_direction = action, machine.up_direction
         weight = with_weight * float(np.linalg.norm(machine.model.gravity.linear))
         self._slope_tangent = np.tan(ground_slope)
         self._vertical_gravity = weight * np.cos(ground_slope)

@@ -9,7 +9,7 @@ from crane.common.samples import Array, as_number
 from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.dynamics.statics import StaticQuantities
 from crane.machine.machine import Machine
-from crane.motion.workspaces.workspace_section import WorkspaceSection, up_direction
+from crane.motion.workspaces.workspace_section import WorkspaceSection
 
 MAX_GROUND_SLOPE = np.deg2rad(45.0)
 
@@ -178,10 +178,10 @@ def gravity_action(machine: Machine) -> FixedUnitAction:
     Raises:
         InputError: The machine has no gravity.
     """
-    gravity = np.array(machine.model.gravity.linear)
+    gravity = np.array(machine.gravity)
     if not gravity.any():
         raise InputError(f"'{machine.name}' has no gravity, a load has no weight there")
-    return FixedUnitAction(gravity, up_direction(machine), is_weight=True)
+    return FixedUnitAction(gravity, machine.up_direction, is_weight=True)
 
 
 def rotate_about_axis(vectors: Array, axis: Array, angles: Array) -> Array:
@@ -208,5 +208,5 @@ def slew_angles(
         return np.zeros(len(slew_coordinates))
     frames, column = FrameJacobians(machine), machine.closure.active[section.slewing_joint]
     frames.set_configuration(machine.home)
-    rotation_sign = np.sign(frames.jacobian(frame)[3:, column] @ up_direction(machine))
+    rotation_sign = np.sign(frames.jacobian(frame)[3:, column] @ machine.up_direction)
     return np.asarray(rotation_sign * (slew_coordinates - machine.home[column]))

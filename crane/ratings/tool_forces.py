@@ -11,7 +11,6 @@ from crane.common.samples import Array, as_sample
 from crane.common.units import format_quantity
 from crane.dynamics.statics import StaticsEvaluator
 from crane.machine.machine import Machine
-from crane.motion.workspaces.workspace_section import up_direction
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.drive_force_limits import drive_force_limits
 from crane.ratings.limiting_factors import RatingConditions
@@ -103,7 +102,7 @@ class ToolForce(RatingChart):
             self.machine.closure.solve(self.q_a[s, b, a])
         )
         unit_vectors = -rotate_about_axis(
-            self.action.unit_vectors(statics, angles), up_direction(self.machine), -angles
+            self.action.unit_vectors(statics, angles), self.machine.up_direction, -angles
         )
         first_directions = np.broadcast_to(self.section.first_direction, unit_vectors.shape)
         if self.section.is_radial:  # outwards from the axis at each position
@@ -114,7 +113,7 @@ class ToolForce(RatingChart):
                 * self.section.second_direction
             )
             first_directions = rotate_about_axis(
-                first_directions, up_direction(self.machine), -angles
+                first_directions, self.machine.up_direction, -angles
             )
             first_directions /= np.maximum(
                 np.linalg.norm(first_directions, axis=1, keepdims=True), 1e-300
@@ -200,7 +199,7 @@ def tangent_action(strokes: Strokes, stroke_index: int) -> PathUnitAction:
     if limits is None:
         raise InputError(f"nothing limits '{joint}', give it a cylinder, or an effort in <limit>")
     pushes_harder = limits.max_force >= -limits.min_force
-    return PathUnitAction(stroke_index, -1.0 if pushes_harder else 1.0, up_direction(machine))
+    return PathUnitAction(stroke_index, -1.0 if pushes_harder else 1.0, machine.up_direction)
 
 
 def _direction_action(
@@ -208,7 +207,7 @@ def _direction_action(
 ) -> tuple[UnitAction, str | None]:
     """Return the unit action on the frame, and the joint for a tangent of a path."""
     machine, section = search.machine, search.section
-    up = up_direction(machine)
+    up = machine.up_direction
     if isinstance(direction, str):
         if direction not in TOOL_DIRECTIONS:
             raise InputError(

@@ -11,7 +11,6 @@ from crane.common.samples import as_number
 from crane.dynamics.statics import StaticsEvaluator
 from crane.machine.machine import Machine
 from crane.motion.workspaces import Workspace, workspace
-from crane.motion.workspaces.workspace_section import up_direction
 from crane.ratings.strokes import Strokes, bucket_and_arm_strokes, check_drives, find_pivot
 from crane.ratings.working_range_dimensions import Dimension, DimensionFinder
 from crane.recordings.timeseries import Table, write_table
@@ -113,7 +112,7 @@ def working_range(
     """
     level = as_number(level, "the level bottom's length", "m", greater_than=0.0)
     reach = workspace(machine, _WORKSPACE_SAMPLES, frame)
-    is_upright = abs(reach.section.second_direction @ up_direction(machine)) >= 1 - 1e-9
+    is_upright = abs(reach.section.second_direction @ machine.up_direction) >= 1 - 1e-9
     if not reach.area or not is_upright:
         raise InputError(
             f"'{reach.frame}' of '{machine.name}' moves in no upright plane, a working range is "

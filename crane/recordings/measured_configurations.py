@@ -15,6 +15,7 @@ from crane.common.errors import ClosureError, MechanismError, RecordingError
 from crane.common.samples import Array
 from crane.description.sensors import INCLINATION_PREFIX, VELOCITY_SUFFIX, VELOCITY_UNITS
 from crane.machine.machine import Machine
+from crane.recordings.rotation_columns import body_rates
 from crane.recordings.sensor_kinematics import ideal_readings, pin_derivatives
 from crane.recordings.timeseries import TIME, Table, table_column, time_derivative
 
@@ -184,6 +185,21 @@ def motion_from_joints(
             if (recorded := recorded_velocity(machine, joint, table)) is None
             else recorded
         )
+    for column in machine.coordinates.rotation_columns:
+        parts = machine.joints[column : column + 3]
+        missing = [
+            x for x in parts if recorded_velocity(machine, x, table) is None and x in drives
+        ]
+        if not missing:
+            continue
+        if not set(parts) <= set(drives):
+            raise RecordingError(
+                f"'{missing[0]}_velocity' is missing, the angular velocity about an axis of the "
+                f"child, which {', '.join(parts)} together determine: record it, or all of them"
+            )
+        rates = body_rates(q_b[:, [drives.index(x) for x in parts]], time)
+        for x in missing:
+            v_b[:, drives.index(x)] = rates[:, parts.index(x)]
     if set(drives) == set(machine.active):
         order = [drives.index(x) for x in machine.active]
         return q_b[:, order], v_b[:, order]

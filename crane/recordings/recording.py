@@ -23,6 +23,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import InitVar, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -323,6 +324,16 @@ class Recording(Result):
         return scratch_arrays.compute_in_blocks(
             lambda part: (reference[part] - actual[part])[:, None], len(self.time)
         )[:, 0]
+
+    def rotations(self, joint: str) -> Any:
+        """Rotations (N,) of a ball joint or floating base, as `scipy.spatial.transform.Rotation`.
+
+        Raises:
+            InputError: The recording has no rotation vector of this joint.
+        """
+        from scipy.spatial.transform import Rotation  # slow to import
+
+        return Rotation.from_rotvec(np.column_stack([self[f"{joint}_r{x}"] for x in "xyz"]))
 
     def to_csv(self, path: str | Path) -> None:
         """Write the recording as CSV; an incomplete file is never left.

@@ -41,15 +41,15 @@ def _inclinations(machine: Machine, q: Array, v: Array, links: list[str]) -> dic
     model, data = machine.model, machine.model.createData()
     frames = [machine.frame(link) for link in links]
     out = np.empty((2 * len(links), len(q)))
-    axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    axes, up = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED, machine.up_direction
     for i, (place, rate) in enumerate(zip(q, v, strict=True)):
         pin.forwardKinematics(model, data, machine.coordinates.configuration(place), rate)
         for k, frame in enumerate(frames):
             x = pin.updateFramePlacement(model, data, frame).rotation[:, 0]
             w = pin.getFrameVelocity(model, data, frame, axes).angular
-            flat = max(float(np.hypot(x[0], x[1])), 1e-12)
-            out[2 * k, i] = np.arctan2(x[2], flat)
-            out[2 * k + 1, i] = (w[0] * x[1] - w[1] * x[0]) / flat
+            flat = max(float(np.linalg.norm(np.cross(up, x))), 1e-12)
+            out[2 * k, i] = np.arctan2(up @ x, flat)
+            out[2 * k + 1, i] = up @ np.cross(w, x) / flat
     names = [INCLINATION_PREFIX + link + end for link in links for end in ("", VELOCITY_SUFFIX)]
     return dict(zip(names, out, strict=True))
 

@@ -22,6 +22,7 @@ from crane.common.samples import Array
 from crane.common.units import SI_CONVERSIONS, accepted_units
 from crane.description.sensors import TIME
 from crane.recordings.npz import MAX_COLUMNS, MAX_NUMBERS, read_arrays, read_columns
+from crane.recordings.rotation_columns import convert_quaternions
 from crane.recordings.timeseries import (
     BLOCK_ROWS,
     SAMPLE_COUNT_NOTE,
@@ -215,7 +216,7 @@ def _convert_to_si(table: Table) -> Table:
                 f"'{name}' is {column[sample]:.3g} at sample {sample}, beyond all that is "
                 "measured, correct it"
             )
-    return Table(units, values, table.notes)
+    return convert_quaternions(Table(units, values, table.notes))
 
 
 def _detect_encoding(path: Path) -> str:

@@ -177,7 +177,8 @@ def buried_contact_text(machine: Machine, q: Array) -> str:
     contacts = [force for force in machine.external_forces if isinstance(force, Contact)]
     if not contacts:
         return ""
-    weight = 9.81 * sum(inertia.mass for inertia in machine.model.inertias)
+    gravity = float(np.linalg.norm(machine.gravity)) or 9.81  # [m/s2]
+    weight = gravity * sum(inertia.mass for inertia in machine.model.inertias)
     frames = FrameJacobians(machine)
     frames.set_configuration(q)
     for contact in contacts:
@@ -186,8 +187,9 @@ def buried_contact_text(machine: Machine, q: Array) -> str:
         depth = contact.radius - height
         if contact.stiffness * depth > _MAX_CONTACT_FORCE_RATIO * weight:
             return (
-                f"'{contact.name}' is {depth:.3g} m inside the ground, where its whole weight "
-                f"presses it in by {weight / contact.stiffness:.2g} m: start higher"
+                f"'{contact.name}' is {depth:.3g} m inside the ground, where its whole weight at "
+                f"{gravity:.3g} m/s2 presses it in by {weight / contact.stiffness:.2g} m: start "
+                "higher"
             )
     return ""
 

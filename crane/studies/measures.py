@@ -15,7 +15,6 @@ from crane.machine.machine import Machine
 from crane.motion.kinematics import Kinematics
 from crane.motion.task_trajectories import task_trajectory
 from crane.motion.workspaces.workspace_extremes import maximize_on_branch
-from crane.motion.workspaces.workspace_section import up_direction
 from crane.recordings.recording import FORCE_UNITS
 from crane.simulation.simulation_run import simulate
 
@@ -292,7 +291,7 @@ def _largest_reach(
     is_coupled: NDArray[np.bool_],
     limits: tuple[Array, Array],
 ) -> float:
-    kinematics, up = Kinematics(machine), up_direction(machine)
+    kinematics, up = Kinematics(machine), machine.up_direction
     active = machine.closure.active
 
     def objective(q: Array) -> tuple[float, Array]:

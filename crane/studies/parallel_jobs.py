@@ -97,7 +97,7 @@ _PROCESSES_PER_CORE = 8  # more would wait for each other, and each keeps the ma
 # attributes of a machine that its files describe
 _COMPARED_ATTRIBUTES = (
     "tree", "active", "free", "friction", "forces", "gas_springs", "ropes", "end_stops",
-    "hydraulics",
+    "hydraulics", "gravity",
 )  # fmt: skip
 
 

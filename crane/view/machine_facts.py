@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from crane.common.units import format_quantity
 from crane.description.sensors import Sensor
+from crane.description.specification import STANDARD_GRAVITY
 from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.frame_jacobians import FrameDistances
 from crane.machine.machine import Machine
@@ -34,6 +35,8 @@ def machine_facts(machine: Machine) -> Iterator[MachineFact]:
     if machine.source:
         yield MachineFact("source", machine.source)
     yield MachineFact("file", str(machine.path))
+    if machine.gravity != STANDARD_GRAVITY:
+        yield MachineFact("gravity", f"{' '.join(f'{x:g}' for x in machine.gravity)} m/s2")
     yield _chain_fact(machine)
     yield _joint_fact(machine)
     yield from _loop_facts(machine)
@@ -107,7 +110,13 @@ def _loop_facts(machine: Machine) -> Iterator[MachineFact]:
         tuple((x.name, x.type, f"{x.predecessor} to {x.successor}") for x in loops),
     )
     for coupling in closure.equations.couplings:
-        terms = _format_sum(coupling.factors)
+        powers = {
+            f"{joint}^{power}": x
+            for joint, numbers in coupling.powers.items()
+            for power, x in enumerate(numbers, start=2)
+            if x
+        }
+        terms = _format_sum({**coupling.factors, **powers})
         yield MachineFact("coupling", f"{coupling.name}, {terms} = {coupling.offset:g}")
     if structure.blocks:
         order = [

@@ -17,9 +17,9 @@ from crane.common.package_search import (
     use_load_options,
 )
 from crane.description.findings import collect_findings, error_recovery
-from crane.description.floating_bases import add_floating_base
 from crane.description.machine_lookup import command_line_arguments, find_machine_file
 from crane.description.parameter_changes import set_active_joints
+from crane.description.rotation_vectors import add_floating_base
 from crane.description.specification import MachineSpec
 from crane.formats.additions.open_loop_search import LoopProposal, propose_loops
 from crane.formats.checks.mechanism_check import check_mechanism

@@ -99,9 +99,7 @@ def _loop_gaps(spec: MachineSpec, model: pin.Model, initial_guess: Array) -> dic
         q = initial_guess.copy()
         for _ in range(200):
             phi, jacobian = equations.evaluate_scaled(q)
-            q[movable] += (
-                least_squares_step(jacobian[:, movable], phi) * equations.coordinate_units[movable]
-            )
+            q = equations.displace(q, movable, least_squares_step(jacobian[:, movable], phi))
         phi, _ = equations.evaluate_scaled(q)
         if np.abs(phi).max() > _OPEN_TOLERANCE:
             break

@@ -25,6 +25,7 @@ from crane.description.sensors import (
     signal_delay_error,
 )
 from crane.description.specification import (
+    STANDARD_GRAVITY,
     Chain,
     EstimationSettings,
     LoopSpec,
@@ -118,6 +119,7 @@ def _read_robot(path: Path) -> MachineSpec:
         tip=tree.single_leaf_link() if urdf.tip is None else urdf.tip,
         couplings=urdf.couplings,
         source_locations=locations,
+        gravity=urdf.gravity or STANDARD_GRAVITY,
     )
 
 
@@ -133,7 +135,7 @@ def read_plain_data(path: Path) -> dict[str, Any]:
 def _read_machine(path: Path) -> MachineSpec:
     top = YamlSection.read(path, MACHINE)
     name, source = top.text("name"), top.text("source")
-    chains, tree, friction, couplings, springs = read_chains(top, path)
+    chains, tree, friction, couplings, springs, gravity = read_chains(top, path)
     loops = read_loops(top, tree)
     couplings += read_couplings(top, tree)
     active: tuple[str, ...] = UnknownNames()
@@ -199,6 +201,7 @@ def _read_machine(path: Path) -> MachineSpec:
         external_forces,
         _read_or_default(_read_supports, (), top, tree, external_forces),
         _read_or_default(_read_pins, {}, top, tree, loops),
+        gravity,
     )
 
 

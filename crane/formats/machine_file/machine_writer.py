@@ -166,6 +166,8 @@ class MachineDraft:
             for element in elements[:1]:
                 self._element_notes.setdefault(element, []).append(f"{name}: {note}")
             return bool(elements)
+        if section == "gravity":  # a list, whose items have no lines
+            return False
         key_path: KeyPath = path
         if section == "tree":
             key_path = "rotor_inertia", rest[0]
@@ -260,7 +262,7 @@ def _machine_data(machine: Machine) -> dict[str, Any]:
     """The machine file, with empty chains and without payload."""
     equations = machine.closure.equations
     for coupling in equations.couplings:
-        if len(coupling.factors) < 2:
+        if len(coupling.joints) < 2:
             raise InputError(
                 f"coupling '{coupling.name}' holds {next(iter(coupling.factors))} alone, lock "
                 "that joint instead"

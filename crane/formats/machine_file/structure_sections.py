@@ -14,13 +14,14 @@ import pinocchio as pin
 
 from crane.common.errors import CraneError, CraneWarning, DescriptionError, suggest_names
 from crane.description.findings import FollowUpError, error_recovery, report_error
-from crane.description.floating_bases import add_base_joints, check_freedoms
 from crane.description.force_elements import ForceElement, Friction
 from crane.description.kinematic_tree import Joint, Link, Tree, body_of
 from crane.description.pinocchio_conversion import se3_from_xyz_rpy
+from crane.description.rotation_vectors import add_base_joints, check_freedoms
 from crane.description.specification import (
     AXISLESS_TYPES,
     LOOP_TYPES,
+    STANDARD_GRAVITY,
     Chain,
     Coupling,
     Drive,
@@ -203,14 +204,15 @@ def read_chains(
     top: YamlSection, path: Path
 ) -> tuple[
     tuple[Chain, ...], TreeBuilder, dict[str, Friction], tuple[Coupling, ...],
-    tuple[ForceElement, ...],
+    tuple[ForceElement, ...], tuple[float, ...],
 ]:  # fmt: skip
-    """The sub-chains, their tree, and the friction, couplings and springs of their URDFs."""
+    """The sub-chains, their tree, the friction, couplings and springs of their URDFs, gravity."""
     chains: list[Chain] = []
     tree = TreeBuilder()
     friction: dict[str, Friction] = {}
     couplings: tuple[Coupling, ...] = ()
     springs: tuple[ForceElement, ...] = ()
+    gravities: dict[tuple[float, ...], str] = {}  # name of a chain that states each
     for item in top.list_items("chains"):
         tree.is_complete &= top.is_complete
         was_complete = tree.is_complete
@@ -223,6 +225,8 @@ def read_chains(
             friction |= urdf.friction
             couplings += urdf.couplings
             springs += urdf.springs
+            if urdf.gravity is not None:
+                gravities.setdefault(urdf.gravity, chain.name)
     tree.is_complete &= top.is_complete
     if not chains and tree.is_complete:
         report_error(top.error_at("chains", "there are no chains, add one under 'chains:'"))
@@ -231,7 +235,24 @@ def read_chains(
         tree.add_floating_base(check_freedoms(top.names("floating")))
     if not tree.joints and tree.is_complete:
         report_error(top.error_at("chains", "no joint of these chains moves, add one"))
-    return tuple(chains), tree, friction, couplings, springs
+    gravity = _read_gravity(top, gravities)
+    return tuple(chains), tree, friction, couplings, springs, gravity
+
+
+def _read_gravity(
+    top: YamlSection, gravities: Mapping[tuple[float, ...], str]
+) -> tuple[float, ...]:
+    """The gravity of the file, or else the only one that its chains state."""
+    if "gravity" in top or not gravities:
+        with error_recovery(harmless=True):
+            if len(gravity := top.numbers("gravity")) == 3:
+                return gravity
+            raise top.error_at("gravity", f"gravity has {len(gravity)} numbers, give 3: [x, y, z]")
+    if len(gravities) > 1:
+        names = " and ".join(f"'{name}'" for name in gravities.values())
+        problem = f"the chains {names} have different gravity, write 'gravity' in this file"
+        report_error(top.error_at("chains", problem))
+    return next(iter(gravities), STANDARD_GRAVITY)
 
 
 def _read_chain(
@@ -304,22 +325,32 @@ def read_loops(top: YamlSection, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
 
 
 def read_couplings(top: YamlSection, tree: TreeBuilder) -> tuple[Coupling, ...]:
-    """Linear constraints of joints."""
+    """Constraints of joints."""
     names: list[str] = []
 
     def read_coupling(item: YamlSection) -> Coupling:
         name, joints = item.text("name"), item.section("joints")
         if name in names:
             raise item.error_at("name", f"two couplings are named '{name}', rename one")
-        if joints is None or len(list(joints)) < 2:
+        factors = item.value_map("joints", YamlSection.number, tree.check_joint)
+        powers = item.value_map("powers", _read_powers, tree.check_joint)
+        coupling = Coupling(name, factors, item.number("offset"), item.source_location(), powers)
+        if joints is None or len(coupling.joints) < 2:
             raise item.error_at(
                 "joints", f"coupling '{name}' joins less than two joints, add some"
             )
-        factors = item.value_map("joints", YamlSection.number, tree.check_joint)
         names.append(name)
-        return Coupling(name, factors, item.number("offset"), item.source_location())
+        return coupling
 
     return top.read_items("couplings", read_coupling)
+
+
+def _read_powers(section: YamlSection, joint: str) -> tuple[float, ...]:
+    if len(powers := section.numbers(joint)) != 3:
+        raise section.error_at(
+            joint, f"'{joint}' has {len(powers)} coefficients, give 3: [a, b, c]"
+        )
+    return powers
 
 
 def read_drives(top: YamlSection, tree: TreeBuilder) -> tuple[Drive, ...]:

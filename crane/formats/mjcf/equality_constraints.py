@@ -221,7 +221,7 @@ def _create_coupling(
     index: int,
     series_joints: Mapping[int, list[str]],
 ) -> Coupling:
-    """Return the coupling y - y_0 = a_0 + a_1 (x - x_0), where x and y are joints or tendons."""
+    """Return the coupling y - y_0 = sum a_k (x - x_0)^k, where x and y are joints or tendons."""
     model, label = mjcf.model, f"{source_location}: the constraint '{name}'"
     joint_sums: list[dict[int, float]] = []  # of y and x, none for an absent object
     for i in (int(model.eq_obj1id[index]), int(model.eq_obj2id[index])):
@@ -231,18 +231,35 @@ def _create_coupling(
         if terms is None:
             raise DescriptionError(f"{label} is about a tendon in space, use a fixed one")
         joint_sums.append(terms)
-    offset, linear_coefficient, *higher_coefficients = (float(x) for x in model.eq_data[index, :5])
-    if any(higher_coefficients) and joint_sums[1]:
+    coefficients = [float(x) for x in model.eq_data[index, :5]]
+    y, x = joint_sums
+    if not x:
+        coefficients[1:] = [0.0] * 4
+    if any(coefficients[2:]) and len(x) > 1:
         raise DescriptionError(
-            f"{label} is not linear, leave the higher powers of its polycoef away"
+            f"{label} has higher powers of a tendon of {len(x)} joints, give it one joint"
         )
+    y_0, x_0 = (
+        sum(
+            factor * float(model.qpos0[model.jnt_qposadr[joint]])
+            for joint, factor in terms.items()
+        )
+        for terms in joint_sums
+    )
+    # in powers of x instead of x - x_0
+    shifted = np.polynomial.Polynomial(coefficients)(np.polynomial.Polynomial([-x_0, 1.0])).coef
+    shifted = np.append(shifted, np.zeros(5 - len(shifted)))
+    offset = float(shifted[0]) + y_0
     factors: dict[str, float] = {}
-    for factor_by_joint, sign in zip(joint_sums, (1.0, -linear_coefficient), strict=True):
+    for factor_by_joint, sign in ((y, 1.0), (x, -float(shifted[1]))):
         for joint, factor in factor_by_joint.items():
             (part,) = series_joints[joint]
             factors[part] = factors.get(part, 0.0) + sign * factor
-            offset += sign * factor * float(model.qpos0[model.jnt_qposadr[joint]])
+    powers = {
+        series_joints[joint][0]: tuple(-float(shifted[k]) * factor**k for k in (2, 3, 4))
+        for joint, factor in (x.items() if shifted[2:].any() else ())
+    }
     factors = {part: factor for part, factor in factors.items() if factor}
     if not factors:
         raise DescriptionError(f"{label} binds no joint, remove it")
-    return Coupling(name, factors, offset, source_location)
+    return Coupling(name, factors, offset, source_location, powers)

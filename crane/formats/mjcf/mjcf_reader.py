@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
+from crane.closure.coordinates import cardan_angles
 from crane.common.errors import DescriptionError
-from crane.description.floating_bases import with_rotation_vectors
 from crane.description.kinematic_tree import (
     Joint,
     Limits,
@@ -20,24 +20,25 @@ from crane.description.kinematic_tree import (
     with_rotor_inertias,
 )
 from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
+from crane.description.rotation_vectors import with_rotation_vectors
 from crane.description.specification import Chain, MachineSpec, source_locations
 from crane.formats.machine_file.structure_sections import TreeBuilder
+from crane.formats.mjcf.actuator_cylinders import read_cylinders
 from crane.formats.mjcf.equality_constraints import MjcfFrames, read_equality_constraints
 from crane.formats.mjcf.model_features import (
-    isotropic_rotor_inertia,
-    note_unsupported_features,
     read_drives,
     read_joint_effects,
 )
 from crane.formats.mjcf.mujoco_file import MujocoFile, pose
+from crane.formats.mjcf.unsupported_features import note_unsupported_features
 from crane.formats.urdf.urdf_reader import UrdfModel
 
 
 def read_mjcf(path: Path) -> MachineSpec:
     """Read a machine from a MJCF file.
 
-    The coordinate of a hinge or slide is its `qpos`. A ball joint has the Cardan angles of its
-    body relative to the reference pose, a free joint position and Cardan angles in the world.
+    The coordinate of a hinge or slide is its `qpos`. A ball joint has the rotation vector of its
+    body relative to the reference pose, a free joint position and rotation vector in the world.
 
     Raises:
         DescriptionError: The file is wrong or has an element that no machine has; the message has
@@ -80,9 +81,15 @@ class _MjcfReader:
         for link, (body, placement, source_location) in frames.placements.items():
             self.links[link] = Link(link, source_location)
             self._add_fixed_joint(link, self.body_links[body], placement)
-        effects = read_joint_effects(mjcf, self.series_joints, frames.link_of_site)
-        drives = read_drives(mjcf, self.series_joints)
-        note_unsupported_features(mjcf)
+        used_names = {*self.links, *self.joints, *(loop.name for loop in loops)}
+        qpos = self._home_coordinates()
+        cylinders = read_cylinders(mjcf, frames.link_of_site, used_names, qpos)
+        self.links |= {x.name: x for x in cylinders.parts if isinstance(x, Link)}
+        self.joints |= {x.name: x for x in cylinders.parts if isinstance(x, Joint)}
+        loops += tuple(cylinders.loops)
+        effects = read_joint_effects(mjcf, self.series_joints, frames.link_of_site, cylinders)
+        drives = read_drives(mjcf, self.series_joints, cylinders)
+        note_unsupported_features(mjcf, cylinders)
         urdf = UrdfModel(
             mjcf.file,
             mjcf.file.stem,
@@ -101,9 +108,9 @@ class _MjcfReader:
         active = self._listed_joints("active")
         for drive in drives if not active else ():
             # one joint of each drive: its other joints depend on that, or are other coordinates
-            active += [x for x in drive.factors if x not in active][:1]
+            active += [x for x in drive.factors if x not in {*active, *cylinders.resting}][:1]
         free = tuple(self._listed_joints("free"))
-        home, tip = self._read_home(), self._read_tip(tree)
+        home, tip = self._read_home(qpos) | cylinders.home, self._read_tip(tree)
         mjcf.warn_about_notes()
         home_locations = {f"home {joint}": self.joints[joint].source_location for joint in home}
         spec = MachineSpec(
@@ -123,6 +130,9 @@ class _MjcfReader:
             source_locations=source_locations(loops, couplings) | home_locations,
             free=free,
             drives=drives,
+            gravity=(0.0,) * 3
+            if "GRAVITY" in mjcf.disabled_features
+            else to_vector(self.model.opt.gravity),
         )
         return with_rotation_vectors(spec)
 
@@ -163,7 +173,6 @@ class _MjcfReader:
         series_joints: list[Joint] = []
         previous_anchor = np.zeros(3)  # anchor of the previous joint, in the body's frame
         for joint in range(first, first + model.body_jntnum[body]):
-            tensor = tensor + isotropic_rotor_inertia(self.mjcf, joint) * np.eye(3)
             if model.jnt_type[joint] == 0:
                 placement = pin.SE3.Identity()
             offset = pin.SE3(np.eye(3), model.jnt_pos[joint] - previous_anchor)
@@ -232,12 +241,27 @@ class _MjcfReader:
             )
         return frames
 
-    def _read_home(self) -> dict[str, float]:
-        """Return the coordinates of the key "home", else of the first key, else of `qpos0`."""
+    def _home_coordinates(self) -> np.ndarray:
+        """Return `qpos` of the key "home", else of the first key, else `qpos0`, within limits."""
         model = self.model
         keys = [self.mjcf.element_name("KEY", i) for i in range(model.nkey)]
         key_index = keys.index("home") if "home" in keys else 0
-        qpos = model.key_qpos[key_index] if keys else model.qpos0
+        qpos = np.array(model.key_qpos[key_index] if keys else model.qpos0)
+        for joint, (name, *others) in self.series_joints.items():
+            limits, i = self.joints[name].limits, model.jnt_qposadr[joint]
+            if others or limits.lower <= qpos[i] <= limits.upper:
+                continue
+            inside = min(max(qpos[i], limits.lower), limits.upper)
+            if qpos[i]:
+                self.mjcf.note_difference(
+                    "home is taken within the limits", f"{name} {qpos[i]:g} as {inside:g}"
+                )
+            qpos[i] = inside
+        return qpos
+
+    def _read_home(self, qpos: np.ndarray) -> dict[str, float]:
+        """Return the coordinates that are not zero, by joint."""
+        model = self.model
         home: dict[str, float] = {}
         for joint, joint_names in self.series_joints.items():
             kind, first = self.mjcf.joint_type(joint), model.jnt_qposadr[joint]
@@ -245,15 +269,8 @@ class _MjcfReader:
             values = list(qpos[first : first + translation_count])
             if kind in ("BALL", "FREE"):
                 quaternion = qpos[first + translation_count : first + translation_count + 4]
-                values += _cardan_angles(pose(quaternion, np.zeros(3)).rotation)
+                values += cardan_angles(pose(quaternion, np.zeros(3)).rotation)
             home |= {x: float(y) for x, y in zip(joint_names, values, strict=True) if y}
-        for name, value in home.items():
-            limits = self.joints[name].limits
-            home[name] = min(max(value, limits.lower), limits.upper)
-            if home[name] != value:
-                self.mjcf.note_difference(
-                    "home is taken within the limits", f"{name} {value:g} as {home[name]:g}"
-                )
         return home
 
     def _listed_joints(self, name: str) -> list[str]:
@@ -271,12 +288,3 @@ class _MjcfReader:
             return tip
         self.mjcf.note_unsupported(f"the text 'tip', which names no moving body or site '{tip}'")
         return None
-
-
-def _cardan_angles(rotation: np.ndarray) -> list[float]:
-    """Return the angles a, b, c with rotation = R_x(a) R_y(b) R_z(c)."""
-    first = np.arctan2(-rotation[1, 2], rotation[2, 2])
-    sine, cosine = np.sin(first), np.cos(first)
-    second = np.arctan2(rotation[0, 2], cosine * rotation[2, 2] - sine * rotation[1, 2])
-    x, y = cosine * rotation[1, :2] + sine * rotation[2, :2]
-    return [float(first), float(second), float(np.arctan2(x, y))]

@@ -11,7 +11,10 @@ from lxml import etree
 from crane.common.atomic_output import replace_file
 from crane.common.errors import CraneWarning, InputError
 from crane.description.force_elements import ForceElement, Friction, Rope, element_name
-from crane.description.specification import Coupling, LoopSpec
+from crane.description.kinematic_tree import ROTATIONS
+from crane.description.rotation_vectors import ROTATION_COUNT
+from crane.description.specification import Coupling, Drive, LoopSpec
+from crane.formats.mjcf.massless_struts import find_massless_struts
 from crane.formats.urdf.urdf_writer import (
     format_document,
     origin_text,
@@ -33,9 +36,10 @@ def write_mjcf(machine: Machine, path: str | Path) -> None:
     the axis; couplings become `joint`, or `tendon` if they have more than two joints. Each drive
     has a motor, with a fixed tendon if it acts along several joints; if the drives are not the
     active joints, a text lists these. Frames are sites, the home configuration is the key "home".
-    Coulomb and viscous friction, springs and rotor inertias are written; damping of force elements
-    along joints becomes viscous friction; force elements and ropes between frames become spatial
-    tendons. A warning lists what is left out. Shapes are not written, so there are no contacts.
+    Gravity, Coulomb and viscous friction, springs and rotor inertias are written; damping of force
+    elements along joints becomes viscous friction; force elements and ropes between frames become
+    spatial tendons. Cylinders without mass, as they are read, become spatial tendons or cranks of
+    actuators. A warning lists what is left out. Shapes are not written, so there are no contacts.
 
     Args:
         machine: The machine with its parameter changes, locked joints and payload.
@@ -48,13 +52,7 @@ def write_mjcf(machine: Machine, path: str | Path) -> None:
     writer = _MjcfWriter(machine)
     with replace_file(path) as temporary_file:
         temporary_file.write_bytes(writer.build_content())
-    floating = [
-        machine.joints[column + i]
-        for column in machine.coordinates.floating_base_columns
-        for i in range(6)
-    ]
-    unsupported = [f"the friction of {joint}" for joint in floating if joint in machine.friction]
-    unsupported += [
+    unsupported = [
         f"the constant force on {x.joint}" for x in machine.forces if x.force and x.joint
     ]
     unsupported += writer.unsupported
@@ -86,6 +84,11 @@ class _MjcfWriter:
             and frame.name not in self.moved_links
             and self.tree.links[frame.name].composite_joint is None
         ]
+        struts = find_massless_struts(machine)
+        driven = [x for drive in machine.drives if drive.factors.keys() <= struts.keys()
+                  for x in drive.factors]  # fmt: skip
+        self.struts = {joint: strut for joint, strut in struts.items() if joint in driven}
+        self._strut_joints = {joint for strut in self.struts.values() for joint in strut.joints}
         self.root = etree.Element("mujoco", model=machine.name)
         self.bodies: dict[int, etree._Element] = {}  # by index of the joint
         self.home_coordinates: list[float] = []
@@ -96,7 +99,8 @@ class _MjcfWriter:
         """Return the file's content."""
         add = etree.SubElement
         add(self.root, "compiler", angle="radian", autolimits="false", inertiafromgeom="false")
-        add(self.root, "option", timestep="0.001", gravity="0 0 -9.81", integrator="implicitfast")
+        gravity = format_numbers(self.machine.gravity)
+        add(self.root, "option", timestep="0.001", gravity=gravity, integrator="implicitfast")
         self._add_texts()
         self.bodies[0] = add(self.root, "worldbody")
         pending = [(joint, self.bodies[0]) for joint in reversed(self._child_joints(0))]
@@ -113,13 +117,27 @@ class _MjcfWriter:
         equations = self.machine.closure.equations
         tendons, equality, actuator = map(etree.Element, ("tendon", "equality", "actuator"))
         for loop in equations.loops:
-            self._add_loop(equality, loop)
+            if all(strut.loop is not loop for strut in self.struts.values()):
+                self._add_loop(equality, loop)
         for coupling in equations.couplings:
             self._add_coupling(equality, tendons, coupling)
         for drive in self.machine.drives:
+            if drive.factors.keys() <= self.struts.keys():
+                self._add_strut_drive(actuator, tendons, drive)
+                continue
             target = {"joint": drive.name}
-            if dict(drive.factors) != {drive.name: 1.0}:
+            joints = {
+                self.model.names[int(self.machine.coordinates.joints[self.machine.column(joint)])]
+                for joint in drive.factors
+            }
+            if len(joints) == 1 and joints != set(drive.factors):  # about an axis of a ball
+                (ball,) = joints
+                gear = [drive.factors.get(f"{ball}_{part}", 0.0) for part, _, _ in ROTATIONS]
+                target = {"joint": ball, "gear": format_numbers(gear)}
+            elif drive.factors.keys() != {drive.name}:
                 target = {"tendon": _add_fixed_tendon(tendons, drive.name, drive.factors)}
+            elif (factor := drive.factors[drive.name]) != 1.0:
+                target["gear"] = format_numbers([factor])
             add(actuator, "motor", {"name": drive.name, **target})
         force_elements: list[ForceElement | Rope] = [*self.machine.forces, *self.machine.ropes]
         for item in force_elements:
@@ -150,7 +168,8 @@ class _MjcfWriter:
 
     def _child_joints(self, joint: int) -> list[int]:
         """Return the joints on the link that a joint moves."""
-        return [i for i in self.joints if self.model.parents[i] == joint]
+        joints = (i for i in self.joints if i not in self._strut_joints)
+        return [i for i in joints if self.model.parents[i] == joint]
 
     def _joints_of_body(self, joint: int) -> list[int]:
         """Return the joints of one body: a joint and those after it up to a link with mass."""
@@ -180,15 +199,9 @@ class _MjcfWriter:
     def _add_joint(self, body: etree._Element, joint: int, placement: pin.SE3) -> None:
         """Add a joint at a placement in its body's frame at coordinate zero."""
         machine, name = self.machine, self.model.names[joint]
-        column = self.model.joints[joint].idx_v
-        if column in machine.coordinates.floating_base_columns:
-            etree.SubElement(body, "freejoint", name=name)
-            data = self.model.createData()
-            pin.forwardKinematics(
-                self.model, data, machine.coordinates.configuration(machine.home)
-            )
-            *position, x, y, z, w = pin.SE3ToXYZQUAT(data.oMi[joint])  # in the world
-            self.home_coordinates += [float(value) for value in (*position, w, x, y, z)]
+        column, count = self.model.joints[joint].idx_v, self.model.joints[joint].nv
+        if count > 1:
+            self._add_composite_joint(body, joint, placement)
             return
         tree_joint = self.tree.joints[name]
         values = {
@@ -199,21 +212,110 @@ class _MjcfWriter:
         }
         if (limits := finite_limits(tree_joint.limits)) is not None:
             values |= {"limited": "true", "range": format_numbers(limits)}
-        friction = machine.friction.get(name, Friction())
-        joint_elements = [item for item in machine.forces if item.joint == name]
-        stiffness = sum(item.stiffness for item in joint_elements)
-        effects = {
-            "armature": tree_joint.rotor_inertia,
-            "damping": sum(item.damping for item in joint_elements) + friction.viscous,
-            "frictionloss": friction.coulomb,
-            "stiffness": stiffness,
-        }
-        values |= {key: format_numbers([value]) for key, value in effects.items() if value}
-        if stiffness:
-            rest = sum(item.stiffness * item.rest for item in joint_elements) / stiffness
-            values["springref"] = format_numbers([rest])
+        values |= self._joint_attributes(name, "springref")
         etree.SubElement(body, "joint", values)
         self.home_coordinates.append(float(machine.home[column]))
+
+    def _joint_attributes(self, name: str, rest_attribute: str) -> dict[str, str]:
+        """Return the attributes for rotor inertia, friction and springs of a joint."""
+        joint_elements = [item for item in self.machine.forces if item.joint == name]
+        stiffness = sum(item.stiffness for item in joint_elements)
+        effects = self._joint_effects(name) | {"stiffness": stiffness}
+        if stiffness:
+            rest = sum(item.stiffness * item.rest for item in joint_elements) / stiffness
+            effects[rest_attribute] = rest
+        return {
+            key: format_numbers([value])
+            for key, value in effects.items()
+            if value or key == rest_attribute
+        }
+
+    def _add_strut_drive(
+        self, actuator: etree._Element, tendons: etree._Element, drive: Drive
+    ) -> None:
+        """Add the motor of struts along a spatial tendon, or of a slider-crank.
+
+        The parts of the tendon are its branches, whose divisors are gear / factor.
+        """
+        gear = max(drive.factors.values(), key=abs)
+        motor = {"name": drive.name, "gear": format_numbers([gear])}
+        struts = [self.struts[joint] for joint in drive.factors]
+        effects = self._joint_attributes(struts[0].joint, "springlength")
+        if any(gear * factor < 0 for factor in drive.factors.values()) or (
+            len(struts) > 1 and any(strut.rod_length for strut in struts)
+        ):
+            self.unsupported.append(f"the drive {drive.name}")
+            return
+        sites = [
+            tuple(self._frame_site(link)[2] for link in (strut.base, strut.loop.successor))
+            for strut in struts
+        ]
+        if struts[0].rod_length:
+            crank = {"slidersite": sites[0][0], "cranksite": sites[0][1]}
+            crank["cranklength"] = format_numbers([struts[0].rod_length])
+            etree.SubElement(actuator, "motor", motor | crank)
+            self.unsupported += [f"{key} of {drive.name}" for key in effects]
+            return
+        tendon = _add_tendon(tendons, "spatial", drive.name)
+        for ends, factor in zip(sites, drive.factors.values(), strict=True):
+            if len(sites) > 1:
+                etree.SubElement(tendon, "pulley", divisor=format_numbers([gear / factor]))
+            for site in ends:
+                etree.SubElement(tendon, "site", site=site)
+        if len(struts) == 1:
+            if (limits := finite_limits(self.tree.joints[struts[0].joint].limits)) is not None:
+                effects |= {"limited": "true", "range": format_numbers(limits)}
+            tendon.attrib.update(effects)
+        else:
+            alone = {tuple(x.factors) for x in self.machine.drives}  # written with their tendon
+            parts = (x.joint for x in struts if (x.joint,) not in alone)
+            self.unsupported += [
+                f"friction, springs and rotors of {joint}"
+                for joint in parts
+                if self._joint_attributes(joint, "springlength")
+            ]
+        etree.SubElement(actuator, "motor", motor | {"tendon": str(tendon.get("name"))})
+
+    def _joint_effects(self, name: str) -> dict[str, float]:
+        """Return rotor inertia and friction along a coordinate by attribute."""
+        friction = self.machine.friction.get(name, Friction())
+        damping = sum(item.damping for item in self.machine.forces if item.joint == name)
+        return {
+            "armature": self.tree.joints[name].rotor_inertia,
+            "damping": damping + friction.viscous,
+            "frictionloss": friction.coulomb,
+        }
+
+    def _add_composite_joint(self, body: etree._Element, joint: int, placement: pin.SE3) -> None:
+        """Add a ball joint, or the free joint of a floating base.
+
+        MuJoCo has one value of each effect for all axes.
+        """
+        machine, data = self.machine, self.model.createData()
+        configuration = machine.coordinates.configuration(machine.home)
+        pin.forwardKinematics(self.model, data, configuration)
+        first = self.model.joints[joint].idx_v
+        names = machine.joints[first : first + self.model.joints[joint].nv]
+        is_ball = len(names) == ROTATION_COUNT
+        values = {"name": self.model.names[joint], "type": "ball" if is_ball else "free"}
+        if is_ball:
+            values |= _placement_attributes(pin.SE3(np.eye(3), placement.translation))
+            # the rotation in the axes of the body
+            turn = placement.rotation @ data.joints[joint].M.rotation @ placement.rotation.T
+            *_, x, y, z, w = pin.SE3ToXYZQUAT(pin.SE3(turn, np.zeros(3)))
+            self.home_coordinates += [float(value) for value in (w, x, y, z)]
+        else:
+            *position, x, y, z, w = pin.SE3ToXYZQUAT(data.oMi[joint])  # in the world
+            self.home_coordinates += [float(value) for value in (*position, w, x, y, z)]
+        effects = [self._joint_effects(name) for name in names]
+        for key, value in effects[0].items():
+            if any(other[key] != value for other in effects):
+                self.unsupported.append(f"different {key} about the axes of {values['name']}")
+            elif value and key == "frictionloss" and not is_ball:
+                self.unsupported.append(f"the friction of {values['name']}")
+            elif value:
+                values[key] = format_numbers([value])
+        etree.SubElement(body, "joint", values)
 
     def _add_site(self, body: etree._Element, name: str, placement: pin.SE3) -> str:
         """Add a site under a unique name, and return the name."""
@@ -264,6 +366,8 @@ class _MjcfWriter:
         attributes = {"name": coupling.name, "solref": "0.002 1"}
         coefficients = [offset, *(derivatives or [0.0]), 0, 0, 0]
         tag = "joint"
+        if coupling.powers:
+            joints, coefficients = _solve_polynomial(coupling)
         if len(joints) > 2:
             tag, coefficients = "tendon", [coupling.offset, 0, 0, 0, 0]
             joints = [_add_fixed_tendon(tendons, coupling.name, coupling.factors)]
@@ -299,6 +403,23 @@ class _MjcfWriter:
             tendon.set(key, format_numbers(numbers))
         for link in links:
             etree.SubElement(tendon, "site", site=self._frame_site(link)[2])
+
+
+def _solve_polynomial(coupling: Coupling) -> tuple[list[str], list[float]]:
+    """Return follower and leader of a coupling with powers, and its five coefficients.
+
+    Raises:
+        InputError: It is no polynomial of one joint.
+    """
+    factors, (leader, *others) = coupling.factors, coupling.powers
+    followers = [joint for joint in coupling.joints if joint != leader]
+    if others or len(followers) != 1:
+        raise InputError(
+            f"coupling '{coupling.name}' is no polynomial of one joint, for which alone MJCF has "
+            "a constraint, write a machine file"
+        )
+    terms = [-coupling.offset, factors.get(leader, 0.0), *coupling.powers[leader]]
+    return [*followers, leader], [-x / factors[followers[0]] + 0.0 for x in terms]
 
 
 def _add_tendon(tendons: etree._Element, tag: str, name: str) -> etree._Element:

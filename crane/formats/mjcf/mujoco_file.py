@@ -302,6 +302,25 @@ class MujocoFile(ConversionNotes):
         number = index + (object_type != "BODY")
         return self.element_name(object_type, index).strip() or f"{object_type.lower()}{number}"
 
+    def kinematics(self, qpos: np.ndarray, data: Any = None) -> Any:
+        """Return MuJoCo's `MjData` with sites, axes of joints and tendons at coordinates (nq,).
+
+        Args:
+            qpos: The coordinates.
+            data: What receives them; new if not given.
+        """
+        data = self._mujoco.MjData(self.model) if data is None else data
+        data.qpos[:] = qpos
+        for step in ("mj_kinematics", "mj_comPos", "mj_tendon"):
+            getattr(self._mujoco, step)(self.model, data)
+        return data
+
+    def point_jacobian(self, data: Any, point: np.ndarray, body: int) -> np.ndarray:
+        """Return the Jacobian (3, nv) of a point (3,) in the world that moves with a body."""
+        jacobian = np.zeros((3, self.model.nv))
+        self._mujoco.mj_jac(self.model, data, jacobian, None, point, body)
+        return jacobian
+
     def joint_type(self, joint: int) -> str:
         """Return the type of a joint: HINGE, SLIDE, BALL or FREE."""
         return self.enumeration_name("Joint", self.model.jnt_type[joint])

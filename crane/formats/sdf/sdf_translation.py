@@ -125,6 +125,8 @@ class _SdfTranslation:
         self._frames = SdfFramePoses()
         self._locations = {xml.file.name: 0}
         self._robot = etree.Element("robot", name=top.name)
+        if gravity := world.item.numbers("gravity", 3, ()):
+            self._robot.set("gravity", format_numbers(gravity))
         self._pose_in_world = self._frames.pose_in_scope(world, top.name, top.item)
         self._link_poses: dict[str, pin.SE3] = {WORLD_NODE: self._pose_in_world.inverse()}
         self._links: dict[str, SdfElement] = {}

@@ -119,6 +119,7 @@ class UrdfModel:
         tip: Link of the end effector "tip".
         is_complete: Whether all elements have unique names, so that none is missing here.
         springs: Springs, if the file is in a format that has some.
+        gravity: (3,) acceleration of gravity [m/s2], `<robot gravity="...">`; None without it.
     """
 
     file: Path
@@ -134,6 +135,7 @@ class UrdfModel:
     tip: str | None = None
     is_complete: bool = True
     springs: tuple[ForceElement, ...] = ()
+    gravity: tuple[float, ...] | None = None
 
     @property
     def moving_joints(self) -> tuple[str, ...]:
@@ -206,6 +208,9 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
         _read_tip(xml, links),
         is_complete=not xml.unnamed_kinds,
         springs=springs,
+        gravity=xml.vector(xml.root, "gravity", "the robot", 3)
+        if "gravity" in xml.root.attrib
+        else None,
     )
 
 

@@ -16,7 +16,7 @@ from lxml import etree
 from crane.common.atomic_output import replace_file
 from crane.common.errors import CraneWarning, InputError, format_one_line
 from crane.description.kinematic_tree import Tree
-from crane.description.specification import Coupling, LoopSpec
+from crane.description.specification import STANDARD_GRAVITY, Coupling, LoopSpec
 from crane.formats.robot_files import open_robots
 from crane.formats.visuals.urdf_shapes import find_mesh_file
 from crane.formats.xml_file import (
@@ -46,6 +46,8 @@ def write_urdf_plus(machine: Machine, path: str | Path) -> None:
     """
     tree = with_floating_joints(machine)
     robot = etree.Element("robot", name=machine.name)
+    if machine.gravity != STANDARD_GRAVITY:
+        robot.set("gravity", format_numbers(machine.gravity))
     loop_frames = {  # the reader adds them with the loops
         frame
         for loop in machine.closure.equations.loops
@@ -111,6 +113,11 @@ def _add_loop(tree: Tree, robot: etree._Element, loop: LoopSpec) -> None:
 
 def _add_coupling(machine: Machine, robot: etree._Element, coupling: Coupling) -> None:
     """Add a `<coupling>` if one represents the coupling, else a `<mimic>`."""
+    if coupling.powers:
+        raise InputError(
+            f"coupling '{coupling.name}' has powers, for which URDF+ has no place, write a "
+            "machine file"
+        )
     joints, derivatives, offset = solve_coupling(coupling)
     is_mimic = len(joints) <= 2 and coupling.name == f"{joints[0]}_mimic"
     ends = None if is_mimic or offset else _coupling_ends(machine, joints, derivatives)

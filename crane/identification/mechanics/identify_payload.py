@@ -43,7 +43,6 @@ _SEGMENT_COUNT = 10  # segments of a recording in the jackknife
 _MIN_RETURN_SHARE = 0.1  # least share of a drive's travel in the other direction
 _MAX_INTERVAL_SHARE = 0.1  # largest half width of an interval, relative to the moving mass
 _CENTRE_STEP = 0.01  # [m] step of derivatives by the centre of a point load
-_GRAVITY = 9.81  # [m/s^2]
 
 
 @with_single_threaded_blas
@@ -221,7 +220,7 @@ class _PayloadCase:
         drive_indices = [self.machine.active.index(joint) for joint in self.moving_drives]
         weight = np.abs(load.columns(at)[:, drive_indices, 0]).max(initial=0.0)
         length = self.machine.closure.characteristic_length
-        if weight <= _IDENTIFIABLE_TOLERANCE * _GRAVITY * length:
+        if weight <= _IDENTIFIABLE_TOLERANCE * np.linalg.norm(self.machine.gravity) * length:
             return None
         try:
             equations, base = build_equations(

@@ -15,6 +15,7 @@ from crane.common.errors import CraneError, CraneWarning, InputError, OutputErro
 from crane.common.samples import Array
 from crane.description.force_elements import Friction
 from crane.description.kinematic_tree import inertia_problem
+from crane.description.machine_parameters import GRAVITY_PREFIX
 from crane.description.machine_schema import END_STOP, FORCE, GAS_SPRING, LOOP, ROPE
 from crane.description.parameter_changes import lock_joints
 from crane.description.specification import Chain, MachineSpec
@@ -138,7 +139,8 @@ def check_rewritable(machine: Machine) -> None:
     """Check that the files of a machine can be written with other parameters.
 
     Raises:
-        InputError: The format is not supported, or the machine has parameter changes.
+        InputError: The format is not supported, or the machine has parameter changes other than
+            its gravity.
     """
     if any(chain.urdf.suffix.lower() != ".urdf" for chain in machine.chains) or (
         not (machine.path.suffix.lower() == ".urdf") and is_parallel_robot(machine.path)
@@ -147,7 +149,7 @@ def check_rewritable(machine: Machine) -> None:
             f"{machine.path.name}: an identified machine needs a machine file or URDF, make "
             f"one: crane convert {machine.command_line_arguments} FOLDER"
         )
-    if machine.parameter_changes:
+    if not all(name.startswith(GRAVITY_PREFIX) for name in machine.parameter_changes):
         raise InputError(
             f"'{machine.name}' was loaded with parameter changes, identify it as its files "
             "describe it"
@@ -206,6 +208,8 @@ def _machine_file_content(
             data["tip"] = machine.tip
     else:
         data = read_plain_data(machine.path)
+    if machine.gravity != spec.gravity:
+        data["gravity"] = list(machine.gravity)
     data["source"] = f"{origin_text}; else {machine.source or machine.path.name}"
     for chain in data["chains"]:
         chain["urdf"] = names[chain["name"]]

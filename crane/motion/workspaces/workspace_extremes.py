@@ -197,10 +197,8 @@ def _is_reachable_on_branch(
         projected = chord.copy()
         for _ in range(_NEWTON_ITERATIONS):
             phi, jacobian = equations.evaluate_scaled(projected)
-            projected[free_columns] -= (
-                units[free_columns]
-                * np.linalg.lstsq(jacobian[rows][:, free_columns], phi[rows])[0]
-            )
+            step = np.linalg.lstsq(jacobian[rows][:, free_columns], -phi[rows])[0]
+            projected = equations.displace(projected, free_columns, step)
         if (
             np.abs((projected - chord) / units).max()
             > _MAX_CHORD_DEVIATION * path_length + _CLOSURE_TOLERANCE

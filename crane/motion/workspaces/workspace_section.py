@@ -64,19 +64,12 @@ class WorkspaceSection(OneLineRepr):
         return np.einsum("kia,ian->ikn", np.array([first_directions, second_directions]), jacobian)
 
 
-def up_direction(machine: Machine) -> Array:
-    """Unit vector (3,) against gravity; z without gravity."""
-    gravity = np.asarray(machine.model.gravity.linear)
-    length = float(np.linalg.norm(gravity))
-    return -gravity / length if length > 0 else np.array([0.0, 0.0, 1.0])
-
-
 def find_slewing_joint(machine: Machine, frame: str) -> tuple[int, Array] | None:
     """Slewing joint of a frame: its index and a point on its axis, or None.
 
     It is a driven joint on the ground with a vertical axis, and moves no passive joint.
     """
-    model, up = machine.model, up_direction(machine)
+    model, up = machine.model, machine.up_direction
     gamma = machine.closure.gamma(machine.home)
     supporting_joints = list(model.supports[model.frames[machine.frame(frame)].parentJoint])
     data = model.createData()
@@ -111,7 +104,7 @@ def workspace_section(
         tip_positions: (N, 3) positions over the whole reach [m].
         home_position: (3,) position at home [m].
     """
-    up, slewing_joint = up_direction(machine), find_slewing_joint(machine, frame)
+    up, slewing_joint = machine.up_direction, find_slewing_joint(machine, frame)
     _, extents, directions = np.linalg.svd(
         tip_positions - tip_positions.mean(axis=0), full_matrices=False
     )

@@ -297,7 +297,7 @@ class ErrorControlledStepper(MachineCodeStepper):
             order: Order of the error.
             max_step_ratio: Largest ratio of step sizes.
         """
-        if self.has_floating_base:  # larger rotations are not unique
+        if self.has_rotation_vectors:  # larger rotations are not unique
             error = maximum(error, largest_move * (1.0 / _MAX_ROTATION_PER_STEP))
         log_error = apply_function("log", minimum(maximum(error, 1e-9), 1e9))
         step_ratio = _SAFETY_FACTOR * apply_function("exp", (-1.0 / order) * log_error)

@@ -124,9 +124,9 @@ class MachineCodeStepper:
         return float(self._step_state[-1])
 
     @property
-    def has_floating_base(self) -> bool:
-        """Whether a body floats."""
-        return bool(self._chart.machine.coordinates.floating_base_columns)
+    def has_rotation_vectors(self) -> bool:
+        """Whether coordinates are rotation vectors."""
+        return bool(self._chart.machine.coordinates.rotation_columns)
 
     def adopt_modes(self) -> None:
         """Adopt the stick-slip modes of the chart."""

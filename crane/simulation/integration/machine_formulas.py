@@ -204,8 +204,8 @@ def trace_machine(
 def wrap_rotations(chart: Chart, state: Sequence[Scalar]) -> list[Scalar]:
     """A state with rotation vectors of at most pi; its first part is q."""
     out = list(state)
-    for column in chart.machine.coordinates.floating_base_columns:
-        out[column + 3 : column + 6] = wrap_rotation_vector(out[column + 3 : column + 6])
+    for column in chart.machine.coordinates.rotation_columns:
+        out[column : column + 3] = wrap_rotation_vector(out[column : column + 3])
     return out
 
 

@@ -266,7 +266,7 @@ class StepLoop:
         r.store(r.h, 1, select(keeps_proposal, self._proposed_size, next_length))
         is_at_goal = self._is_last & (time_to_event <= 0.0)
         r.assign(self._time, select(is_at_goal, self._goal, self._time + length))
-        if self._stepper.has_floating_base:  # rates depend on the rotation vector
+        if self._stepper.has_rotation_vectors:  # rates depend on the rotation vector
             r.call("wrap", self.step_result, r.state)
             self.call("rate", self._time, r.state, self.start_rate)
         else:

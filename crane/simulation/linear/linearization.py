@@ -129,8 +129,10 @@ def linearize(
     home = machine.home[machine.closure.active]
     q_a = machine.check_limits(_values_by_joint(machine, operating_point, home, "at"), "at")
     v_a = _values_by_joint(machine, velocity, np.zeros(len(home)), "velocity")
-    if machine.coordinates.floating_base_columns and v_a.any():
-        raise InputError("a floating machine is linearized at rest, leave velocities out")
+    if machine.coordinates.is_rotation_vector[machine.closure.active].any() and v_a.any():
+        raise InputError(
+            "a machine with active rotation vectors is linearized at rest, leave velocities out"
+        )
     dynamics = Dynamics(machine)
     q = machine.closure.solve(q_a)
     linearized_drive = LinearizedDrive(machine, dynamics, q, valves, pressures)

@@ -86,7 +86,8 @@ class ForwardDerivatives(RateProgram):
             x: [change] for x, change in zip(loops.active_joints, changed[0], strict=True)
         }
         moving, _ = loops.solve_passive(active_rows, [[-1.0 * x] for x in gap_changes])
-        seeds |= {operation_index(dynamics.q[i - 1]): change for i, (change,) in moving.items()}
+        steps = loops.coordinate_steps({i: change for i, (change,) in moving.items()})
+        seeds |= {operation_index(dynamics.q[i - 1]): change for i, change in steps.items()}
         controller = formulas.machine.state_parts.controller[: self._stiff_state_count]
         changed.append(tape.load_vector(11, 2 * n, self._stiff_state_count))
         for values, changes in zip((dynamics.v_a, controller), changed[1:], strict=True):
@@ -162,11 +163,9 @@ class ReverseDerivatives(RateProgram):
         if loops.rows:
             # q_P depends linearly on the gaps of the loops; their values cancel
             gaps = [tape.load(7, r) for r in range(len(loops.rows))]
-            moving, _ = loops.solve_passive(
-                {joint: [0.0] for joint in loops.active_joints}, [[-1.0 * x] for x in gaps]
-            )
+            changes = loops.coordinate_changes(gaps)
             z = weighted_gradient(
-                [moving[i][0] for i in loops.passive_joints], found[len(numbers) :], gaps
+                [changes[i] for i in loops.passive_joints], found[len(numbers) :], gaps
             )
             by_loops = weighted_gradient([row.phi for row in loops.rows], z, numbers)
             out = [one + other for one, other in zip(out, by_loops, strict=True)]

@@ -268,8 +268,8 @@ class RateProgram:
             position = add_vectors(origin, matvec(rotation, frame_constants[:3]))
             relative = subtract_vectors(position, kinematics.origin[0])
             return matvec(transpose(kinematics.rotation[0]), relative)["xyz".index(name[-1])], 1.0
-        axis = matvec(rotation, frame_constants[3:])
-        height = dot(axis, [row[2] for row in kinematics.rotation[0]])
+        axis = matvec(rotation, frame_constants[3:6])
+        height = dot(axis, matvec(kinematics.rotation[0], frame_constants[6:]))
         flat = apply_function("sqrt", 1.0 - height * height)
         if not name.endswith(VELOCITY_SUFFIX):
             return height, 1.0 / flat

@@ -148,8 +148,11 @@ class SimulatedMotion:
                 f"'{machine.name}' with its controller has no formulas to differentiate: lock "
                 "joints, or write the controller as a Law, and loads as ExternalForce"
             )
-        if machine.coordinates.floating_base_columns:
-            raise InputError(f"'{machine.name}' floats, sensitivities are of machines that stand")
+        if machine.coordinates.is_rotation_vector[machine.closure.active].any():
+            raise InputError(
+                f"'{machine.name}' floats or turns freely about a ball joint, sensitivities are "
+                "of machines without active rotation vectors: lock them"
+            )
         if state_count(machine.external_forces):
             raise InputError(
                 f"'{machine.name}' has contacts that give way along the ground, sensitivities "

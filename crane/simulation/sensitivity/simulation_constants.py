@@ -17,7 +17,7 @@ from crane.dynamics.quantity_evaluator import UNIT_OF_ZERO_PARAMETER, ConstantDe
 from crane.machine.machine import Machine
 from crane.simulation.integration.machine_formulas import reference_samples
 
-FRAME_SIZE = 6  # numbers of a frame
+FRAME_SIZE = 9  # numbers of a frame
 
 
 class SimulationConstants(NamedTuple):
@@ -29,7 +29,8 @@ class SimulationConstants(NamedTuple):
         dynamics_constants: Inertias and force laws, see
             `crane.dynamics.formula_structure.dynamics_constants`, without stick-slip modes.
         settings: Settings of the controller, with the constants of a circuit.
-        frames: Position (3,) on its body and x axis (3,) of each frame of an output.
+        frames: Position (3,) on its body, x axis (3,) and direction up in the world (3,) of each
+            frame of an output.
         references: (N, c) references at N instants.
         initial_state: (m,) initial minimal state.
     """
@@ -91,6 +92,7 @@ def simulation_constants_of(
         frame_constants += [
             rotation @ frame.placement.translation,
             rotation @ frame.placement.rotation[:, 0],
+            machine.up_direction,
         ]
     return SimulationConstants(
         geometry,

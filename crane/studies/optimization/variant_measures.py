@@ -14,7 +14,6 @@ from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.statics import StaticsEvaluator
 from crane.formats.machine_loading import MachineVariants
 from crane.machine.machine import Machine
-from crane.motion.workspaces.workspace_section import up_direction
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.lifting_capacity import capacity, torques
 from crane.ratings.rating_rules import Rule
@@ -266,7 +265,7 @@ class VariantEvaluation:
             offset = tip - np.array(arguments, dtype=float)
             length = np.linalg.norm(offset, axis=1)
             return length, offset / np.maximum(length, 1e-300)[:, None]
-        up = up_direction(self.machine)
+        up = self.machine.up_direction
         height = tip @ up
         if name in ("highest", "lowest"):
             sign = -1.0 if name == "highest" else 1.0

@@ -16,7 +16,7 @@ _FULL_ARROW_PERCENTILE = (
     99.5  # percentile of the forces that has a full arrow: a single spike does not count
 )
 _MIN_WEIGHT_SHARE = (
-    1e-6  # share of the machine's weight that is rounding noise, as a force or torque
+    1e-6  # share of the machine's weight on earth that is rounding noise, as a force or torque
 )
 _SAMPLED_CONFIGURATIONS = 300  # configurations that determine the shortest length
 
@@ -30,7 +30,7 @@ def actuator_markers(
     loop_links += [loop.predecessor for loop in machine.closure.equations.loops]
     loop_frames = [frame_data(machine, end) for end in loop_links]
     forces = {x: recording.tau[:, recording.joints.index(x)] for x in machine.driven_joints}
-    zero_threshold = _MIN_WEIGHT_SHARE * 9.81 * sum(inertia.mass for inertia in model.inertias)
+    zero_threshold = _MIN_WEIGHT_SHARE * 9.81 * sum(x.mass for x in model.inertias)
     full_arrow = full_arrow_forces(
         machine,
         {
@@ -40,7 +40,8 @@ def actuator_markers(
     )
     markers = []
     for joint, force in forces.items():
-        index, shown_force = model.getJointId(joint) - 1, force[rows]
+        index = int(machine.coordinates.joints[machine.column(joint)]) - 1
+        shown_force = force[rows]
         pin_frames = (
             [frame for frame in loop_frames if frame["joint"] == index]
             if (machine.unit(joint) == "m")

@@ -8,6 +8,7 @@ import pinocchio as pin
 
 from crane.common.errors import InputError, RecordingError, suggest_names
 from crane.common.samples import Array
+from crane.description.rotation_vectors import ROTATION_COUNT
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 
@@ -56,8 +57,9 @@ def joint_tree(machine: Machine) -> dict[str, Any]:
     joints = []
     for i in range(1, model.njoints):
         column = model.joints[i].idx_v
-        joint_kind, axis = "floating", np.zeros(3)
-        if column not in machine.coordinates.floating_base_columns:
+        joint_kind = "floating" if model.joints[i].nv > ROTATION_COUNT else "ball"
+        axis = np.zeros(3)
+        if model.joints[i].nv == 1:
             subspace = np.ravel(model.joints[i].createData().S)
             is_prismatic = bool(machine.coordinates.is_translation[column])
             joint_kind = "prismatic" if is_prismatic else "revolute"

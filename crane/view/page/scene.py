@@ -353,7 +353,7 @@ def sliding_body_visuals(machine: Machine, drawn_joints: Collection[int]) -> lis
     visuals = []
     for joint in range(1, model.njoints):
         column = model.joints[joint].idx_v
-        is_prismatic = column not in limits.floating_base_columns and limits.is_translation[column]
+        is_prismatic = model.joints[joint].nv == 1 and limits.is_translation[column]
         if not is_prismatic or joint in drawn_joints or not model.inertias[joint].mass:
             continue
         axis = np.ravel(model.joints[joint].createData().S)[:3]

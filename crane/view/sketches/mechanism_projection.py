@@ -9,7 +9,7 @@ import pinocchio as pin
 
 from crane.common.samples import Array
 from crane.machine.machine import Machine
-from crane.motion.workspaces.workspace_section import WorkspaceSection, up_direction
+from crane.motion.workspaces.workspace_section import WorkspaceSection
 from crane.view.sketches.sketch_canvas import convex_hull
 from crane.view.sketches.sketch_elements import (
     DrawingPlane,
@@ -41,15 +41,17 @@ class _MechanismProjection:
         self.machine, self.plane, self.q = machine, plane, q
         model = self.model = machine.model
         data = self.data = model.createData()
-        pin.framesForwardKinematics(model, data, q)
+        pin.framesForwardKinematics(model, data, machine.coordinates.configuration(q))
         self.origins = np.array([plane.project(placement.translation) for placement in data.oMi])
         axes = joint_axes(machine, data)
         self.axes, self.axis_cosines = plane.project(axes), np.abs(axes @ plane.normal)
+        self.axis_cosines[[joint.nv > 1 for joint in model.joints]] = 1.0  # ball joints
         self.parents = [int(parent) for parent in model.parents]
-        self.turns = [False] + [machine.unit(name) == "rad" for name in machine.joints]
+        names = [machine.joints[joint.idx_v] for joint in list(model.joints)[1:]]
+        self.turns = [False] + [machine.unit(name) == "rad" for name in names]
         self.chains = [-1] + [
             {x: i for i, chain in enumerate(machine.chains) for x in chain.joints}.get(name, 0)
-            for name in machine.joints
+            for name in names
         ]
         self.tip_body, self.tip = 0, None
         if machine.tip is not None:
@@ -345,7 +347,7 @@ def _forward_direction(
         length = float(np.linalg.norm(offset))
         if length > 0:
             return np.asarray(offset / length)
-        lateral = np.cross(section.second_direction, up_direction(machine))
+        lateral = np.cross(section.second_direction, machine.up_direction)
         return np.asarray(lateral if lateral.any() else np.eye(3)[0])
     if section.slewing_joint is None:
         return section.first_direction

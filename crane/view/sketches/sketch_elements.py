@@ -64,7 +64,8 @@ def find_plane(machine: Machine, q: Array, view: str | None = None) -> DrawingPl
             raise InputError(f"view '{view}' is unknown, {suggest_names(VIEW_DIRECTIONS, view)}")
         return _label_plane(*VIEW_DIRECTIONS[view])
     home_data = pin.Data(machine.model)
-    pin.forwardKinematics(machine.model, home_data, machine.home)
+    to_pinocchio = machine.coordinates.configuration
+    pin.forwardKinematics(machine.model, home_data, to_pinocchio(machine.home))
     axes, carriers = _revolute_axes(machine, home_data)
     counts = (np.abs(axes @ axes.T) > 1 - _PARALLEL_TOLERANCE).sum(axis=1)
     if 2 * counts.max(initial=0) < max(len(axes), 1):
@@ -77,14 +78,16 @@ def find_plane(machine: Machine, q: Array, view: str | None = None) -> DrawingPl
     chosen_axis = max(range(len(axes)), key=lambda i: (counts[i], is_level[i], -i))
     right, up = _plane_directions(axes[chosen_axis])
     moved_data = pin.Data(machine.model)
-    pin.forwardKinematics(machine.model, moved_data, q)
+    pin.forwardKinematics(machine.model, moved_data, to_pinocchio(q))
     body = carriers[chosen_axis]
     body_rotation = moved_data.oMi[body].rotation @ home_data.oMi[body].rotation.T
     return _label_plane(body_rotation @ right, body_rotation @ up)
 
 
 def joint_axes(machine: Machine, data: pin.Data) -> Array:
-    """Return the directions (njoints, 3) of all joints in the world; the first row is unused.
+    """Return the directions (njoints, 3) of all joints in the world, zero for ball joints.
+
+    The first row is unused.
 
     Args:
         machine: The machine.
@@ -93,6 +96,8 @@ def joint_axes(machine: Machine, data: pin.Data) -> Array:
     model = machine.model
     axes = np.zeros((model.njoints, 3))
     for i in range(1, model.njoints):
+        if model.joints[i].nv > 1:
+            continue
         column = np.asarray(model.joints[i].createData().S).reshape(6)
         axes[i] = data.oMi[i].rotation @ (column[:3] + column[3:])  # one of both is zero
     return axes
@@ -102,8 +107,8 @@ def _revolute_axes(machine: Machine, data: pin.Data) -> tuple[Array, list[int]]:
     """Return the directions (k, 3) of all revolute axes, and the parent joint of each."""
     model, equations = machine.model, machine.closure.equations
     all_axes, axes, carriers = joint_axes(machine, data), [], []
-    for i, name in enumerate(machine.joints, start=1):
-        if machine.unit(name) == "rad":
+    for i, name in zip(machine.coordinates.joints.tolist(), machine.joints, strict=True):
+        if machine.unit(name) == "rad" and model.joints[i].nv == 1:
             axes.append(all_axes[i])
             carriers.append(int(model.parents[i]))
     for loop, (joint, placement) in zip(equations.loops, equations.frames[::2], strict=True):

@@ -20,8 +20,10 @@ function turned(pose, [x, y, z]) {
 
 const STILL = Float64Array.of(1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1);
 
-// What a joint does at a coordinate: slide along its axis, or turn about it (Rodrigues).
-function displacement({ type, axis: [x, y, z] }, value) {
+// What a joint does at its coordinates: slide along its axis, or turn about it (Rodrigues).
+function displacement({ type, axis: [x, y, z] }, [value, ...more]) {
+    if (type === "floating") return flown([value, ...more]);
+    if (type === "ball") return flown([0, 0, 0, value, ...more]);
     if (type === "prismatic") {
         return Float64Array.of(1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, x * value, y * value, z * value, 1);
     }
@@ -61,9 +63,7 @@ class Tree {
         for (const joint of this.joints) {
             const parent = joint.parent < 0 ? STILL : found[joint.parent];
             const zero = product(parent, joint.placement);
-            found.push(product(zero, joint.type === "floating"
-                ? flown(q.slice(joint.column, joint.column + 6))
-                : displacement(joint, q[joint.column])));
+            found.push(product(zero, displacement(joint, q.slice(joint.column, joint.column + 6))));
         }
         return found;
     }

@@ -1,17 +1,21 @@
-"""Floating bases: series of six joints at the root that are one joint without singularity.
+"""Ball joints and floating bases: series of joints that are one joint without singularity.
 
-A joint with six degrees of freedom is read as a series of three translations and three rotations
-(see `crane.description.kinematic_tree`), whose Cardan angles are singular at a pitch of 90
-degrees. If such a series connects a body to the ground, and no loop, coupling, spring or drive
-acts on it, its coordinates need not be solved for: then the series is one free-flyer joint with
-its own coordinates and velocities.
+A joint with three rotations is read as a series of three revolute joints (see
+`crane.description.kinematic_tree`), whose Cardan angles are singular where the second is 90
+degrees. Unless a spring, an end stop or a coupling acts on one of these angles, the series is one
+spherical joint. Its coordinates are the rotation vector r [rad] of the child in the frame of the
+joint, R = exp(r x), of length at most pi; its velocities are the relative angular velocity w
+[rad/s] in the axes of the child, and its forces moments about these axes [N m]:
 
-Its coordinates are the position p [m] and the rotation vector r [rad] of the body, R = exp(r x),
-of length at most pi; its velocity is the body's twist in the body's axes, V = (linear, angular):
+    r' = (1 + r x / 2 + c (r x)^2) w,   c = (1 - (t/2) cot(t/2)) / t^2,   t = |r|
 
-    p' = R V_lin,   r' = (1 + r x / 2 + c (r x)^2) V_ang,   c = (1 - (t/2) cot(t/2)) / t^2, t = |r|
+(Bullo and Murray 1995), which is regular up to t = 2 pi.
 
-(Bullo and Murray 1995), which is regular up to t = 2 pi. Forces are a wrench in the same axes.
+A joint with six degrees of freedom is a series of three translations and three rotations. If it
+connects a body to the ground, and nothing acts on its coordinates and no loop contains it, it is
+one free-flyer joint: its coordinates are the position p [m] and the rotation vector of the body,
+its velocity is the body's twist in the body's axes, V = (linear, angular), with p' = R V_lin.
+Forces are a wrench in the same axes.
 """
 
 import dataclasses
@@ -19,6 +23,7 @@ from collections.abc import Mapping, Sequence
 
 from crane.common.errors import InputError
 from crane.description.kinematic_tree import (
+    ROTATIONS,
     Joint,
     Link,
     Tree,
@@ -29,6 +34,37 @@ from crane.description.kinematic_tree import (
 from crane.description.specification import MachineSpec
 
 FLOATING_FREEDOMS = ("x", "y", "z", "rx", "ry", "rz")
+ROTATION_COUNT = len(ROTATIONS)
+_FIRST_ROTATION = ROTATIONS[0][0]
+
+
+def composite_joints(spec: MachineSpec) -> dict[str, tuple[str, ...]]:
+    """Return the joints of each series that is one joint, in order, by name of that joint.
+
+    Six for a floating base, three for a ball joint.
+    """
+    found, constrained = floating_bases(spec), _constrained_joints(spec)
+    joints, links = spec.tree.joints, spec.tree.links
+    for joint in joints.values():
+        name = joint.name.removesuffix(f"_{_FIRST_ROTATION}")
+        names = tuple(f"{name}_{part}" for part, _, _ in ROTATIONS)
+        if joint.name != names[0] or name in found or constrained & set(names):
+            continue
+        series = [joints[x] for x in names if x in joints]
+        between = [part.child for part in series[:-1]]
+        if (
+            [(x.kind, x.axis) for x in series] == [(kind, axis) for _, kind, axis in ROTATIONS]
+            and [(x.parent, *x.xyz, *x.rpy) for x in series[1:]]
+            == [(link, *[0.0] * 6) for link in between]
+            and all(links[link].composite_joint is not None for link in between)
+        ):
+            found[name] = names
+    return found
+
+
+def rotation_series(spec: MachineSpec) -> list[tuple[str, ...]]:
+    """Return the three rotations of each floating base and ball joint."""
+    return [series[-ROTATION_COUNT:] for series in composite_joints(spec).values()]
 
 
 def floating_bases(spec: MachineSpec) -> dict[str, tuple[str, ...]]:
@@ -53,18 +89,21 @@ def floating_series(spec: MachineSpec) -> dict[str, tuple[str, ...]]:
     }
 
 
+def _constrained_joints(spec: MachineSpec) -> set[str]:
+    """Joints whose coordinates springs, end stops or couplings act on."""
+    joints = {part.joint for part in spec.force_elements if part.between is None}
+    joints |= {part.joint for part in spec.end_stops}
+    return joints | {joint for coupling in spec.couplings for joint in coupling.joints}
+
+
 def _is_unconstrained(spec: MachineSpec, series: list[Joint]) -> bool:
     """Whether a series connects a body to the ground and nothing else acts on it."""
     parent_joints = spec.tree.parent_joints
     if body_of(parent_joints, series[0].parent) in parent_joints:
         return False  # another body carries it
-    names = {joint.name for joint in series}
-    force_element_joints = {part.joint for part in spec.force_elements if part.between is None}
-    force_element_joints |= {part.joint for part in spec.end_stops}
     driven_joints = set(spec.active or ()) - set(spec.free)
     driven_joints |= {joint for drive in spec.drives for joint in drive.factors}
-    coupled_joints = {joint for coupling in spec.couplings for joint in coupling.factors}
-    if names & (force_element_joints | driven_joints | coupled_joints):
+    if {joint.name for joint in series} & (_constrained_joints(spec) | driven_joints):
         return False
     return not any(
         _carries_link(parent_joints, loop.predecessor, series[-1].child)
@@ -84,8 +123,7 @@ def with_rotation_vectors(spec: MachineSpec) -> MachineSpec:
     from scipy.spatial.transform import Rotation
 
     home = dict(spec.home)
-    for series in floating_bases(spec).values():
-        rotations = series[3:]
+    for rotations in rotation_series(spec):
         angles = [home.pop(name, 0.0) for name in rotations]
         rotation_vector = Rotation.from_euler("XYZ", angles).as_rotvec().tolist()
         home |= {name: x for name, x in zip(rotations, rotation_vector, strict=True) if x}
@@ -95,7 +133,7 @@ def with_rotation_vectors(spec: MachineSpec) -> MachineSpec:
 def convert_locked_rotations(
     spec: MachineSpec, lock: Mapping[str, float]
 ) -> tuple[MachineSpec, Mapping[str, float]]:
-    """Convert home and locks of floating bases that lose joints by locking.
+    """Convert home and locks of ball joints and floating bases that lose joints by locking.
 
     Three rotations locked together are a rotation vector, as the coordinates are. Remaining
     rotations, and one or two that are locked alone, become Cardan angles.
@@ -103,9 +141,8 @@ def convert_locked_rotations(
     from scipy.spatial.transform import Rotation
 
     home, locked = dict(spec.home), dict(lock)
-    for series in floating_bases(spec).values():
-        rotations = series[3:]
-        if not locked.keys() & set(series):
+    for rotations in rotation_series(spec):
+        if not locked.keys() & set(rotations):
             continue
         all_locked = locked.keys() >= set(rotations)
         values = locked if all_locked else home
