@@ -53,7 +53,7 @@ def sustained_oscillation(
 
     Moving means of doubling widths are subtracted from the samples; the difference crosses zero
     twice per period. Widths of one to two and a half periods are used. An oscillation decays if
-    its swings fall below 0.85 in eight periods, by those of the first and the last four. One that
+    its swings fall below 0.85 in eight periods, by their largest and their last quarter. One that
     begins and ends while commands do not change is a transient, or noise, unless it lasts half of
     that time or sixty periods. It is commanded if a command reverses in at least half of the
     periods.
@@ -191,8 +191,8 @@ def _oscillation_spans(
     at = at[is_even]
     for half in range(2 * order):  # above and below, which may differ
         at = at[_evenness(rows[at, half :: 2 * order], _MAX_SWING_RANGE)[1]]
-    first, last = (np.median(x, axis=1) for x in np.split(rows[at], 2, axis=1))
-    at = at[last >= np.maximum(_MIN_DECAY_RATIO**0.5 * first, least)]
+    quarters = np.median(rows[at].reshape(len(at), 4, count // 4), axis=2)
+    at = at[quarters[:, -1] >= np.maximum(_MIN_DECAY_RATIO**0.75 * quarters.max(axis=1), least)]
     if not len(at):
         return []
     good = np.zeros(len(rows), dtype=bool)
