@@ -110,7 +110,7 @@ class _Draw:
         if self.often(0.3):
             out["hysteresis"] = float(self.random.uniform(0, 0.1))
         if self.often(0.3):
-            out["dead_band"] = float(self.random.uniform(0, 0.3))
+            out["dead_band"] = float(self.random.uniform(-0.2, 0.3))
         for side in "ab":
             if nodes and self.often(0.3):
                 out[f"return_{side}"] = str(self.random.choice(nodes))

@@ -1,4 +1,4 @@
-"""Linkages with dead centres and bifurcations as URDF texts.
+"""Linkages with dead centres and change points as URDF texts.
 
 They lie in the plane of x and z and turn about y; rods are slender, of 1 kg per rod.
 """
@@ -48,6 +48,27 @@ def four_bar(folder, active, a=1.0, b=0.9, c=1.2, d=2.2):
         _end("three", c), _pin("pin", "two_end", "three_end"),
     ]  # fmt: skip
     return load(folder, "linkage", parts, {"a": -1.0, "b": 0.7, "c": -2.2}, active)
+
+
+def kite_angles(crank, a=1.0, b=1.5):
+    """Joint angles (3, N) of a kite, along its smooth motion: symmetric about a diagonal.
+
+    Crank and base of length a, coupler and rocker of length b; the diagonal through the pins of
+    coupler and rocker turns by half the crank's angle.
+    """
+    tilt = np.arctan2(a * np.sin(crank / 2), np.sqrt(b**2 - (a * np.sin(crank / 2)) ** 2))
+    return np.array([crank, -crank / 2 - tilt, crank / 2 + tilt])
+
+
+def kite(folder, active):
+    """Of a crank of 1 m on a base of 1 m, coupler and rocker of 1.5 m; folds once in a turn."""
+    parts = [
+        _rod("one", 1.0), _rod("two", 1.5), _rod("three", 1.5), _joint("a", "base", "one"),
+        _joint("b", "one", "two", 1.0), _joint("c", "base", "three", 1.0), _end("two", 1.5),
+        _end("three", 1.5), _pin("pin", "two_end", "three_end"),
+    ]  # fmt: skip
+    home = dict(zip("abc", kite_angles(-1.0), strict=True))
+    return load(folder, "linkage", parts, home, active)
 
 
 def windows(folder, active, count):

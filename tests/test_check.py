@@ -91,7 +91,8 @@ NUMBERS = [
             "four_bar.yaml:21: error: 'viscous' of friction of 'coupler' is nan, give a "
             "finite number",
             "four_bar.yaml:27: error: 'stiffness' of end stop of 'crank' is -1, give at least 0",
-            "four_bar.yaml:34: error: 'duration' of task 'swing' is 'two', give a number",
+            "four_bar.yaml:34: error: 'duration' of task 'swing' is 'two', give a number "
+            "in s, as in 5 ms",
         ],
         swap("  crank: 1.2", "  crank: 1,2"),
         swap("viscous: 0.01", "viscous: .nan"),
@@ -471,7 +472,8 @@ MECHANISM = [
             "(crank = 1.2): it stays 0.101 m open, correct the frames or the guess (it is "
             "102 mm apart and 0.0723 deg askew)",
             "four_bar.yaml:20: error: 'coulomb' of friction of 'crank' is -0.3, give at least 0",
-            "four_bar.yaml:38: error: 'duration' of task 'reach' is 'soon', give a number",
+            "four_bar.yaml:38: error: 'duration' of task 'reach' is 'soon', give a number "
+            "in s, as in 5 ms",
             "four_bar.yaml:42: error: 'ki' of control of 'crank' is -20, give at least 0",
         ],
         swap("type: revolute", "type: fixed"),

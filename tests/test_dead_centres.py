@@ -1,14 +1,16 @@
-"""Runs through dead centres and bifurcations with any active joint."""
+"""Runs through dead centres and change points with any active joint."""
 
 import warnings
 
 import numpy as np
+import pinocchio as pin
 import pytest
 import singular_linkages
 from scipy.integrate import solve_ivp
+from warned import told
 
 import crane
-from crane.closure import home_search
+from crane.closure import change_points, home_search
 from crane.common.errors import CraneWarning, SimulationError
 from crane.motion.trajectory import point_to_point
 
@@ -151,6 +153,126 @@ def test_a_rocker_that_turns_back_everywhere(tmp_path):
     assert np.ptp(runs[0], axis=0).min() > 1.0
     for other in runs[1:]:
         np.testing.assert_allclose(other, runs[0], rtol=0, atol=1e-7)
+
+
+CHANGE_POINTS = {  # linkage by active joint, closed form of its joint angles, a change point
+    "slider crank": (
+        lambda folder: singular_linkages.slider_crank(folder, "a", 0.3, 0.3),
+        lambda a: np.array([a, -2 * a, 0.6 * np.cos(a)]),
+        np.pi / 2,
+    ),
+    "parallelogram": (
+        lambda folder: singular_linkages.windows(folder, "r0", 1),
+        lambda a: np.array([a, -a, a]),
+        np.pi,
+    ),
+    "kite": (
+        lambda folder: singular_linkages.kite(folder, "a"),
+        singular_linkages.kite_angles,
+        2 * np.pi,
+    ),
+}
+
+
+def energies(machine, closed_form, a):
+    """Inertia (N,) about the active joint, and potential energy (N,), of the closed form."""
+    rates = (closed_form(a + 1e-5) - closed_form(a - 1e-5)) / 2e-5
+    inertia, potential = np.zeros_like(a), np.zeros_like(a)
+    data = machine.model.createData()
+    for i, (q, v) in enumerate(zip(closed_form(a).T, rates.T, strict=True)):
+        inertia[i] = 2 * pin.computeKineticEnergy(machine.model, data, q, v)
+        potential[i] = pin.computePotentialEnergy(machine.model, data, q)
+    return inertia, potential
+
+
+def needed_torque(machine, closed_form, a, v, acceleration):
+    """J a'' + J' a'^2 / 2 + V' of the closed form."""
+    ends = [energies(machine, closed_form, a + side * 1e-4) for side in (1, -1)]
+    inertia_slope, slope = ((one - other) / 2e-4 for one, other in zip(*ends, strict=True))
+    inertia = energies(machine, closed_form, a)[0]
+    return inertia * acceleration + 0.5 * inertia_slope * v**2 + slope
+
+
+@pytest.mark.parametrize("name", CHANGE_POINTS)
+def test_loops_are_followed_through_change_points(tmp_path, name):
+    """Ten turns by `solve` and `follow_motion`, to change points themselves, and forces there."""
+    make, closed_form, change_point = CHANGE_POINTS[name]
+    machine = make(tmp_path)
+    home = machine.home[machine.closure.active][0]
+    a = np.append(home + np.linspace(0, 20 * np.pi, 1001), change_point + 2 * np.pi)
+    q, lines = told(machine.closure.solve, a[:, None])
+    assert len(lines) == 1 and "passes a change point" in lines[0]
+    np.testing.assert_allclose(q.T, closed_form(a), rtol=0, atol=1e-12)
+    assert machine.closure.residual(q).max() < 1e-13
+    order = np.random.default_rng(1).permutation(len(a))[:40]
+    np.testing.assert_allclose(machine.closure.solve(a[order, None]), q[order], rtol=0, atol=1e-12)
+    guess = machine.closure.solve(a[[700]])
+    np.testing.assert_allclose(machine.closure.solve(a[[702]], guess), q[702], rtol=0, atol=1e-12)
+    followed = machine.closure.follow_motion(a[:150, None])
+    np.testing.assert_allclose(followed, q[:150], rtol=0, atol=1e-11)
+    some = np.append(a[::50], change_point)
+    tau = crane.Dynamics(machine).inverse(some[:, None], [1.3], [-0.7])[:, 0]
+    wanted = needed_torque(machine, closed_form, some, 1.3, -0.7)
+    np.testing.assert_allclose(tau, wanted, rtol=0, atol=1e-6 * np.abs(wanted).max())
+    with pytest.raises(crane.CraneError, match="is at the edge of its branch"):
+        machine.closure.gamma(machine.closure.solve([change_point]))
+
+
+def test_a_limit_of_neighbours_or_none():
+    x = 4e-3 * change_points.NEIGHBOUR_PLACES
+    values = np.column_stack([np.cos(x), np.exp(3 * x), np.zeros(8)])
+    found = change_points.interpolate_limit(values)
+    np.testing.assert_allclose(found, [1.0, 1.0, 0.0], rtol=0, atol=1e-14)
+    for unbounded in (1 / x, 1 / x**2, np.sign(x), np.abs(x) + 0.01):
+        assert change_points.interpolate_limit(unbounded[:, None]) is None
+
+
+@pytest.mark.parametrize("name", CHANGE_POINTS)
+def test_computed_torque_drives_through_change_points(tmp_path, name):
+    """Two turns; torques of the closed form, and the energy balance closes."""
+    make, closed_form, _ = CHANGE_POINTS[name]
+    machine = make(tmp_path)
+    start = machine.home[machine.closure.active]
+    path = point_to_point(start, start + 4 * np.pi, 4.0)
+    found = crane.simulate(machine, crane.ComputedTorque(machine, path), step=1e-3)
+    q = singular_linkages.postures(machine, found)
+    a = q[:, machine.column(machine.active[0])]
+    np.testing.assert_allclose(a, path.position(found.time)[:, 0], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(q.T, closed_form(a), rtol=0, atol=1e-10)
+    every = slice(None, None, 50)
+    _, v, acceleration = (np.atleast_2d(x)[:, 0] for x in path(found.time[every]))
+    wanted = needed_torque(machine, closed_form, a[every], v, acceleration)
+    error = np.abs(found.tau[every, 0] - wanted).max()
+    assert error < 1e-5 * np.abs(wanted).max()
+    assert singular_linkages.imbalance(found) < 1e-7
+
+
+def test_a_kite_falls_through_its_change_points(tmp_path):
+    """It turns on: energy is that of the closed form at every instant."""
+    machine = singular_linkages.kite(tmp_path, "a")
+    found = run(machine, "a", 9.0, 3.0, step=5e-4, method="rk4")
+    q = singular_linkages.postures(machine, found)
+    a = q[:, machine.column("a")]
+    assert np.ptp(a) > 6 * np.pi
+    np.testing.assert_allclose(q.T, singular_linkages.kite_angles(a), rtol=0, atol=1e-9)
+    every = slice(None, None, 20)
+    inertia, potential = energies(machine, singular_linkages.kite_angles, a[every])
+    total = 0.5 * inertia * found.v[every, 0] ** 2 + potential
+    assert np.ptp(total) < 1e-6 * np.ptp(potential)
+    assert singular_linkages.imbalance(found) < 1e-8
+
+
+@pytest.mark.parametrize("excess", [1e-3, 1e-6, 1e-9])
+def test_branches_that_do_not_meet_are_not_changed(tmp_path, excess):
+    """A rod that is longer than the crank turns over where one as long goes on."""
+    machine = singular_linkages.slider_crank(tmp_path, "a", 0.3, 0.3 + excess)
+    a = np.linspace(-0.7, 2.5, 400)
+    s = machine.closure.solve(a[:, None])[:, machine.column("s")]
+    wanted = 0.3 * np.cos(a) + np.sqrt((0.3 + excess) ** 2 - (0.3 * np.sin(a)) ** 2)
+    np.testing.assert_allclose(s, wanted, rtol=0, atol=1e-9)
+    short = singular_linkages.slider_crank(tmp_path, "a", 0.3, 0.3 - excess)
+    with pytest.raises(crane.CraneError, match="cannot be closed at a = 2"):
+        short.closure.solve([2.0])
 
 
 class Weighed(crane.control.ControlLaw):

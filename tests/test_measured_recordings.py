@@ -275,8 +275,8 @@ BROKEN = {
         f"column 'pressure_X1_a' has no unit, give {PASCAL}'pressure_X1_a [bar]'",
     ),
     "unknown unit of a pressure": (
-        renamed(PRESSURE, "pressure_X1_a [psi]"),
-        f"column 'pressure_X1_a' is in [psi], give {PASCAL}'pressure_X1_a [bar]'",
+        renamed(PRESSURE, "pressure_X1_a [Torr]"),
+        f"column 'pressure_X1_a' is in [Torr], give {PASCAL}'pressure_X1_a [bar]'",
     ),
     "negative pressure": (
         changed(PRESSURE, 17, -0.25),
@@ -310,7 +310,8 @@ BROKEN = {
     ),
     "force in another unit": (
         renamed("q1_force [N m]", "q1_force [N]"),
-        "column 'q1_force' is in [N], give 'q1_force [N m]' or 'q1_force [kN m]'",
+        "column 'q1_force' is in [N], give 'q1_force [N m]' or 'q1_force [Nm]' or "
+        "'q1_force [kN m]'",
     ),
     "no slewing angle": (
         without("q1 [deg]"),
@@ -331,8 +332,9 @@ BROKEN = {
         "column 'q3' is in [m], give 'q3 [rad]' or 'q3 [deg]'",
     ),
     "rate in another unit": (
-        lambda columns, truth: columns.update({"q2_velocity [rpm]": truth["t"]}),
-        "column 'q2_velocity' is in [rpm], give 'q2_velocity [rad/s]' or 'q2_velocity [deg/s]'",
+        lambda columns, truth: columns.update({"q2_velocity [mm/s]": truth["t"]}),
+        "column 'q2_velocity' is in [m/s], give 'q2_velocity [rad/s]' or 'q2_velocity [rpm]' or "
+        "'q2_velocity [deg/s]'",
     ),
     "wrong zero": (
         lambda columns, truth: columns["q2 [deg]"].__iadd__(60.0),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import crane
-from crane.cli.parsing import parse_values
+from crane.cli.parsing import parse_changes
 from crane.common.errors import (
     CraneError,
     InputError,
@@ -61,7 +61,7 @@ def test_counts(value):
 
 
 def test_joints_by_name():
-    assert parse_values("--lock", ["a=1", "b=-2e3", "a=b=0"]) == {"a": 1, "b": -2e3, "a=b": 0}
+    assert parse_changes("--lock", ["a=1", "b=-2e3", "a=b=0"]) == {"a": 1, "b": -2e3, "a=b": 0}
     for words, told in (
         (["a"], "--lock is 'a', write JOINT=VALUE"),
         (["=1"], "--lock is '=1', write"),
@@ -71,7 +71,7 @@ def test_joints_by_name():
         (["a=1e308"], "--lock a is 1e.308, give a number from"),
     ):
         with pytest.raises(InputError, match=told):
-            parse_values("--lock", words)
+            parse_changes("--lock", words)
 
 
 @pytest.mark.parametrize("joint", ["s", "theta", "phi"])

@@ -124,7 +124,10 @@ def test_urdfs_can_be_changed_too():
             "'link3.x' and 'link3_H.x'; crane info mini_forwarder --names lists all names",
         ),
         ({"link7.mass": -1.0}, "parameter 'link7.mass' is -1 kg, it must not be negative"),
-        ({"link7.mass": "heavy"}, "parameter 'link7.mass' is not made of real numbers"),
+        (
+            {"link7.mass": "heavy"},
+            "parameter 'link7.mass' is 'heavy', give a number in kg, as in 5 t",
+        ),
         ({"link7.mass": float("nan")}, "parameter 'link7.mass' is nan"),
         ({"friction.X1.coulomb": -1}, "coulomb of friction is -1, it must not be negative"),
         ({"friction.X1.stribeck": 0}, "stribeck of friction is 0"),

@@ -119,8 +119,8 @@ def test_text_with_notes_reads_as_without():
             "list": [{"k": 1.0, "deep": {"z": 0.1}}]}  # fmt: skip
     notes = {("a", "x y"): "one", ("a", "it's: #"): "two\nlines", ("list", 0, "k"): "#3",
              ("list", 0, "deep", "z"): "ß"}  # fmt: skip
-    text = format_yaml(data, notes)
-    assert yaml.safe_load(text) == data == yaml.safe_load(format_yaml(data))
+    text = format_yaml(data, notes, {})
+    assert yaml.safe_load(text) == data == yaml.safe_load(format_yaml(data, {}, {}))
     assert "x y: 1.0  # one\n" in text and "# two lines\n" in text and "k: 1.0  # #3\n" in text
 
 

@@ -203,7 +203,7 @@ def test_masses_beyond_what_counts_are_told_in_a_line(folder):
         '<axis xyz="0 0 1"/></joint></robot>'
     )
     dynamics = crane.Dynamics(quiet(crane.load, path), backend="pinocchio")
-    with pytest.raises(CraneError, match="the mass matrix is not definite"):
+    with pytest.raises(CraneError, match="the mass matrix is singular at one = 0, two = 0"):
         dynamics.forward([0.0, 0.0], [0.0, 0.0], [1.0, 1.0])
 
 

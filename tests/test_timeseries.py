@@ -79,7 +79,7 @@ BROKEN = {
     "semicolons": ("time [s];a [m]\n0;1\n", "separates columns by ';', use commas"),
     "tabs": ("time [s]\ta [m]\n0\t1\n", r"separates columns by '\t', use commas"),
     "time without unit": ("time,a\n0,1\n", "column 'time' has no unit, give 'time [s]' or"),
-    "hours": ("time [h],a\n0,1\n", "column 'time' is in [h], give 'time [s]' or 'time [ms]'"),
+    "days": ("time [d],a\n0,1\n", "column 'time' is in [d], give 'time [s]' or 'time [ms]'"),
     "milliseconds stand": ("time [ms],a\n5,1\n5,1\n", "time goes from 5.0 to 5.0 ms, give"),
     "twice": ("time [s],a [m],a [m]\n0,1,1\n", "column 'a' is there twice, rename or remove one"),
     "nameless": ("time [s],,b\n0,1,2\n", "column 2 is headed '', write 'name [unit]'"),

@@ -12,6 +12,7 @@ from command_line import typed
 import crane
 from crane.common.errors import CraneError, OutputError
 from crane.formats import write_home
+from crane.formats.machine_file.machine_reader import read_machine_spec
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 
@@ -74,6 +75,20 @@ def test_a_machine_file_keeps_its_other_text(home, then, end, tmp_path):
         assert abs(value - machine.home[machine.column(joint)]) < 4e-16
         then = then.replace(f"{joint}: X", f"{joint}: {value!r}")
     assert written == then.replace("\n", end)
+
+
+def test_units_of_home_stay(tmp_path):
+    path = tmp_path / "home.yaml"
+    path.write_text(
+        "extends: patu655\nhome: {slew: 30 deg, q3: -45 °, X_lift: 117 mm}\n", encoding="utf-8"
+    )
+    machine = crane.load(path)
+    write_home(path)
+    text = path.read_text(encoding="utf-8")
+    assert "slew: 30 deg" in text and "X_lift: 117 mm" in text
+    assert re.search(r"q3: -45\.0\d+ °, X_lift", text)
+    read = read_machine_spec(path).home
+    assert [read[joint] for joint in machine.joints] == machine.home.tolist()
 
 
 def test_a_machine_file_without_home_gets_one(tmp_path):

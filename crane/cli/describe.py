@@ -7,6 +7,7 @@ import typer
 
 import crane
 from crane.cli.command import app, command
+from crane.cli.option_units import number_option
 from crane.cli.options import (
     AssemblyOptions,
     MachineName,
@@ -152,17 +153,16 @@ def cylinder(
             help="Attachment points of barrel and rod: LINK, or LINK:x,y,z in m.",
         ),
     ],
-    bore: Annotated[float, typer.Option(metavar="M", help="Diameter of the piston in m.")],
-    rod: Annotated[float, typer.Option(metavar="M", help="Diameter of the rod in m.")],
-    stroke: Annotated[float, typer.Option(metavar="M", help="Stroke in m.")],
+    bore: Annotated[float, number_option("m", "Diameter of the piston in m.")],
+    rod: Annotated[float, number_option("m", "Diameter of the rod in m.")],
+    stroke: Annotated[float, number_option("m", "Stroke in m.")],
     name: Annotated[
         str, typer.Option(help="Name of the cylinder and of its stroke.")
     ] = "cylinder",
     dead_length: Annotated[
         float | None,
-        typer.Option(
-            metavar="M",
-            help="Retracted length between the pins in m; by default the stroke plus four bores.",
+        number_option(
+            "m", "Retracted length between the pins in m; by default the stroke plus four bores."
         ),
     ] = None,
 ) -> None:

@@ -6,6 +6,7 @@ import typer
 
 import crane
 from crane.cli.command import command
+from crane.cli.option_units import parameter_units
 from crane.cli.options import (
     Frame,
     MachineName,
@@ -52,10 +53,12 @@ def study(
     seed: Seed = 0,
 ) -> None:
     """Compute measures of variants, on a grid or at random."""
-    axes = parse_grids(vary) if draws is None else parse_ranges(vary)
+    loaded = options.load(machine)
+    units_of = parameter_units(loaded)
+    axes = parse_grids(vary, units_of) if draws is None else parse_ranges(vary, units_of)
     with progress_bar("computing variants") as progress:
         result = crane.study(
-            options.load(machine), axes, task, measure, require=require or (),
+            loaded, axes, task, measure, require=require or (),
             user_measures=measures, frame=frame, rule=rule, draws=draws, seed=seed,
             progress=progress, **parallel.arguments(),
         )  # fmt: skip
@@ -95,7 +98,8 @@ def design(
     loaded = options.load(machine)
     with progress_bar("searching") as progress:
         result = crane.design(
-            loaded, parse_ranges(vary), minimise=minimise or (), maximise=maximise or (),
+            loaded, parse_ranges(vary, parameter_units(loaded)),
+            minimise=minimise or (), maximise=maximise or (),
             require=require or (), measures=measures, frame=frame, rule=rule, tasks=task,
             starts=starts, points=points, seed=seed, progress=progress, **parallel.arguments(),
         )  # fmt: skip

@@ -10,6 +10,7 @@ import typer
 
 import crane
 from crane.cli.command import OptionBlock, command, refuse_options
+from crane.cli.option_units import joint_units, number_option, parameter_units
 from crane.cli.options import (
     Bandwidth,
     CentreOfMass,
@@ -57,7 +58,7 @@ class PeriodicMotionOptions(OptionBlock):
     """A periodic excitation motion."""
 
     panel = "Options of a motion"
-    period: Annotated[float, typer.Option(metavar="SECONDS", help="Period of the motion.")] = 10.0
+    period: Annotated[float, number_option("s", "Period of the motion.")] = 10.0
     harmonics: Annotated[int, typer.Option(help="Harmonics of the motion.")] = 5
     periods: Annotated[int, typer.Option(help="Number of steady periods.")] = 3
     acceleration: Annotated[
@@ -67,11 +68,12 @@ class PeriodicMotionOptions(OptionBlock):
         ),
     ] = None
 
-    def arguments(self) -> dict[str, Any]:
+    def arguments(self, machine: "crane.Machine") -> dict[str, Any]:
         """Arguments of `crane.excite` by name."""
+        units_of = joint_units(machine, "/s2")
         return {
             "period": self.period, "harmonics": self.harmonics, "periods": self.periods,
-            "acceleration": parse_values("--acceleration", self.acceleration),
+            "acceleration": parse_values("--acceleration", self.acceleration, units_of),
         }  # fmt: skip
 
 
@@ -80,17 +82,14 @@ class SignalOptions(OptionBlock):
     """Valve signals for calibration."""
 
     panel = "Options of valve signals (with --fit)"
-    duration: Annotated[
-        float, typer.Option(metavar="SECONDS", help="Duration of the signals.")
-    ] = 20.0
+    duration: Annotated[float, number_option("s", "Duration of the signals.")] = 20.0
     sensors: ComparedColumns = None
     rate: Annotated[
         float, typer.Option(help="Maximum rate of the signals, in spool strokes per second.")
     ] = 2.0
-    margin: Annotated[
-        float,
-        typer.Option(metavar="FRACTION", help="Fraction of a stroke kept free at both ends."),
-    ] = 0.1
+    margin: Annotated[float, number_option("", "Fraction of a stroke kept free at both ends.")] = (
+        0.1
+    )
 
     def arguments(self) -> dict[str, Any]:
         """Arguments of `crane.identification.excite_valves` by name."""
@@ -124,9 +123,7 @@ def excite(
             "limit, or with --fit of a column; may be repeated.",
         ),
     ] = None,
-    step: Annotated[
-        float, typer.Option(metavar="SECONDS", help="Interval of the written samples.")
-    ] = 0.01,
+    step: Annotated[float, number_option("s", "Interval of the written samples.")] = 0.01,
 ) -> None:
     """Design an excitation: a motion or valve signals.
 
@@ -134,23 +131,28 @@ def excite(
     parameters that crane calibrate fits.
     """
     from crane.description.machine_lookup import command_line_arguments
+    from crane.description.sensors import FORCE_SUFFIX, quantity_unit
 
     if fit is None:
         signals.refuse("only goes with --fit, name parameters to fit or leave it out")
     else:
         motion.refuse("does not go with --fit, leave it out")
-    fits = None if fit is None else parse_fits(fit)
+    loaded = options.load(machine)
+    fits = None if fit is None else parse_fits(fit, parameter_units(loaded))
+    suffix = FORCE_SUFFIX if fit is None else ""
+    deviations = parse_values(
+        "--noise", noise, lambda name: (quantity_unit(loaded.tree, name + suffix) or "",)
+    )
     common: dict[str, Any] = {
         "criterion": criterion,
-        "noise": parse_values("--noise", noise),
+        "noise": deviations,
         "step": step,
         "seed": seed,
     }
-    loaded = options.load(machine)
     result: Result
     with progress_bar("optimising") as progress:
         if fits is None:
-            result = crane.excite(loaded, **motion.arguments(), **common, progress=progress)
+            result = crane.excite(loaded, **motion.arguments(loaded), **common, progress=progress)
             note = f"see it with: crane view {output.out}/reference.csv"
         else:
             result = crane.identification.excite_valves(
@@ -231,8 +233,8 @@ def identify(
     from crane.identification.mechanics.write_identified import check_rewritable
 
     window, terms, priors = parse_window(train), parse_terms(model.term), parse_priors(model.prior)
-    min_speeds, trials = parse_values("--min-speed", min_speed), parse_trials(tried)
-    loaded = options.load(machine)
+    loaded, trials = options.load(machine), parse_trials(tried)
+    min_speeds = parse_values("--min-speed", min_speed, joint_units(loaded, "/s"))
     if priors is None:
         loaded = loaded.replace(estimation=replace(loaded.estimation, prior={}))
     if model.feasible:
@@ -374,10 +376,7 @@ def circuit(
     ] = None,
     period: Annotated[
         float | None,
-        typer.Option(
-            metavar="SECONDS",
-            help="Period over which a periodic motion is averaged, for orifices.",
-        ),
+        number_option("s", "Period over which a periodic motion is averaged, for orifices."),
     ] = None,
     validation: Validation = None,
 ) -> None:
@@ -434,8 +433,8 @@ def calibrate(
     """Fit parameters by simulation of recorded valve signals."""
     from crane.recordings.measured_recordings import recording_file
 
-    fits, window = parse_fits(fit), parse_window(train)
-    loaded = options.load(machine)
+    window, loaded = parse_window(train), options.load(machine)
+    fits = parse_fits(fit, parameter_units(loaded))
     paths, held_out = (
         [recording_file(x) for x in given or ()] for given in (recording, validation)
     )

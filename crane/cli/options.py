@@ -10,7 +10,8 @@ import typer
 
 import crane
 from crane.cli.command import OptionBlock
-from crane.cli.parsing import parse_arguments, parse_names, parse_values
+from crane.cli.option_units import number_option
+from crane.cli.parsing import parse_arguments, parse_changes, parse_names
 from crane.cli.terminal import status
 from crane.common.atomic_output import check_file_is_writable, check_folder_is_writable
 from crane.common.errors import OutputError
@@ -55,7 +56,7 @@ Frame = Annotated[
 ]
 Bandwidth = Annotated[
     float | None,
-    typer.Option(metavar="HZ", help="Passband of the filter; derived from the motion by default."),
+    number_option("Hz", "Passband of the filter; derived from the motion by default."),
 ]
 CentreOfMass = Annotated[
     str | None,
@@ -165,13 +166,14 @@ class ChangeOptions(OptionBlock):
         typer.Option(
             "--set",
             metavar="NAME=VALUE",
-            help="New value of a parameter, e.g. payload.mass=200; may be repeated.",
+            help="New value of a parameter, e.g. payload.mass=200 or supply.pressure=200bar; may "
+            "be repeated.",
         ),
     ] = None
 
-    def changed_values(self) -> dict[str, float]:
-        """Values of the changed parameters."""
-        return parse_values("--set", self.changes, "NAME=VALUE, as in payload.mass=200")
+    def changed_values(self) -> dict[str, float | str]:
+        """Values of the changed parameters, texts of those with units."""
+        return parse_changes("--set", self.changes, "NAME=VALUE, as in payload.mass=200")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,14 +184,15 @@ class ParameterOptions(ChangeOptions):
         list[str] | None,
         typer.Option(
             metavar="JOINT=VALUE",
-            help="A joint to lock and its coordinate in m or rad; may be repeated.",
+            help="A joint to lock and its coordinate in m or rad or with a unit, e.g. slew=30deg; "
+            "may be repeated.",
         ),
     ] = None
 
     def load(self, name: str) -> "crane.Machine":
         """Load a machine by its name or path."""
         return crane.load(
-            name, self.changed_values(), parse_values("--lock", self.lock), **self.assembly()
+            name, self.changed_values(), parse_changes("--lock", self.lock), **self.assembly()
         )
 
     def assembly(self) -> dict[str, Any]:
@@ -260,15 +263,11 @@ class TimeOptions(OptionBlock):
 
     panel = "Recording options"
     since: Annotated[
-        float | None,
-        typer.Option(
-            "--from", metavar="SECONDS", help="Start of the part to read, in recorded time."
-        ),
+        float | None, number_option("s", "Start of the part to read, in recorded time.", "--from")
     ] = None
-    until: Annotated[
-        float | None,
-        typer.Option("--until", metavar="SECONDS", help="End of the part to read."),
-    ] = None
+    until: Annotated[float | None, number_option("s", "End of the part to read.", "--until")] = (
+        None
+    )
 
     @property
     def span(self) -> tuple[float, float]:
@@ -317,7 +316,9 @@ class ShiftedRecordingOptions(RecordingOptions):
         recording = super().read(path, machine, needs)
         if not self.shift:
             return recording
-        return crane.recordings.shift_columns(recording, parse_values("--shift", self.shift))
+        return crane.recordings.shift_columns(
+            recording, parse_values("--shift", self.shift, lambda _: ("s",))
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

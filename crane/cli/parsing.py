@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import crane
+from crane.cli.option_units import UnitsOf
 from crane.common.errors import InputError, check_name
+from crane.common.unit_conversions import UnitError, is_quantity, parse_number
 
 if TYPE_CHECKING:
     from crane.common.samples import Array
@@ -53,6 +55,8 @@ def _parse_named(
         name = name.strip()
         try:
             parsed = parse(name, value if equals else None)
+        except UnitError as error:
+            raise InputError(f"{option} is '{text}', {error}") from None
         except (InputError, TypeError, ValueError):
             name = ""
         if not name:
@@ -63,10 +67,10 @@ def _parse_named(
     return values
 
 
-def parse_values(
+def parse_changes(
     option: str, texts: Sequence[str] | None, form: str = _VALUE_FORM
-) -> dict[str, float]:
-    """Numbers by name from texts NAME=VALUE.
+) -> dict[str, float | str]:
+    """Numbers by name from texts NAME=VALUE, those with units as texts for `crane.load`.
 
     Args:
         option: Name of the option, for errors.
@@ -78,17 +82,53 @@ def parse_values(
     """
     from crane.common.samples import as_number
 
-    values = _parse_named(option, texts, form, lambda _, value: float(value or ""))
+    def parse(_: str, value: str | None) -> float | str:
+        return str(value) if is_quantity(value or "") else float(value or "")
+
+    values = _parse_named(option, texts, form, parse)
+    return {
+        name: value if isinstance(value, str) else as_number(value, f"{option} {name}", "")
+        for name, value in values.items()
+    }
+
+
+def parse_values(
+    option: str,
+    texts: Sequence[str] | None,
+    units_of: UnitsOf,
+    form: str = _VALUE_FORM,
+) -> dict[str, float]:
+    """Numbers by name from texts NAME=VALUE, in SI units.
+
+    Args:
+        option: Name of the option, for errors.
+        texts: The texts.
+        units_of: Returns the SI units that a name may have.
+        form: The form that an error asks for.
+
+    Raises:
+        InputError: A text has another form, a name is given twice, or a number is out of range.
+    """
+    from crane.common.samples import as_number
+
+    values = _parse_named(
+        option, texts, form, lambda name, value: _named_number(name, value or "", units_of)
+    )
     return {name: as_number(value, f"{option} {name}", "") for name, value in values.items()}
 
 
-def parse_configuration(option: str, text: str | None) -> dict[str, float]:
+def parse_configuration(option: str, text: str | None, units_of: UnitsOf) -> dict[str, float]:
     """Numbers by joint from JOINT=VALUE,JOINT=VALUE.
 
     Raises:
         InputError: As `parse_values`.
     """
-    return parse_values(option, text.split(",") if text else None, CONFIGURATION_FORM)
+    return parse_values(option, text.split(",") if text else None, units_of, CONFIGURATION_FORM)
+
+
+def _named_number(name: str, text: str, units_of: UnitsOf) -> float:
+    """A plain number, of whatever it is, or one in a unit of what is named."""
+    return parse_number(text, units_of(name) if is_quantity(text) else ())
 
 
 def parse_arguments(texts: Sequence[str] | None) -> dict[str, str]:
@@ -114,22 +154,29 @@ def parse_window(text: str | None) -> tuple[float, float]:
     """
     first, colon, last = (text or ":").partition(":")
     try:
-        start, end = float(first or "-inf"), float(last or "inf")
-    except ValueError:
+        start, end = (parse_number(text, ("s",)) for text in (first or "-inf", last or "inf"))
+    except (UnitError, ValueError):
         start, end = 0.0, 0.0
     if not colon or not start < end:
         raise InputError(f"--train is '{text}', write FROM:TO in seconds, as 0:13.5")
     return start, end
 
 
-def parse_numbers(texts: Sequence[str], message: str) -> list[float]:
-    """Numbers of texts.
+def parse_numbers(texts: Sequence[str], message: str, units: Sequence[str]) -> list[float]:
+    """Numbers of texts, in SI units.
+
+    Args:
+        texts: The texts.
+        message: The error where a text is no number.
+        units: SI units that they may have.
 
     Raises:
-        InputError: A text is no number; with this message.
+        InputError: A text is no number, or one of something else.
     """
     try:
-        return [float(text) for text in texts]
+        return [parse_number(text, units) for text in texts]
+    except UnitError as error:
+        raise InputError(f"{message}, {error}") from None
     except ValueError:
         raise InputError(message) from None
 
@@ -141,7 +188,7 @@ def parse_gravity(text: str) -> tuple[float, ...]:
         InputError: The text has another form.
     """
     message = f"--gravity is '{text}', write X,Y,Z in m/s2, as 0,0,-1.62"
-    numbers = parse_numbers(text.split(","), message)
+    numbers = parse_numbers(text.split(","), message, ("m/s2",))
     if len(numbers) != 3 or not all(map(isfinite, numbers)):
         raise InputError(message)
     return tuple(numbers)
@@ -153,7 +200,8 @@ def parse_slew_angles(text: str) -> list[float]:
     Raises:
         InputError: The text has another form, or there are too many angles.
     """
-    angles = parse_numbers(text.split(","), f"--slew is '{text}', write degrees, as 0,45,90")
+    message = f"--slew is '{text}', write degrees, as 0,45,90"
+    angles = parse_numbers(text.split(","), message, ("deg",))
     if len(angles) > _MAX_SLEW_ANGLES:
         raise InputError(
             f"--slew has {len(angles)} angles, a page has room for {_MAX_SLEW_ANGLES}"
@@ -161,21 +209,26 @@ def parse_slew_angles(text: str) -> list[float]:
     return angles
 
 
-def parse_fits(texts: Sequence[str]) -> dict[str, object]:
+def parse_fits(texts: Sequence[str], units_of: UnitsOf) -> dict[str, object]:
     """What is fitted, by name: None, an initial guess, or initial guess, lower and upper bound.
+
+    Args:
+        texts: The texts.
+        units_of: Returns the SI units that a name may have.
 
     Raises:
         InputError: A text has another form, or a name is given twice.
     """
 
-    def parse(_: str, text: str | None) -> object:
+    def parse(name: str, text: str | None) -> object:
         if text is None:
             return None
         start, comma, bounds = text.partition(",")
-        if not comma:
-            return float(start)
-        low, _, high = bounds.partition("~")
-        return float(start), float(low), float(high)
+        words = [start, *(bounds.split("~") if comma else ())]
+        numbers = [_named_number(name, word, units_of) for word in words]
+        if len(numbers) == 2:
+            raise ValueError
+        return tuple(numbers) if comma else numbers[0]
 
     return _parse_named("--fit", texts, _FIT_FORM, parse)
 
@@ -229,13 +282,20 @@ def parse_trials(texts: Sequence[str] | None) -> "dict[str, list[float | Paramet
 
     def parse(name: str, values: str | None) -> "list[float | ParameterPrior]":
         words = (values or "").split(",")
-        return [float(x) if name == "bandwidth" else ParameterPrior.parse(x) for x in words]
+        return [
+            parse_number(x, ("Hz",)) if name == "bandwidth" else ParameterPrior.parse(x)
+            for x in words
+        ]
 
     return _parse_named("--try", texts, _TRIAL_FORM, parse)
 
 
-def parse_grids(texts: Sequence[str] | None) -> "dict[str, Array]":
+def parse_grids(texts: Sequence[str] | None, units_of: UnitsOf) -> "dict[str, Array]":
     """Values by parameter from NAME=start:stop:count.
+
+    Args:
+        texts: The texts.
+        units_of: Returns the SI units that a parameter may have.
 
     Raises:
         InputError: A text has another form, or a name is given twice.
@@ -248,7 +308,7 @@ def parse_grids(texts: Sequence[str] | None) -> "dict[str, Array]":
         words = values.split(":")
         if len(words) != 3:
             raise InputError(f"--vary {text}: '{values}' is no grid, give {_GRID_FORM}")
-        start, stop = _finite_numbers(text, words[:2], _GRID_FORM)
+        start, stop = _finite_numbers(text, words[:2], _GRID_FORM, units_of)
         count = int(words[2]) if words[2].strip().isdecimal() else 0
         if not 1 <= count <= _MAX_GRID_VALUES:
             raise InputError(
@@ -262,8 +322,12 @@ def parse_grids(texts: Sequence[str] | None) -> "dict[str, Array]":
     return _parse_varied(texts, parse)
 
 
-def parse_ranges(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
+def parse_ranges(texts: Sequence[str], units_of: UnitsOf) -> dict[str, tuple[float, float]]:
     """Ends of ranges by parameter from NAME=low~high.
+
+    Args:
+        texts: The texts.
+        units_of: Returns the SI units that a parameter may have.
 
     Raises:
         InputError: A text has another form, or a name is given twice.
@@ -275,7 +339,7 @@ def parse_ranges(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
         words = values.split("~")
         if len(words) != 2:
             raise InputError(f"--vary {text}: a range has two ends, give {_RANGE_FORM}")
-        low, high = _finite_numbers(text, words, _RANGE_FORM)
+        low, high = _finite_numbers(text, words, _RANGE_FORM, units_of)
         if not low < high:
             raise InputError(f"--vary {text}: {low:g} is not below {high:g}, give {_RANGE_FORM}")
         return low, high
@@ -297,9 +361,10 @@ def _parse_varied(
     return {name: parse(f"{name}={values}", values) for name, values in varied.items()}
 
 
-def _finite_numbers(text: str, words: list[str], form: str) -> list[float]:
+def _finite_numbers(text: str, words: list[str], form: str, units_of: UnitsOf) -> list[float]:
     message = f"--vary {text}: '{':'.join(words)}' are no numbers, give {form}"
-    numbers = parse_numbers(words, message)
+    units = units_of(text.partition("=")[0]) if any(map(is_quantity, words)) else ()
+    numbers = parse_numbers(words, message, units)
     if not all(map(isfinite, numbers)):
         raise InputError(message)
     return numbers
@@ -322,7 +387,9 @@ def parse_load(text: str) -> "crane.Wrench":
         times, force, moment = _read_wrenches(Path(wrench))
         return crane.Wrench(frame, force, moment, times, axes)
     message = f"{what}: give 3 or 6 numbers with commas, or a CSV file"
-    numbers = parse_numbers(wrench.split(","), message)
+    words = wrench.split(",")
+    numbers = parse_numbers(words[:3], message, ("N",))
+    numbers += parse_numbers(words[3:], message, ("N m",))
     if len(numbers) not in (3, 6):
         raise InputError(message)
     return crane.Wrench(frame, numbers[:3], numbers[3:] or (0.0, 0.0, 0.0), axes=axes)

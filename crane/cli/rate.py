@@ -11,6 +11,7 @@ import typer
 
 import crane
 from crane.cli.command import OptionBlock, command, refuse_options
+from crane.cli.option_units import number_option
 from crane.cli.options import (
     Bucket,
     Configuration,
@@ -31,9 +32,7 @@ from crane.cli.terminal import status
 from crane.common.errors import CraneWarning, InputError
 from crane.common.result import Result
 
-ChartStep = Annotated[
-    float | None, typer.Option("--step", metavar="M", help="Distance of grid points in m.")
-]
+ChartStep = Annotated[float | None, number_option("m", "Distance of grid points in m.", "--step")]
 
 
 @command()
@@ -101,9 +100,8 @@ def breakout(
     loaded = options.load(machine)
     vector: str | list[float] | None = direction
     if direction is not None and "," in direction:
-        vector = parse_numbers(
-            direction.split(","), f"--direction {direction} is no X,Y,Z, give three numbers"
-        )
+        message = f"--direction {direction} is no X,Y,Z, give three numbers"
+        vector = parse_numbers(direction.split(","), message, ("",))
     result: Result
     with status("computing forces"):
         if vector is None:
@@ -123,17 +121,13 @@ class RatingOptions(OptionBlock):
     rule: Rule = "none"
     hydraulic: Annotated[
         float | None,
-        typer.Option(
-            metavar="FRACTION",
-            help="Rated fraction of the hydraulic lifting load, instead of that of the rule.",
+        number_option(
+            "", "Rated fraction of the hydraulic lifting load, instead of that of the rule."
         ),
     ] = None
     tipping: Annotated[
         float | None,
-        typer.Option(
-            metavar="FRACTION",
-            help="Rated fraction of the tipping load, instead of that of the rule.",
-        ),
+        number_option("", "Rated fraction of the tipping load, instead of that of the rule."),
     ] = None
     raising: Annotated[
         list[str] | None,
@@ -152,10 +146,7 @@ class RatingOptions(OptionBlock):
         ),
     ] = None
     slope: Annotated[
-        float,
-        typer.Option(
-            metavar="DEG", help="Slope of the ground in the most unfavourable direction."
-        ),
+        float, number_option("deg", "Slope of the ground in the most unfavourable direction.")
     ] = 0.0
     friction: Annotated[
         bool,
@@ -199,9 +190,8 @@ def capacity(
     step: ChartStep = None,
     torque: Annotated[
         float | None,
-        typer.Option(
-            metavar="RADIUS",
-            help="Also compute lifting torques at this radius in m, and the slewing torque.",
+        number_option(
+            "m", "Also compute lifting torques at this radius in m, and the slewing torque."
         ),
     ] = None,
     by: OptionalParameters = None,
@@ -278,8 +268,7 @@ def power(
         ),
     ] = None,
     moved_mass: Annotated[
-        float | None,
-        typer.Option(metavar="KG", help="Mass that each run moves, for the work per kg."),
+        float | None, number_option("kg", "Mass that each run moves, for the work per kg.")
     ] = None,
 ) -> None:
     """Compute the power balance of a hydraulic run.

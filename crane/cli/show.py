@@ -7,6 +7,7 @@ import typer
 
 import crane
 from crane.cli.command import command, refuse_options
+from crane.cli.option_units import joint_units
 from crane.cli.options import (
     Configuration,
     MachineName,
@@ -196,7 +197,7 @@ def active_coordinates(machine: "crane.Machine", at: str | None) -> "Array":
         InputError: --at has another form, or names something that is no active joint.
     """
     q_a = machine.home[machine.closure.active].copy()
-    for joint, value in parse_configuration("--at", at).items():
+    for joint, value in parse_configuration("--at", at, joint_units(machine)).items():
         check_name(joint, machine.active, f"--at: '{joint}' is no active joint")
         q_a[machine.active.index(joint)] = value
     return q_a

@@ -12,6 +12,7 @@ import typer
 
 import crane
 from crane.cli.command import OptionBlock, command, refuse_options
+from crane.cli.option_units import joint_units, number_option, parameter_units
 from crane.cli.options import (
     ChangeOptions,
     Configuration,
@@ -55,10 +56,9 @@ ControllerName = Annotated[
     ),
 ]
 Duration = Annotated[
-    float | None,
-    typer.Option(metavar="SECONDS", help="Duration; that of the task or path by default."),
+    float | None, number_option("s", "Duration; that of the task or path by default.")
 ]
-Step = Annotated[float, typer.Option(metavar="SECONDS", help="Step of the recorded samples.")]
+Step = Annotated[float, number_option("s", "Step of the recorded samples.")]
 
 
 @command()
@@ -319,7 +319,8 @@ def sway(
     ] = 0.2,
 ) -> None:
     """Compare methods that suppress the sway of a load."""
-    masses = parse_numbers(payload.split(","), f"--payload {payload}: give masses as 0,200,500")
+    message = f"--payload {payload}: give masses as 0,200,500"
+    masses = parse_numbers(payload.split(","), message, ("kg",))
     with progress_bar("simulating") as progress:
         result = crane.studies.sway_study(
             machine, task, masses, damping, options.changed_values(), progress
@@ -357,9 +358,10 @@ def modes(
     ] = None,
 ) -> None:
     """Compute frequencies, damping and shapes of modes."""
-    axes = parse_grids(vary)
     loaded = options.load(machine)
-    q_a, v_a = parse_configuration("--at", at), parse_configuration("--velocity", velocity)
+    axes = parse_grids(vary, parameter_units(loaded))
+    q_a = parse_configuration("--at", at, joint_units(loaded))
+    v_a = parse_configuration("--velocity", velocity, joint_units(loaded, "/s"))
     with status("linearizing"):
         model = crane.linearize(
             loaded, q_a, velocity=v_a, drive=drive, outputs=parse_names(outputs)

@@ -11,6 +11,7 @@ import numpy as np
 from crane.closure.active_joint_selection import null_space_basis
 from crane.closure.compiled_closure import CompiledClosure, ContinuationCursor
 from crane.closure.constraint_structure import ConstraintStructure
+from crane.closure.continuation_errors import ClosedConfiguration
 from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
 from crane.closure.newton_continuation import NewtonContinuation
@@ -34,6 +35,33 @@ _MAX_EXTRAPOLATION_ERROR = 0.5
 
 # samples worth sorting: number, and mean distance of neighbours as a fraction of the range
 _MIN_SAMPLES_TO_SORT, _FAR_SAMPLE_DISTANCE = 100, 0.1
+
+
+class _DistantBranchPart:
+    """A branch beyond change points: the last configuration there, and machine code to go on.
+
+    Args:
+        home: (nq,) home configuration.
+
+    Attributes:
+        configuration: Configuration from which it goes on, None at first.
+        code: Machine code for the signs of its determinants.
+        cursor: Cursor of this code; None where the signs are those at home.
+        q: (nq,) configuration that `follow` reached last.
+    """
+
+    code: CompiledClosure
+
+    def __init__(self, home: Array):
+        self.configuration: ClosedConfiguration | None = None
+        self.cursor: ContinuationCursor | None = None
+        self.q = home.copy()
+
+    def follow(self, target: Array) -> bool:
+        """Close the loops at a target (n,) next to the last; returns whether this succeeds."""
+        if self.cursor is None:
+            return False
+        return self.code.follow_targets(self.cursor, target[None], self.q[None]) == 1
 
 
 class BranchSolver:
@@ -67,7 +95,8 @@ class BranchSolver:
         self.home.flags.writeable = False
         self._with_machine_code = with_machine_code
         self.__dict__.pop("_machine_code", None)  # of the closure that this one is a copy of
-        self.__dict__.pop("_cursors", None)
+        for name in ("_cursors", "_beyond", "_codes_beyond"):
+            self.__dict__.pop(name, None)
 
     @cached_property
     def _machine_code(self) -> CompiledClosure | None:
@@ -100,6 +129,15 @@ class BranchSolver:
     def _cursors(self) -> ThreadLocal[ContinuationCursor]:
         return ThreadLocal(self.compiled_closure.new_cursor)
 
+    @cached_property
+    def _beyond(self) -> ThreadLocal["_DistantBranchPart"]:
+        return ThreadLocal(lambda: _DistantBranchPart(self.home))
+
+    @cached_property
+    def _codes_beyond(self) -> dict[bytes, CompiledClosure]:
+        """Machine code beyond change points, by the signs of determinants there."""
+        return {}
+
     def _solve_stack(self, targets: Array, guess: Array | None, stacked: bool, out: Array) -> None:
         """Close the loops at targets (N, n) into out (N, nq).
 
@@ -113,7 +151,8 @@ class BranchSolver:
         if self.is_compiled:
             cursor = self._cursors.value
             if guess is not None and not self.compiled_closure.start_cursor_at(cursor, guess):
-                cursor.start_from(nearest(guess))
+                cursor.start_from(known := nearest(guess))
+                self._go_beyond(known)
             self._follow_stack(cursor, targets, out, stacked)
             return
         solution = self.continuation.home if guess is None else nearest(guess)
@@ -158,7 +197,9 @@ class BranchSolver:
         Returns:
             q (nq,).
         """
-        home, n = self.continuation.home, _CONTINUATION_STEPS
+        home, n, beyond = self.continuation.home, _CONTINUATION_STEPS, self._beyond.value
+        if beyond.follow(target):
+            return beyond.q.copy()
         line = home.q_a + np.linspace(0, 1, n + 1)[1:, None] * (target - home.q_a)
         line[-1] = target
         out = np.empty((n, len(home.q)))
@@ -166,9 +207,34 @@ class BranchSolver:
             cursor.start_from(home)
             if self.compiled_closure.follow_targets(cursor, waypoints, out) == len(waypoints):
                 return out[len(waypoints) - 1]
-        solution = self.continuation.continue_to(target, home, sample)
+        solution = self.continuation.continue_to(target, beyond.configuration or home, sample)
         cursor.start_from(solution)
+        self._go_beyond(solution)
         return solution.q
+
+    def neighbours(self, q: Array) -> list[Array]:
+        """Configurations about one in a change point that `continue_from_home` returned.
+
+        Empty for others. See `crane.closure.change_points.interpolate_limit`.
+        """
+        last = self._beyond.value.configuration
+        return [node.q for node in last.neighbours] if last is not None and last.q is q else []
+
+    def _go_beyond(self, solution: ClosedConfiguration) -> None:
+        """Continue from a configuration with machine code for the signs of its determinants."""
+        beyond, code = self._beyond.value, self.compiled_closure
+        changes = np.sign(self.continuation.determinants(solution))
+        beyond.configuration, beyond.cursor = solution, None
+        if not (changes < 0).any() or not changes.all():
+            return
+        key = changes.tobytes()
+        if key not in self._codes_beyond:
+            home = self.continuation.home
+            scale, signs = self.continuation.rounding_scale(home.q), code.signs * changes
+            self._codes_beyond[key] = CompiledClosure(*self._parts, home, scale, signs)
+        beyond.code = self._codes_beyond[key]
+        beyond.cursor = beyond.code.new_cursor()
+        beyond.cursor.start_from(solution)
 
     def is_on_branch(self, q: Array) -> bool:
         """Whether a closed configuration (nq,) lies on the branch of home."""

@@ -151,6 +151,7 @@ class Closure(BranchSolver, OneLineRepr):
             return None
         other = copy.copy(self)
         other.__dict__.pop("_cursors", None)
+        other.__dict__.pop("_beyond", None)
         return other
 
     def with_perturbed_model(
@@ -225,9 +226,10 @@ class Closure(BranchSolver, OneLineRepr):
         Newton's method starts from the last configuration that this thread solved (or the guess),
         in one step where that stays on the branch; else from home, along the straight line of q_A,
         in steps that are halved where Newton's method converges slowly or would leave the branch.
-        A stack is followed like a path; a stack of distant samples is sorted first. The result is
-        closed to rounding and on the branch of home, independently of earlier calls, or an error
-        is raised.
+        A stack is followed like a path; a stack of distant samples is sorted first. Change points,
+        where several branches meet, are passed in the direction of the motion, with a warning at
+        the first one. The result is closed to rounding and on the branch of home, independently of
+        earlier calls, or an error is raised.
 
         Args:
             q_a: (n,) or (N, n) active coordinates [m], [rad]. Limits are not checked here.
@@ -239,7 +241,7 @@ class Closure(BranchSolver, OneLineRepr):
         Raises:
             InputError: Wrong shape or not finite.
             OutOfReachError: No configuration closes the loops.
-            SingularConfigurationError: The passive joints are not determined there.
+            SingularConfigurationError: The branch ends there, at a dead centre.
             WrongBranchError: The guess belongs to another branch.
         """
         targets = as_samples(q_a, len(self.active), "q_a", self.active_names)

@@ -8,6 +8,9 @@ import numpy as np
 from crane.codegen import Layout, Program
 
 _MAX_NEWTON_ITERATIONS = 8  # Newton's method converges quadratically
+# least determinant, as a share of that at home, over the correction of a prediction, below which
+# another branch may be as near
+_MIN_REGULARITY = 0.02
 
 
 def add_closure_routines(
@@ -89,6 +92,8 @@ def _add_follow(program: Program, nq: int, n: int, wraps_rotations: bool) -> Non
                 r.return_value(i)
             r.call("distance", r.constants, predicted, guess, correction)
             with r.if_then(~(correction["all"] <= move * 0.5 + 0.02)):
+                r.return_value(i)
+            with r.if_then(~(correction["all"] * _MIN_REGULARITY < result["determinant"])):
                 r.return_value(i)
             if wraps_rotations:
                 r.copy(predicted.element_pointer("q"), guess, nq)

@@ -9,6 +9,7 @@ import numpy as np
 
 from crane.closure.closure_routines import add_closure_routines
 from crane.closure.constraint_structure import ConstraintStructure
+from crane.closure.continuation_errors import ClosedConfiguration
 from crane.closure.coordinates import Indices
 from crane.closure.kinematics_formulas import (
     FormulaConstants,
@@ -19,7 +20,6 @@ from crane.closure.kinematics_formulas import (
 )
 from crane.closure.loop_equations import Cluster, LoopEquations, find_clusters
 from crane.closure.loop_formulas import LoopFormulas
-from crane.closure.newton_continuation import ClosedConfiguration
 from crane.closure.predictor_formulas import PredictorFormulas
 from crane.codegen import Layout, LayoutView, Program, Scalar, Tape, max_abs, maximum
 from crane.codegen.symbolic import minimum
@@ -27,6 +27,7 @@ from crane.common.samples import Array
 
 # Scaled values: rad and characteristic length, as in `NewtonContinuation`.
 _LARGE_GAMMA = 1e3  # above this entry of gamma, `NewtonContinuation` checks singularity
+_MIN_DETERMINANT = 1e-9  # share of that at home below which gamma is left to it as well
 _NEARLY_CLOSED_TOLERANCE = 1e-6  # residual of a guess that counts as closed
 
 
@@ -77,12 +78,14 @@ class CompiledClosure:
         passive: Columns of the other joints.
         home: The home configuration, whose branch is followed.
         rounding_scale: See `NewtonContinuation.rounding_scale`.
+        signs: See the attribute; those at home if not given.
 
     Attributes:
         geometry: Geometry that the formulas were traced from.
         programs: Further programs of this machine, by what they depend on.
         tolerances: (3,) scaled residual that counts as rounding; that counts as closed if it no
             longer decreases; scaled step whose square is rounding.
+        signs: Signs of the block determinants on the branch, over their order of magnitude.
         follow_address: Address of the function `follow_targets`, for other machine code.
         close_address: Address of the function `close`; of `project` with partly active rotations,
             for the states of a simulation.
@@ -96,6 +99,7 @@ class CompiledClosure:
         passive: Indices,
         home: ClosedConfiguration,
         rounding_scale: float,
+        signs: Array | None = None,
     ):
         self.geometry = tree_geometry(equations)
         self._equations, self._structure = equations, structure
@@ -107,7 +111,7 @@ class CompiledClosure:
         self._predictor = PredictorFormulas(
             self.geometry, active, passive, self._gamma_entry_pairs
         )
-        signs = self._determinant_signs(home)
+        signs = self.signs = self._determinant_signs(home) if signs is None else signs
         key = self._cache_key(signs)
         shared = _SHARED_CODE.get(key)
         if shared is None:
@@ -314,8 +318,8 @@ class CompiledClosure:
 
         "regular" is positive on the branch of home away from singular configurations, with
         redundant equations closed; "largest_gamma" is the largest entry of gamma (rows of passive
-        joints); "determinant" is the least determinant of a block, with its sign on the branch of
-        home.
+        joints); "determinant" is the least determinant of a block, about 1 at home, with its sign
+        on the branch of home.
         """
         q, kinematics, loops = self.trace_kinematics(Tape(), 0, 1)
         steps = loops.newton_step(holds_coordinates)
@@ -327,10 +331,12 @@ class CompiledClosure:
             largest_gamma - _LARGE_GAMMA,
             loops.largest_residual(redundant=True) - self._structure.redundancy.tolerance,
         )
-        least_determinant: Scalar = 1.0
-        for sign, determinant in zip(signs, loops.gamma_and_determinants[1], strict=True):
-            least_determinant = minimum(least_determinant, float(sign) * determinant)
-        worst = maximum(worst, -1.0 * least_determinant)
+        shares = [
+            float(sign) * determinant
+            for sign, determinant in zip(signs, loops.gamma_and_determinants[1], strict=True)
+        ]
+        least_determinant = minimum(*shares) if shares else 1.0
+        worst = maximum(worst, _MIN_DETERMINANT - least_determinant)
         for alignment in loops.alignments:
             worst = maximum(worst, -1.0 * alignment)
         program.add_formula(
@@ -380,12 +386,13 @@ class CompiledClosure:
         program.add_formula("gamma", 1, [entry for row in rows for entry in row])
 
     def _determinant_signs(self, home: ClosedConfiguration) -> Array:
-        """Signs of the block determinants on the branch of home."""
+        """Signs of the block determinants on the branch of home, over their order of magnitude."""
         blocks = (
             home.jacobian[np.ix_(rows, self._passive_columns[columns])]
             for rows, columns in self._structure.blocks
         )
-        return np.array([np.linalg.slogdet(block)[0] for block in blocks])
+        signs_and_logarithms = [np.linalg.slogdet(block) for block in blocks]
+        return np.array([sign * 2.0 ** -round(x / np.log(2)) for sign, x in signs_and_logarithms])
 
     def inverse_characteristic_length(self, tape: Tape) -> Scalar:
         """One over the characteristic length, from the geometry constants as first argument."""

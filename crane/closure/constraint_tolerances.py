@@ -232,8 +232,8 @@ class ExactConstraints:
         reduces motions that do not exist to rounding. Groups of joints that no equation connects
         step at once, each as far as it would alone, so that the number of steps is that of the
         group with the most directions. Joints that N moves and that stay fixed in all remaining
-        motions are locked. At a bifurcation N has more columns than the mobility, too, but all its
-        joints move.
+        motions are locked. At a change point N has more columns than the mobility, too, but all
+        its joints move.
 
         Args:
             q: (nq,) closed configuration.

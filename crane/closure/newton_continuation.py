@@ -1,46 +1,43 @@
 """Newton's method and continuation along one branch."""
 
-from dataclasses import dataclass, replace
+import warnings
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from crane.closure.change_points import (
+    NEIGHBOUR_PLACES,
+    NEIGHBOUR_WEIGHTS,
+    is_smooth_passage,
+)
 from crane.closure.constraint_structure import ConstraintStructure
+from crane.closure.continuation_errors import (
+    CLOSED_TOLERANCE,
+    SINGULAR_TOLERANCE,
+    ClosedConfiguration,
+    ContinuationErrors,
+)
 from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
 from crane.common.errors import (
+    ClosureError,
+    CraneWarning,
     MechanismError,
     OutOfReachError,
-    SingularConfigurationError,
-    WrongBranchError,
 )
 from crane.common.samples import Array, solve_linear
 
 # Scaled values (rad, characteristic length): the same for machines of any size.
-_CLOSED_TOLERANCE = 1e-12  # residual of a closed loop
-# relative least singular value of a singular block
-_SINGULAR_TOLERANCE = 1e-6
 _MIN_STEP = 2.0**-24  # smallest step of the continuation, as a fraction of the line
+# least singular value, as a share of that at home, over the correction of a prediction
+_MIN_REGULARITY = 2.0
+_CHANGE_POINT_ZONE = 1e-5  # least singular value, as a share of that at home, to which steps lead
+_CHANGE_POINT_TOLERANCE = 1e-11  # relative least singular value below which gamma has no digits
+_MIN_PASSAGE = 1e-4  # scaled distance of the two sides of a change point
+_INTERPOLATION_STEP = 4e-3  # scaled distance of the neighbours of a change point
 
 
-@dataclass(frozen=True, eq=False)
-class ClosedConfiguration:
-    """A closed configuration with what the next continuation step needs.
-
-    Attributes:
-        q: (nq,).
-        q_a: (n,) its active coordinates.
-        jacobian: (m, nv) of the independent equations, see `LoopEquations.evaluate_scaled`.
-        passive_gamma: (m, n) passive rows of gamma.
-    """
-
-    q: Array
-    q_a: Array
-    jacobian: Array
-    passive_gamma: Array
-
-
-class NewtonContinuation:
+class NewtonContinuation(ContinuationErrors):
     """The configurations that are reached from home without passing a singular one.
 
     Args:
@@ -76,19 +73,9 @@ class NewtonContinuation:
         if home is None:
             raise MechanismError("the home configuration does not close, change 'home'", "home")
         self.home = home
-        self._home_signs = self._determinant_signs(home)
-
-    def rounding_scale(self, q: Array) -> float:
-        """Factor on rounding errors at a configuration (nq,): its largest scaled dimension."""
-        return max(
-            1.0,
-            float(
-                np.abs(q[self._equations.coordinates.is_translation]).max(
-                    initial=self._largest_dimension
-                )
-            )
-            / self._equations.characteristic_length,
-        )
+        self._home_determinants = self._block_determinants(home)
+        self._home_regularity = max(self._most_singular_block(home.jacobian)[0], 1e-300)
+        self._has_warned = False
 
     def solve_newton(
         self, q: Array, q_a: Array | None, max_iterations: int
@@ -111,7 +98,7 @@ class NewtonContinuation:
             residual = np.abs(phi).max(initial=0.0)
             at_rounding = residual <= 4e-15 * rounding_scale
             stalled = (
-                residual <= 0.1 * _CLOSED_TOLERANCE * rounding_scale
+                residual <= 0.1 * CLOSED_TOLERANCE * rounding_scale
                 and residual > 0.25 * previous_residual
             )
             try:
@@ -177,6 +164,8 @@ class NewtonContinuation:
         last_reached = known
         for start in starts:
             solution, last_reached = self._follow_line(start, target)
+            if solution is None:
+                solution = self._interpolate_at(last_reached, target)
             if solution is not None:
                 self._check_solution(solution, sample)
                 return solution
@@ -191,10 +180,10 @@ class NewtonContinuation:
         solution = self.solve_newton(q, q[self._active_columns], 10)
         if solution is None:
             return self.home
-        changed_signs = self._changed_signs(solution)
-        if changed_signs.any():
-            rows = [block for group, _ in self._blocks for block in group][changed_signs.argmax()]
-            raise self._wrong_branch_error(self._format_loop_names(np.ravel(rows)), solution)
+        is_changed = self.determinants(solution) < 0
+        if is_changed.any() and not self._is_beyond_change_points(solution):
+            loops = self._format_loop_names(self._block_rows(int(is_changed.argmax())))
+            raise self._wrong_branch_error(loops, solution)
         opposed_loop = self._equations.find_opposed_loop(solution.q)
         if opposed_loop is not None:
             raise self._wrong_branch_error(f"loop '{opposed_loop}'", solution)
@@ -242,6 +231,8 @@ class NewtonContinuation:
         except np.linalg.LinAlgError:
             raise self.singularity_error(jacobian, q_a) from None
         self.check_singularity(jacobian, solution, q_a)
+        if self._most_singular_block(jacobian)[0] < _CHANGE_POINT_TOLERANCE:
+            raise self.singularity_error(jacobian, q_a)
         return solution
 
     def check_singularity(
@@ -259,50 +250,25 @@ class NewtonContinuation:
             SingularConfigurationError: J_P is singular.
         """
         if (
-            np.abs(solution).max(initial=0.0) > 1e-3 / _SINGULAR_TOLERANCE
-            and self._most_singular_block(jacobian)[0] < _SINGULAR_TOLERANCE
+            np.abs(solution).max(initial=0.0) > 1e-3 / SINGULAR_TOLERANCE
+            and self._most_singular_block(jacobian)[0] < SINGULAR_TOLERANCE
         ):
             raise self.singularity_error(jacobian, q_a, sample)
 
-    def singularity_error(
-        self, jacobian: Array, q_a: Array, sample: str = ""
-    ) -> SingularConfigurationError:
-        """The error for a configuration with a singular J_P."""
-        loops = self._format_loop_names(self._most_singular_block(jacobian)[1])
-        return SingularConfigurationError(
-            f"{loops} is at the edge of its branch at {self._format_values(q_a)}{sample}, where "
-            "the passive joints are undetermined: stay away from it"
-        )
-
-    def _most_singular_block(self, jacobian: Array) -> tuple[float, Indices]:
-        """Relative least singular value and rows of the most singular block.
-
-        Whole rows set the scale: a single equation for a single joint is singular where that joint
-        loses its lever while others keep theirs.
-        """
-        least_ratio, rows = 1.0, np.zeros(0, dtype=np.intp)
-        for block_rows, block_columns in self._structure.blocks:
-            values = np.linalg.svd(
-                jacobian[np.ix_(block_rows, self._passive_columns[block_columns])],
-                compute_uv=False,
-            )
-            scale = np.abs(jacobian[block_rows]).max()
-            ratio = values[-1] / scale if scale > 0 else 0.0
-            if ratio <= least_ratio:
-                least_ratio, rows = float(ratio), block_rows
-        return least_ratio, rows
-
-    def _determinant_signs(self, solution: ClosedConfiguration) -> Array:
-        """Sign of every block's determinant: constant on a branch."""
-        signs = [
-            np.linalg.slogdet(solution.jacobian[rows, self._passive_columns[columns]])[0]
+    def _block_determinants(self, solution: ClosedConfiguration) -> Array:
+        blocks = [
+            np.linalg.det(solution.jacobian[rows, self._passive_columns[columns]])
             for rows, columns in self._blocks
         ]
-        return np.concatenate(signs) if signs else np.zeros(0)
+        return np.concatenate(blocks) if blocks else np.zeros(0)
 
-    def _changed_signs(self, solution: ClosedConfiguration) -> NDArray[np.bool_]:
-        """Which blocks have a determinant of another sign than at home."""
-        return np.asarray(self._determinant_signs(solution) * self._home_signs < 0)
+    def determinants(self, solution: ClosedConfiguration) -> Array:
+        """Determinant of every block as a share of that at home: of constant sign on a branch."""
+        return np.asarray(self._block_determinants(solution) / self._home_determinants)
+
+    def _block_rows(self, block: int) -> Indices:
+        """Rows of a block, by its place in `determinants`."""
+        return np.ravel([rows for group, _ in self._blocks for rows in group][block])
 
     def _follow_line(
         self, start: ClosedConfiguration, target: Array
@@ -332,7 +298,11 @@ class NewtonContinuation:
     def _predict_and_correct(
         self, current: ClosedConfiguration, q_a: Array, max_iterations: int
     ) -> ClosedConfiguration | None:
-        """The configuration at q_A next to the current one, None if the branch changes."""
+        """The configuration at q_A next to the current one, None if the branch changes.
+
+        It may pass a change point. Where the least singular value is smaller than the error of the
+        prediction, another branch may be as near.
+        """
         passive, units = self._passive_columns, self._coordinate_units
         active_step = (q_a - current.q_a) / units[self._active_columns]
         gamma = current.passive_gamma / self._gamma_units
@@ -345,13 +315,100 @@ class NewtonContinuation:
             return None
         predicted = self._equations.displace(current.q, self._all_columns, step)
         corrected = self.solve_newton(predicted, q_a, max_iterations)
-        if corrected is None or self._changed_signs(corrected).any():
+        if corrected is None:
             return None
         correction = np.abs((corrected.q - predicted)[passive] / units[passive]).max(initial=0.0)
         if correction > 0.02 + 0.5 * predicted_step:
             return None
+        if not self._continues(current, corrected, float(correction)):
+            return None
         q = self._equations.coordinates.wrap_rotations(corrected.q, self._passive_columns)
         return replace(corrected, q=q)
+
+    def _continues(
+        self, current: ClosedConfiguration, corrected: ClosedConfiguration, correction: float
+    ) -> bool:
+        """Whether a configuration is on the branch of the current one; see above."""
+        before, determinants = self.determinants(current), self.determinants(corrected)
+        least = self._most_singular_block(corrected.jacobian)[0]
+        regularity = least / self._home_regularity
+        if regularity < _CHANGE_POINT_ZONE and self._is_bounded(current):
+            return False
+        if least < SINGULAR_TOLERANCE:  # the end of the branch itself
+            return True
+        if (before * determinants < 0).any():
+            return self._passes_change_point(current, corrected)
+        return bool(regularity > _MIN_REGULARITY * correction)
+
+    def _is_bounded(self, solution: ClosedConfiguration) -> bool:
+        """Whether gamma is that of a motion through a change point, not towards a dead centre."""
+        largest = np.abs(solution.passive_gamma / self._gamma_units).max(initial=0.0)
+        return bool(largest < 1e-3 / SINGULAR_TOLERANCE)
+
+    def _residual(self, q: Array) -> Array:
+        return self._equations.evaluate_scaled(q)[0][self._structure.independent_rows]
+
+    def _slope(self, at: ClosedConfiguration, active_rate: Array) -> Array:
+        """Derivative (nq,) of the configuration along a rate (n,) of the active coordinates."""
+        rate = active_rate / self._coordinate_units[self._active_columns]
+        step = self._displacement_of(at.q, at.passive_gamma / self._gamma_units, rate)
+        return self._equations.displace(at.q, self._all_columns, step) - at.q
+
+    def _passes_change_point(self, one: ClosedConfiguration, other: ClosedConfiguration) -> bool:
+        """Whether a smooth motion joins two sides of a change point; warns of the first one."""
+        step = other.q_a - one.q_a
+        distance = np.abs((other.q - one.q) / self._coordinate_units).max()
+        before, behind = ((x.q, self._slope(x, step)) for x in (one, other))
+        # sides of a dead centre are on one smooth motion, too, if they are near enough
+        if distance < _MIN_PASSAGE or not is_smooth_passage(before, behind, self._residual):
+            return False
+        if not self._has_warned:
+            self._has_warned = True
+            first, last = self.determinants(one), self.determinants(other)
+            block = int((first * last).argmin())
+            place = one.q_a + step * first[block] / (first[block] - last[block])
+            warnings.warn(
+                f"{self._format_loop_names(self._block_rows(block))} passes a change point at "
+                f"{self._format_values(place)}, from which it could go on in several ways: here "
+                "and at others it goes on as it moves",
+                CraneWarning,
+                stacklevel=2,
+            )
+        return True
+
+    def _is_beyond_change_points(self, solution: ClosedConfiguration) -> bool:
+        """Whether the way from home to a configuration leads through change points only."""
+        try:
+            found = self.continue_to(solution.q_a, self.home)
+        except ClosureError:
+            return False
+        return bool(np.abs((found.q - solution.q) / self._coordinate_units).max() < 1e-6)
+
+    def _interpolate_at(
+        self, current: ClosedConfiguration, target: Array
+    ) -> ClosedConfiguration | None:
+        """The configuration at a target in a change point, from neighbours on both sides.
+
+        None if the target is not there.
+        """
+        direction = target - current.q_a
+        slope = np.abs(self._slope(current, direction) / self._coordinate_units).max(initial=0.0)
+        if not 0.0 < slope < _INTERPOLATION_STEP:
+            return None
+        direction *= _INTERPOLATION_STEP / slope
+        nodes: list[ClosedConfiguration] = []
+        for place in NEIGHBOUR_PLACES:
+            known = nodes[-1] if nodes else current
+            node, _ = self._follow_line(known, target + place * direction)
+            if node is None:
+                return None
+            nodes.append(node)
+        q = NEIGHBOUR_WEIGHTS @ np.array([node.q for node in nodes])
+        q[self._active_columns] = target
+        if np.abs(self._residual(q)).max() > 10 * CLOSED_TOLERANCE * self.rounding_scale(q):
+            return None
+        gamma = np.tensordot(NEIGHBOUR_WEIGHTS, [node.passive_gamma for node in nodes], 1)
+        return ClosedConfiguration(q, target, self._scaled_jacobian(q), gamma, tuple(nodes))
 
     def _check_solution(self, solution: ClosedConfiguration, sample: str) -> None:
         """Raise unless every equation holds and the passive joints are determined."""
@@ -368,58 +425,3 @@ class NewtonContinuation:
                     f"{self._format_values(solution.q_a)}{sample}, its redundant equations hold "
                     "only near home: the mechanism is overconstrained, use a looser loop type"
                 )
-
-    def _out_of_reach_error(
-        self, target: Array, last_reached: ClosedConfiguration, sample: str
-    ) -> OutOfReachError:
-        from scipy.optimize import least_squares  # slow to import
-
-        q = last_reached.q.copy()
-        q[self._active_columns] = target
-
-        def evaluate(passive: Array) -> tuple[Array, Array]:
-            moved = self._equations.displace(q, self._passive_columns, passive)
-            phi, jacobian = self._equations.evaluate_scaled(moved)
-            return phi, jacobian[:, self._passive_columns]
-
-        def residual(passive: Array) -> Array:
-            return evaluate(passive)[0]
-
-        def jacobian(passive: Array) -> Array:
-            return evaluate(passive)[1]
-
-        start = np.zeros(len(self._passive_columns))
-        phi = evaluate(least_squares(residual, start, jacobian, xtol=1e-12).x)[0]
-        worst = int(np.abs(phi).argmax())
-        place, last = self._format_values(target), self._format_values(last_reached.q_a)
-        if np.abs(phi[worst]) < 10 * _CLOSED_TOLERANCE * self.rounding_scale(q):
-            loops = self._format_loop_names(self._most_singular_block(last_reached.jacobian)[1])
-            return OutOfReachError(
-                f"{loops} can be closed at {place}{sample}, but the branch does not lead straight "
-                f"there from {last}: go around in between, or give a nearer guess"
-            )
-        return OutOfReachError(
-            f"loop '{self._equations.name_of_row(worst)}' cannot be closed at {place}{sample}: it "
-            f"stays {self._format_gap(worst, np.abs(phi[worst]))} open; the last configuration on "
-            f"the way that closes is at {last}"
-        )
-
-    def _wrong_branch_error(self, subject: str, solution: ClosedConfiguration) -> WrongBranchError:
-        return WrongBranchError(
-            f"{subject} is assembled the other way at {self._format_values(solution.q_a)}: start "
-            "from the branch of the home configuration"
-        )
-
-    def _format_gap(self, row: int, scaled_residual: float) -> str:
-        gap = scaled_residual * self._equations.residual_units[row]
-        return f"{gap:.3g} {self._equations.unit_of_row(row)}"
-
-    def _format_loop_names(self, rows: Indices) -> str:
-        loops = sorted(
-            set(self._equations.loop_of_row[self._structure.independent_rows[rows]].tolist())
-        )
-        names = " and ".join(f"'{self._equations.names[i]}'" for i in loops)
-        return ("loop " if len(loops) == 1 else "the group of loops ") + names
-
-    def _format_values(self, q_a: Array) -> str:
-        return self._equations.coordinates.format_values(self._active_columns, q_a)

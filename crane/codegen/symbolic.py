@@ -8,7 +8,7 @@ those of vectors and matrices structural zeros cause no operations.
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Union
 
 Scalar = Union["SymbolicExpression", float]
@@ -313,17 +313,38 @@ def solve_linear_system(
 Matrix = list[list[Scalar]]
 
 
+_ROUNDING_SHARE = 1e-11  # of a pivot in the diagonal entry: no more than five digits are left
+
+
+def invert_pivot(pivot: Scalar, least: Scalar) -> Scalar:
+    """1 / pivot, NaN where the pivot is not above `least`."""
+    if not isinstance(pivot, SymbolicExpression) and not pivot > 0:
+        return math.nan
+    return where_positive(pivot - least, 1.0 / pivot, math.nan)
+
+
 class LdltFactorization:
     """Factorization L D L^T of a symmetric positive definite matrix, with unit diagonal of L.
 
+    A singular matrix has NaN in place of solutions if `least_pivots` are given: an entry of D is
+    zero to rounding below 1e-11 of the diagonal entry of the matrix. Without them D is not looked
+    at.
+
     Args:
         matrix: (k, k), of which the lower half is read.
+        least_pivots: (k,) entries of D that count as zero in addition.
+        held: Indices of unknowns that are left out: they are zero in solutions.
 
     Attributes:
-        inverse_diagonal: (k,) inverse of D.
+        inverse_diagonal: (k,) inverse of D, 0 for held unknowns.
     """
 
-    def __init__(self, matrix: Sequence[Sequence[Scalar]]):
+    def __init__(
+        self,
+        matrix: Sequence[Sequence[Scalar]],
+        least_pivots: Sequence[Scalar] | None = None,
+        held: Collection[int] = (),
+    ):
         size = len(matrix)
         self._unit_lower: Matrix = [[0.0] * size for _ in range(size)]
         self.inverse_diagonal: list[Scalar] = []
@@ -334,8 +355,14 @@ class LdltFactorization:
             self._unit_lower[j][:j] = [
                 x * d for x, d in zip(scaled, self.inverse_diagonal, strict=True)
             ]
+            if j in held:
+                self.inverse_diagonal.append(0.0)
+                continue
+            pivot = matrix[j][j] - dot(scaled, self._unit_lower[j][:j])
             self.inverse_diagonal.append(
-                1.0 / (matrix[j][j] - dot(scaled, self._unit_lower[j][:j]))
+                1.0 / pivot
+                if least_pivots is None
+                else invert_pivot(pivot, least_pivots[j] + _ROUNDING_SHARE * matrix[j][j])
             )
 
     def forward_substitute(self, right: Sequence[Scalar]) -> list[Scalar]:

@@ -72,6 +72,10 @@ class MechanismError(CraneError):
         self.configuration = configuration
 
 
+class SingularMassMatrixError(MechanismError):
+    """Some motion moves no inertia, so that forces do not determine accelerations."""
+
+
 class InputError(CraneError):
     """An argument has a wrong shape, is not finite, or names something unknown."""
 

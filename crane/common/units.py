@@ -1,4 +1,4 @@
-"""Unit conversions of inputs, and formatting of quantities and tables."""
+"""Formatting of quantities and tables."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,23 +17,6 @@ DISPLAY_UNITS: Mapping[str, tuple[tuple[str, float, float], ...]] = {
     "m3/s": (("l/min", 6e4, 0.0),),
     "m3": (("l", 1e3, 0.0),),
     "kg": (("t", 1e-3, 1e4),),
-}
-# unit: (SI unit, a, b) with x a / b in SI units; two factors, so that 12.3 mm is 0.0123 m exactly
-SI_CONVERSIONS = {
-    "ms": ("s", 1.0, 1e3),
-    "deg": ("rad", math.pi, 180.0),
-    "deg/s": ("rad/s", math.pi, 180.0),
-    "mm": ("m", 1.0, 1e3),
-    "cm": ("m", 1.0, 1e2),
-    "mm/s": ("m/s", 1.0, 1e3),
-    "cm/s": ("m/s", 1.0, 1e2),
-    "kN": ("N", 1e3, 1.0),
-    "kN m": ("N m", 1e3, 1.0),
-    "kPa": ("Pa", 1e3, 1.0),
-    "MPa": ("Pa", 1e6, 1.0),
-    "bar": ("Pa", 1e5, 1.0),
-    "l/min": ("m3/s", 1.0, 6e4),
-    "mV": ("V", 1.0, 1e3),
 }
 _ZERO_TOLERANCE = 1e-6  # rounding noise in any of these units
 
@@ -59,11 +42,6 @@ def format_quantity(value: float, unit: str, digits: int = 3) -> str:
     """A value (in SI) with its display unit: 13.36 t, 4.2 kN, 350 bar."""
     name, scale = display_unit(unit, value)
     return f"{format_number(scale * value, digits)} {name}"
-
-
-def accepted_units(unit: str) -> list[str]:
-    """An SI unit and the units that are converted to it."""
-    return [unit, *(other for other, (si, _, _) in SI_CONVERSIONS.items() if si == unit)]
 
 
 def format_table(rows: Sequence[Sequence[str]], left_aligned: Sequence[int] = (0,)) -> list[str]:

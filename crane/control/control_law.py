@@ -340,7 +340,11 @@ class ComputedTorque(ControlLaw):
             )
         ]
         tau, _ = hybrid_dynamics(
-            inputs.inverse, self.machine.is_driven.tolist(), accelerations, friction=True
+            inputs.inverse,
+            self.machine.is_driven.tolist(),
+            accelerations,
+            friction=True,
+            held=self.machine.held,
         )
         return self.expand_driven(tau), ()
 

@@ -372,6 +372,6 @@ class TipVelocity(SampledCommand):
         signals = []
         for spool in self._circuit.spools.values():
             y = openings[spool.joint]
-            u = y * (1.0 - spool.dead_band) + spool.dead_band * np.tanh(y / _DEAD_BAND_SMOOTHING)
+            u = y * (1.0 - spool.overlap) + spool.overlap * np.tanh(y / _DEAD_BAND_SMOOTHING)
             signals.append(spool.neutral + (spool.full - spool.neutral) * u)
         return np.array(signals)

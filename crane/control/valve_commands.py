@@ -98,7 +98,7 @@ def lever_signals(spool: Valve | Spool, lever: Array) -> Array:
 
     The signal jumps over the dead band at zero, as that of the electronics of such machines.
     """
-    u = lever * (1.0 - spool.dead_band) + spool.dead_band * np.sign(lever)
+    u = lever * (1.0 - spool.overlap) + spool.overlap * np.sign(lever)
     return np.asarray(spool.neutral + (spool.full - spool.neutral) * u)
 
 
@@ -241,7 +241,7 @@ class ValvePD(ValveCommand, OneLineRepr):
         self._active_indices = [machine.active.index(spool.joint) for spool in spools]
         settings = [
             (
-                gains[spool.joint].kp, gains[spool.joint].kd, spool.dead_band, spool.neutral,
+                gains[spool.joint].kp, gains[spool.joint].kd, spool.overlap, spool.neutral,
                 spool.full - spool.neutral,
             )
             for spool in spools

@@ -40,31 +40,49 @@ CURVE = section_schema(
             "flow coefficient of the fully open edge", _COEFFICIENT, minimum=0.0
         ),
         "shape": RowListKey("rows of relative stroke and relative coefficient", size=2),
-        "flow": RowListKey("rows of relative stroke and flow, with `drop`", "m3/s", size=2),
+        "flow": RowListKey(
+            "rows of relative stroke and flow, with `drop`", "m3/s", size=2,
+            column_units=("", "m3/s"),
+        ),
         "drop": NumberKey("pressure drop at which the flows were measured", "Pa", minimum=0.0),
-        "area": RowListKey("rows of relative stroke and opening area", "m2", size=2),
+        "area": RowListKey(
+            "rows of relative stroke and opening area", "m2", size=2, column_units=("", "m2")
+        ),
         "discharge": NumberKey(
             "discharge coefficient of the opening areas", minimum=0.0, default=0.7
         ),
         "density": NumberKey("density of the oil", "kg/m3", minimum=1.0, default=870.0),
         "file": FileKey("CSV file with the columns `u` and `flow`, `area` or `coefficient`"),
     },
-)
+)  # fmt: skip
 
 
 def _edge(text: str) -> VariantKey:
     """A flow coefficient, or a curve of it over the relative stroke."""
     return VariantKey(
         text,
-        (NumberKey("", _COEFFICIENT, minimum=0.0), RowListKey(size=2), SectionKey(section=CURVE)),
+        (
+            NumberKey("", _COEFFICIENT, minimum=0.0),
+            RowListKey(size=2, column_units=("", _COEFFICIENT)),
+            SectionKey(section=CURVE),
+        ),
     )
 
 
+# fmt: off
 _PUMP_KEYS: dict[str, Key] = {
     "control": TextKey("type of the regulator", choices=PUMP_CONTROLS),
     "pressure": NumberKey("set pressure, or cut-off pressure"),
     "tank": NumberKey("pressure of the return line; first pump only"),
     "flow": NumberKey("maximum flow; 0: no limit"),
+    "displacement": NumberKey(
+        "displacement at full stroke, instead of `flow` = displacement times speed",
+        "m3/rad", minimum=0.0, zero_error="'{key}' of {title} is 0, give it",
+    ),
+    "speed": NumberKey(
+        "speed of the pump, with `displacement`", "rad/s", minimum=0.0,
+        zero_error="'{key}' of {title} is 0, give it", default_text="`engine.speed`",
+    ),
     "droop": NumberKey("decrease of the pressure from zero to full flow"),
     "volume": NumberKey("volume of the line between pump and valves"),
     "margin": NumberKey("load sensing: pressure difference above the highest load pressure"),
@@ -96,8 +114,13 @@ _PUMP_KEYS: dict[str, Key] = {
     "friction": NumberKey("friction torque, relative to the hydraulic torque"),
     "drag": NumberKey("drag power without load, at the set speed"),
 }
-FIRST_PUMP = section_schema("'supply'", _PUMP_KEYS, Supply)
-PUMP = section_schema("supply", {k: x for k, x in _PUMP_KEYS.items() if k != "tank"}, Supply)
+_PUMP_SIZES = (("flow",), ("displacement",), "'{key}' stands beside '{other}', keep one of them")
+FIRST_PUMP = section_schema("'supply'", _PUMP_KEYS, Supply, exclusive=(_PUMP_SIZES,))
+PUMP = section_schema(
+    "supply", {k: x for k, x in _PUMP_KEYS.items() if k != "tank"}, Supply,
+    exclusive=(_PUMP_SIZES,),
+)
+# fmt: on
 ENGINE = section_schema(
     "'engine'",
     {
@@ -273,7 +296,11 @@ _SPOOL_KEYS: dict[str, Key] = {
     "full": NumberKey(
         "signal of $u = 1$; $u = (U - \\text{neutral}) / (\\text{full} - \\text{neutral})$", "V"
     ),
-    "dead_band": NumberKey("fraction of the spool stroke without flow"),
+    "dead_band": NumberKey(
+        "fraction of the spool stroke without flow; negative: underlap, over which the inlet and "
+        "outlet of a chamber are both open",
+        minimum=-1.0,
+    ),
     "bandwidth": NumberKey("natural frequency of the spool; 0: the spool follows immediately"),
     "damping": NumberKey("damping ratio of the spool"),
     "rate": NumberKey("maximum speed in strokes per second; 0: no limit"),

@@ -1,12 +1,13 @@
 """Types of the keys of a machine file: type, unit, bounds, default and text of a value."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from crane.common.plausible_ranges import PlausibleRange, plausible_range
 
+QUANTITY_UNIT = "unit of the quantity"  # of a number whose unit is that of what is measured
 REQUIRED: Any = object()  # the default of a key that has to be given
 
 
@@ -77,19 +78,45 @@ class NumberKey(Key):
         """Its units, as text: "N, N m"; empty for a number without one."""
         return ", ".join(dict.fromkeys(filter(None, (self.unit, self.rotary_unit))))
 
+    def si_units(self, turns: bool | None, position: Sequence[int] = ()) -> tuple[str, ...]:
+        """Its SI unit, or both where it is not known whether its joint turns.
+
+        Args:
+            turns: Whether its joint turns; None: not known.
+            position: Where it is in the list or the rows of the key.
+        """
+        rotary_unit = self.rotary_unit or self.unit
+        if turns is None:
+            return tuple(dict.fromkeys((self.unit, rotary_unit)))
+        return (rotary_unit if turns else self.unit,)
+
 
 @dataclass(frozen=True)
 class NumberListKey(NumberKey):
-    """A key whose value is a list of finite numbers, `size` of them if given."""
+    """A key whose value is a list of finite numbers, `size` of them if given.
+
+    Attributes:
+        size: See above.
+        column_units: SI units of the numbers in turn, where they differ.
+        is_polynomial: Whether it is of coefficients of powers of the time, in the unit by s, s2..
+    """
 
     size: int | None = field(default=None, kw_only=True)
+    column_units: tuple[str, ...] = field(default=(), kw_only=True)
+    is_polynomial: bool = field(default=False, kw_only=True)
+
+    def si_units(self, turns: bool | None, position: Sequence[int] = ()) -> tuple[str, ...]:
+        """See `NumberKey`."""
+        column = position[-1]
+        if self.column_units:
+            return (self.column_units[column % len(self.column_units)],)
+        by_time = f"/s{column if column > 1 else ''}" if self.is_polynomial and column else ""
+        return tuple(f"{unit}{by_time}" for unit in super().si_units(turns))
 
 
 @dataclass(frozen=True)
-class RowListKey(NumberKey):
+class RowListKey(NumberListKey):
     """A key whose value is a list of rows, each a list of `size` numbers."""
-
-    size: int | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from crane.description.force_elements import Friction
 from crane.description.key_types import NumberKey
 from crane.description.kinematic_tree import Joint, Link, Tree
 from crane.description.machine_lookup import bundled_machines, command_line_arguments
-from crane.description.machine_schema import END_STOP, FORCE, FRICTION, GAS_SPRING, ROPE
+from crane.description.machine_schema import CONTROL, END_STOP, FORCE, FRICTION, GAS_SPRING, ROPE
 from crane.description.sensors import (
     PRESSURE_PREFIX,
     SENSOR_PREFIX,
@@ -201,7 +201,8 @@ _JOINT_UNITS = {  # of a sliding and of a turning joint
 }  # fmt: skip
 _SECTIONS = {
     "friction": FRICTION, "spring": FORCE, "gas_spring": GAS_SPRING, "end_stop": END_STOP,
-    "rope": ROPE, "cylinder": CYLINDER, "valve": VALVE, "valve_control": VALVE_CONTROL,
+    "rope": ROPE, "control": CONTROL, "cylinder": CYLINDER, "valve": VALVE,
+    "valve_control": VALVE_CONTROL,
     "supply": FIRST_PUMP, "oil": OIL, "engine": ENGINE, "line": LINE, "accumulator": ACCUMULATOR,
     "element": ELEMENT,
 }  # fmt: skip
@@ -226,8 +227,6 @@ def parameter_unit(tree: Tree, name: str) -> str:
         return "N"
     if name.startswith(GRAVITY_PREFIX):
         return "m/s2"
-    if prefix == "control":  # gains of two kinds of controllers
-        return ""
     if prefix not in _SECTIONS:
         kind = part.rpartition(".")[2]
         if kind in _INERTIAL_UNITS and part not in tree.links:
@@ -235,6 +234,7 @@ def parameter_unit(tree: Tree, name: str) -> str:
         if part in tree.joints and key in _JOINT_UNITS:
             return _JOINT_UNITS[key][tree.joints[part].kind == "revolute"]
         return _LINK_UNITS.get(key, "")
+    owner = owner.partition("#")[0]  # of several elements of a joint
     is_rotary = owner in tree.joints and tree.joints[owner].kind == "revolute"
     value = _SECTIONS[prefix].keys.get(key)
     value = next(iter(getattr(value, "types", ())), value)  # an edge, which may be a curve

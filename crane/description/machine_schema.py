@@ -4,6 +4,7 @@ from crane.description.circuit_schema import HYDRAULICS
 from crane.description.external_force_schema import CONTACT, CUTTER, GROUND, LOAD, SOIL, TASK_LOAD
 from crane.description.force_elements import EndStop, ForceElement, Friction, GasSpring, Rope
 from crane.description.key_types import (
+    QUANTITY_UNIT,
     REQUIRED,
     FileKey,
     FlagKey,
@@ -179,7 +180,7 @@ PAYLOAD = section_schema(
         )
     },
 )
-_POLYNOMIAL = NumberListKey("", "m", "rad")
+_POLYNOMIAL = NumberListKey("", *_COORDINATE, is_polynomial=True)
 _JOINT_VALUE = NumberKey("", *_COORDINATE)
 _RATE = NumberKey("", "m/s", "rad/s")
 VIA_POINT = section_schema(
@@ -226,7 +227,7 @@ TASK = section_schema(
         ),
         "joystick": MapKey(
             "lever positions of the valves, as pairs of time and position",
-            NumberListKey("", ""), "joint",
+            NumberListKey("", column_units=("s", "")), "joint",
         ),
         "phases": ListKey(
             "lever positions of the valves, each constant until joints reach given positions",
@@ -300,12 +301,13 @@ SENSOR = section_schema(
             default_text="name of the quantity",
         ),
         "unit": TextKey("unit of that column", default_text="SI unit"),
-        "zero": NumberKey("offset, in the unit of the quantity"),
+        "zero": NumberKey("offset", QUANTITY_UNIT),
         "scale": NumberKey("scale factor, not 0"),
         "delay": NumberKey("delay of the sensor", "s"),
         "noise": NumberKey(
             "standard deviation of the noise, which sets the weight of the channel in a "
             "calibration",
+            QUANTITY_UNIT,
             default_text="derived from the recording",
         ),
     },

@@ -11,6 +11,7 @@ import numpy as np
 from crane.common.errors import CraneWarning, InputError, suggest_names
 from crane.common.plausible_ranges import implausible_value_text
 from crane.common.samples import MAX_COORDINATE, as_number
+from crane.common.unit_conversions import UnitError, parse_quantity
 from crane.description.external_forces import ExternalForce
 from crane.description.force_elements import (
     AnyForceElement,
@@ -23,6 +24,7 @@ from crane.description.machine_parameters import (
     PINS_PREFIX,
     FieldPath,
     parameter_paths,
+    parameter_unit,
     parameters,
     unknown_parameter_text,
     value_at,
@@ -42,6 +44,48 @@ _LIMIT_TOLERANCE = 1e-9  # relative to a limit, for rounding
 T = TypeVar("T")
 
 
+def changes_in_si(spec: MachineSpec, changes: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Parameter changes with numbers in place of texts with units; unknown names are left.
+
+    Raises:
+        InputError: A text is no number in a unit of its parameter.
+    """
+    changes = changes or {}
+    texts = [name for name in changes if isinstance(changes[name], str)]
+    known = parameters(spec) if texts else {}
+    numbers = {
+        name: _in_si(f"parameter '{name}'", changes[name], (parameter_unit(spec.tree, name),))
+        for name in texts
+        if name in known or name.startswith(SENSOR_PREFIX)
+    }
+    return {**changes, **numbers}
+
+
+def locks_in_si(spec: MachineSpec, lock: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Coordinates of locked joints with numbers in place of texts with units.
+
+    Raises:
+        InputError: A text is no number in a unit of its joint.
+    """
+
+    def units_of(name: str) -> tuple[str, ...]:
+        return tuple(filter(None, [quantity_unit(spec.tree, name)])) or ("m", "rad")
+
+    return {
+        name: _in_si(f"the coordinate to lock '{name}' at", value, units_of(name))
+        if isinstance(value, str)
+        else value
+        for name, value in (lock or {}).items()
+    }
+
+
+def _in_si(what: str, text: str, units: Sequence[str]) -> float:
+    try:
+        return parse_quantity(text, units).value
+    except UnitError as error:
+        raise InputError(f"{what} is '{text}', {error}") from None
+
+
 def apply_parameter_changes(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
     """Return a machine with other parameters.
 
@@ -54,6 +98,7 @@ def apply_parameter_changes(spec: MachineSpec, changes: Mapping[str, float]) -> 
     """
     names, paths = parameters(spec), parameter_paths(spec)
     values = {name: _check_change(spec, names, name, changes[name]) for name in changes}
+    values = _flows_at_engine_speed(spec, values) | values
     payload_mass = values.pop(PAYLOAD_MASS, 0.0)
     sensor_changes = {x: value for x, value in values.items() if x.startswith(SENSOR_PREFIX)}
     new_values: dict[FieldPath, Any] = {}
@@ -79,6 +124,21 @@ def apply_parameter_changes(spec: MachineSpec, changes: Mapping[str, float]) -> 
         changed, sensors=MappingProxyType(with_sensor_parameters(spec.sensors, sensor_changes))
     )
     return _add_payload(changed, payload_mass) if payload_mass else changed
+
+
+def _flows_at_engine_speed(spec: MachineSpec, values: Mapping[str, float]) -> dict[str, float]:
+    """Flows of the pumps of which the file gives the displacement, at another engine speed."""
+    if "engine.speed" not in values or spec.hydraulics is None:
+        return {}
+    numbers, flows = spec.written_numbers, {}
+    for prefix, path in (
+        ("supply", ("supply",)),
+        *((f"supply.{name}", ("supplies", name)) for name in spec.hydraulics.supplies),
+    ):
+        size = numbers.get(("hydraulics", *path, "displacement"))
+        if size is not None and ("hydraulics", *path, "speed") not in numbers:
+            flows[f"{prefix}.flow"] = size.value * values["engine.speed"]
+    return flows
 
 
 def _check_change(

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from crane.common.errors import InputError, suggest_names
+from crane.common.unit_conversions import KeyPath, WrittenNumber
 from crane.description.external_forces import ExternalForce, Wrench
 from crane.description.force_elements import (
     AnyForceElement,
@@ -434,6 +435,8 @@ class MachineSpec:
         default_factory=dict
     )  # by joint or loop, most force [N]
     gravity: tuple[float, ...] = STANDARD_GRAVITY  # (3,) [m/s2]
+    # numbers as they are written, by the keys and names that lead to them in the machine file
+    written_numbers: Mapping[KeyPath, WrittenNumber] = field(default_factory=dict)
 
     @property
     def force_elements(self) -> tuple[AnyForceElement, ...]:

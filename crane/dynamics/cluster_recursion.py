@@ -37,7 +37,7 @@ from crane.closure.kinematics_formulas import (
 )
 from crane.closure.loop_equations import Cluster, find_clusters
 from crane.closure.loop_formulas import LoopFormulas, VelocityKinematics
-from crane.codegen.symbolic import LdltFactorization, Scalar, dot, sum_scalars
+from crane.codegen.symbolic import LdltFactorization, Scalar, dot, invert_pivot, sum_scalars
 from crane.dynamics.spatial_inertia import ClusterMassColumns, SpatialInertia, forward_substitute
 from crane.machine.machine import Machine
 
@@ -64,6 +64,8 @@ class RecursionInput:
         reference_wrenches: For every body, wrench about its COM at the reference, weight included.
         rotor_inertias: (nb + 1,) rotor inertias of the joints.
         joint_forces: (nb + 1,) forces along the joints, those of the drives included.
+        least_inertias: (nb + 1,) inertia of each joint that counts as none.
+        held_joints: Joints of held coordinates, which do not accelerate.
     """
 
     kinematics: PositionKinematics
@@ -74,6 +76,8 @@ class RecursionInput:
     reference_wrenches: Sequence[SpatialVector]
     rotor_inertias: Vector
     joint_forces: Vector
+    least_inertias: Vector
+    held_joints: frozenset[int]
 
     def articulated_inertia(self, i: int, articulated: ArticulatedInertias) -> ArticulatedInertia:
         """Inertia and wrench of a body with those that it carries, at its origin."""
@@ -167,7 +171,9 @@ class ArticulatedCluster:
         parent, arm = recursion.kinematics.geometry.parents[i], recursion.kinematics.offsets[i]
         inertia, wrench = recursion.articulated_inertia(i, articulated)
         column = inertia.apply_to(axis)
-        inverse = 1.0 / (spatial_dot(axis, column) + recursion.rotor_inertias[i])
+        pivot = spatial_dot(axis, column) + recursion.rotor_inertias[i]
+        is_held = i in recursion.held_joints
+        inverse = 0.0 if is_held else invert_pivot(pivot, recursion.least_inertias[i])
         rotor_force = recursion.rotor_inertias[i] * recursion.reference_accelerations[i]
         net_force = recursion.joint_forces[i] - rotor_force - spatial_dot(axis, wrench)
         constraint_forces = [
@@ -285,10 +291,13 @@ class ProjectedCluster:
         columns = ClusterMassColumns(
             kinematics, cluster, self._gamma, inertias, recursion.rotor_inertias
         )
-        self._factorization, self._wrenches = (
-            LdltFactorization(columns.mass_block),
-            columns.base_wrenches,
+        joints = [loops.active_joints[k] for k in coordinates]
+        self._factorization = LdltFactorization(
+            columns.mass_block,
+            [recursion.least_inertias[joint] for joint in joints],
+            [k for k, joint in enumerate(joints) if joint in recursion.held_joints],
         )
+        self._wrenches = columns.base_wrenches
         inertia, bias = articulated_inside[cluster.base]
         self.inertia = inertia.subtract_columns(
             forward_substitute(self._factorization, self._wrenches),

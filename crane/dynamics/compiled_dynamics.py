@@ -97,6 +97,7 @@ class CompiledQuantity:
 
     Attributes:
         size: Length of the result of one sample.
+        solves_mass_matrix: Whether the result is not finite where the mass matrix is singular.
 
     Raises:
         FormulaTooLongError: It would take too long to compile.
@@ -121,6 +122,7 @@ class CompiledQuantity:
         )
         result_size = self.size = program.formula_outputs("formula").size
         self._shape = (n,)
+        self.solves_mass_matrix = _solves_mass_matrix(quantity)
 
         def create_workspace() -> tuple[ContinuationCursor, Array, _SampleBuffers]:
             cursor, q, target = fast.new_cursor(), np.zeros(nq), np.zeros(n)
@@ -176,7 +178,9 @@ class CompiledQuantity:
         return out
 
     def evaluate_targets(self, targets: Array, inputs: Array, out: Array) -> int:
-        """The quantity at q_A (N, n) with inputs (N, 2 n) until a sample is too far from the last.
+        """The quantity at q_A (N, n) with inputs (N, 2 n) until a sample needs a closer look.
+
+        It is too far from the last one, or its mass matrix is singular.
 
         Returns:
             Number of evaluated samples.
@@ -232,7 +236,9 @@ def _build_quantity(
     program.add_formula(
         "scan", 2, [max_abs([*tape.load_vector(0, 0, n), *tape.load_vector(1, 0, 2 * n)])]
     )
-    _add_evaluation_routines(program, len(q), n)
+    tape = Tape()
+    program.add_formula("check", 1, [max_abs(tape.load_vector(0, 0, len(outputs)))])
+    _add_evaluation_routines(program, len(q), n, _solves_mass_matrix(quantity))
 
 
 class CompiledParameterDerivatives:
@@ -336,16 +342,23 @@ def _tape_index(loaded: Scalar) -> int:
     return loaded.index
 
 
-def _add_evaluation_routines(program: Program, nq: int, n: int) -> None:
+def _solves_mass_matrix(quantity: str) -> bool:
+    return quantity.removeprefix(DERIVATIVES_OF).removesuffix(WITH_FRICTION) == "forward"
+
+
+def _add_evaluation_routines(
+    program: Program, nq: int, n: int, stops_where_infinite: bool
+) -> None:
     """Add the routines that evaluate a quantity.
 
     "each" closes the loops and evaluates sample by sample; "once" does so for one finite sample;
     "closed_each" evaluates at closed configurations. Like `follow` of `CompiledClosure`, "each"
-    stops at the first sample that is too far from the previous one.
+    stops at the first sample that is too far from the previous one, or whose result is not finite.
     """
     arrays = ("geometry", "constants", "targets", "inputs", "cursor", "q", "out", "tolerances")
     outputs = program.formula_outputs("formula").size
     with program.add_routine("each", counts=("count",), functions=("follow",), arrays=arrays) as r:
+        checked = r.local_array("checked", program.formula_outputs("check"))
         with r.loop(r.count) as i:
             got = r.call(
                 "follow", 1, r.geometry, r.targets.row_pointer(i, n), r.cursor, r.q, r.tolerances
@@ -354,6 +367,10 @@ def _add_evaluation_routines(program: Program, nq: int, n: int) -> None:
                 r.return_value(i)
             out = r.out.row_pointer(i, outputs)
             r.call("formula", r.geometry, r.constants, r.q, r.inputs.row_pointer(i, 2 * n), out)
+            if stops_where_infinite:
+                r.call("check", out, checked)
+                with r.if_then(~(checked["all"] < np.inf)):
+                    r.return_value(i)
         r.return_value(r.count)
     closed = ("geometry", "constants", "configurations", "inputs", "out")
     with program.add_routine("closed_each", counts=("count",), arrays=closed) as r:

@@ -17,6 +17,9 @@ from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.dynamics.compiled_dynamics import DERIVATIVES_OF, WITH_FRICTION
 from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.dynamics.quantity_evaluator import QuantityEvaluator
+from crane.machine.massless_motions import hold_coordinates
+
+_IDLE_FORCE_SHARE = 1e-9  # of the largest force, that counts as rounding
 
 QUANTITY_ARGUMENTS = {  # arguments of the quantities of `derivatives`
     "inverse": ("q_a", "v_a", "a_a"),
@@ -108,11 +111,18 @@ class Dynamics(QuantityEvaluator):
                 `simulate` determines which joints are held.
 
         Returns:
-            a_A, (n,) or (N, n) [m/s2], [rad/s2].
+            a_A, (n,) or (N, n) [m/s2], [rad/s2], 0 for held coordinates (`Machine.held`).
+
+        Raises:
+            SingularMassMatrixError: Some motion moves no inertia there.
+            InputError: A force acts on an idle motion; otherwise as for other quantities.
         """
-        return self._evaluate(
+        a_a = self._evaluate(
             "forward with friction" if friction else "forward", (), q_a, v_a, tau_a, "tau_a"
         )
+        if self.machine.held:
+            self._check_idle_forces(q_a, v_a, tau_a, a_a, friction)
+        return a_a
 
     def hybrid(
         self, q_a: ArrayLike, v_a: ArrayLike, a_d: ArrayLike, friction: bool = False
@@ -137,14 +147,36 @@ class Dynamics(QuantityEvaluator):
         1994, Partial feedback linearization of underactuated mechanical systems (collocated).
         """
         c = self.inverse(q_a, v_a, self.machine.expand_driven(a_d, "a_d"), friction)
-        driven = self.machine.is_driven
-        mass = self.mass_matrix(q_a)
+        driven, held = self.machine.is_driven, list(self.machine.held)
+        mass = hold_coordinates(self.mass_matrix(q_a), self.machine.held)
         coupling_block, free_block = (
             mass[..., driven, :][..., ~driven],
             mass[..., ~driven, :][..., ~driven],
         )
-        a_f = -solve_linear(free_block, c[..., ~driven, None])
+        unbalanced = c.copy()
+        unbalanced[..., held] = 0.0
+        self.check_free_block(q_a, free_block)
+        a_f = -solve_linear(free_block, unbalanced[..., ~driven, None])
         return c[..., driven] + (coupling_block @ a_f)[..., 0], a_f[..., 0]
+
+    def _check_idle_forces(
+        self, q_a: ArrayLike, v_a: ArrayLike, tau_a: ArrayLike, a_a: Array, friction: bool
+    ) -> None:
+        """Check that forces do not act on idle motions, which nothing would limit.
+
+        Raises:
+            InputError: One does.
+        """
+        held = list(self.machine.held)
+        needed = self.inverse(q_a, v_a, a_a) + (self.friction(q_a, v_a) if friction else 0.0)
+        scale = np.maximum(np.abs(tau_a), np.abs(self.bias(q_a, v_a))).max(axis=-1, initial=0.0)
+        excess = np.abs(np.subtract(tau_a, needed))[..., held]
+        if not (excess <= _IDLE_FORCE_SHARE * scale[..., None]).all():
+            name = self.machine.active[held[int(excess.reshape(-1, len(held)).max(0).argmax())]]
+            raise InputError(
+                f"a force of {excess.max():.3g} acts on the idle motion of '{name}', which has no "
+                "inertia: give it 0, or its link an inertia"
+            )
 
     def mass_matrix(self, q_a: ArrayLike) -> Array:
         """M_A = gamma^T M gamma.
@@ -306,6 +338,7 @@ class Dynamics(QuantityEvaluator):
         Raises:
             InputError: An unknown quantity or name, a missing argument, or a machine whose
                 formulas take too long to compile.
+            SingularMassMatrixError: See `forward`.
         """
         if quantity not in QUANTITY_ARGUMENTS:
             raise InputError(
@@ -343,6 +376,8 @@ class Dynamics(QuantityEvaluator):
             every = self._parameter_derivatives_at(key, parameters, q, inputs)
             every = every.reshape(count, *shape, len(parameters))
             found |= {name: every[..., i].copy() for i, name in enumerate(parameters)}
+        if quantity == "forward" and not all(np.isfinite(x).all() for x in found.values()):
+            self.check_mass_matrices(q)
         return {name: found[name][0] if length is None else found[name] for name in by}
 
     def drive_forces(

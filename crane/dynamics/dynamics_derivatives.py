@@ -33,7 +33,6 @@ from crane.closure.kinematics_formulas import (
 )
 from crane.codegen.differentiation import directional_derivative
 from crane.codegen.symbolic import (
-    LdltFactorization,
     Scalar,
     SymbolicExpression,
     add_vectors,
@@ -311,7 +310,7 @@ class DynamicsDerivatives:
         With M_A a_A + h = tau_A, d a_A = M_A^-1 (d tau_A - d inverse at a_A).
         """
         formulas = self._formulas
-        mass = LdltFactorization(self.mass_matrix)
+        mass = formulas.factorize_mass_matrix(self.mass_matrix)
         right = add_vectors(
             tau, formulas.project(formulas.passive_and_friction_forces(self._friction))
         )

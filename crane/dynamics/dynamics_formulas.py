@@ -15,6 +15,7 @@ from crane.closure.kinematics_formulas import (
 )
 from crane.codegen.symbolic import (
     LdltFactorization,
+    Matrix,
     Scalar,
     add_vectors,
     apply_function,
@@ -207,23 +208,34 @@ class DynamicsFormulas(InertialForceFormulas):
         if self.formula_structure.recursion_plan and self._mobility > _MAX_MOBILITY_FACTORIZED:
             return self._recursive_forward_dynamics(tau, friction)
         right = add_vectors(tau, self.project(self.passive_and_friction_forces(friction)))
-        return LdltFactorization(self.mass_matrix).solve(
-            subtract_vectors(right, self.inertial_bias)
-        )
+        return self.factorize_mass_matrix().solve(subtract_vectors(right, self.inertial_bias))
+
+    def factorize_mass_matrix(self, mass: Matrix | None = None) -> LdltFactorization:
+        """Factorization of M_A without held coordinates; NaN where it is singular.
+
+        Args:
+            mass: M_A if it is known.
+        """
+        least = [self._least_inertias[joint] for joint in self.loops.active_joints]
+        held = self.formula_structure.held
+        return LdltFactorization(self.mass_matrix if mass is None else mass, least, held)
 
     def stick_slip_equations(self, tau: Sequence[Scalar]) -> Vector:
         """Inputs of the stiction problem: M_A (n^2), rows of gamma (k n), drift (k), net (n).
 
-        The rows are those of the stick-slip joints; net is tau minus bias and friction.
+        The rows are those of the stick-slip joints; net is tau minus bias and friction. Held
+        coordinates have the rows and columns of the unit matrix in M_A, and no net force.
         """
         rows = [entry for i in self._stick_slip_columns for entry in self.gamma[i + 1]]
         drift = [self.drift[i + 1] for i in self._stick_slip_columns]
-        return [
-            *(entry for row in self.mass_matrix for entry in row),
-            *rows,
-            *drift,
-            *self._net_force(tau),
-        ]
+        held, n = self.formula_structure.held, self._mobility
+        masses = (
+            float(i == k) if {i, k} & set(held) else self.mass_matrix[i][k]
+            for i in range(n)
+            for k in range(n)
+        )
+        net = [0.0 if i in held else x for i, x in enumerate(self._net_force(tau))]
+        return [*masses, *rows, *drift, *net]
 
     def _net_force(self, tau: Sequence[Scalar]) -> Vector:
         """Active forces minus bias and friction."""
@@ -272,7 +284,7 @@ class DynamicsFormulas(InertialForceFormulas):
             )
         rows = [self.gamma[i + 1] for i in self._stick_slip_columns]
         right = self._net_force(tau)
-        mass = LdltFactorization(self.mass_matrix)
+        mass = self.factorize_mass_matrix()
         holding_forces = self._holding_forces(mass, right, is_held)
         holding_active_forces: Vector = [0.0] * self._mobility
         for r, row in zip(holding_forces, rows, strict=True):
@@ -360,6 +372,8 @@ class DynamicsFormulas(InertialForceFormulas):
             self.body_wrenches(reference_accelerations),
             self.rotor_inertias,
             forces,
+            self._least_inertias,
+            frozenset(self.loops.active_joints[k] for k in self.formula_structure.held),
         )
         rates = joint_accelerations(recursion, self.formula_structure.recursion_plan)
         return [rates[joint] for joint in self.loops.active_joints]

@@ -49,14 +49,17 @@ def motion_parents(machine: Machine, formulation: str) -> tuple[int, ...]:
     return tuple(p if names[p] == names[i] else 0 for i, p in enumerate(parents))
 
 
-def dynamics_constants(machine: Machine, geometry: TreeGeometry, forces: JointForces) -> Array:
+def dynamics_constants(
+    machine: Machine, geometry: TreeGeometry, forces: JointForces, least_inertias: Array
+) -> Array:
     """Inertias, force laws and gravity, see `FormulaStructure.constants_layout`.
 
     Per body mass, COM (3), inertia about it (xx, xy, xz, yy, yz, zz) in the axes of the geometry;
     per joint the 22 values of `JointForces.table`; gravity (3); per joint its rotor inertia; per
     distance its 22 values and the attachment points on its two bodies; the moving factor; circuit
     friction of joints (`JointForces.circuit_friction`); mass and first moment of the fixed bodies
-    (4); the tip point on its body, if there is a tip.
+    (4); the tip point on its body, if there is a tip; per joint the inertia that counts as none
+    (`Machine.least_inertias`).
     """
     bodies = []
     for i, joint in enumerate(machine.coordinates.joints, start=1):
@@ -93,7 +96,7 @@ def dynamics_constants(machine: Machine, geometry: TreeGeometry, forces: JointFo
         joint, placement = frame_placement(machine, machine.tip)
         turn = geometry.body_rotations[machine.coordinates.body_of_joint[joint]]
         numbers.append(turn.T @ placement.translation)
-    return np.concatenate(numbers)
+    return np.concatenate([*numbers, least_inertias])
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,7 @@ class FormulaStructure:
         stick_slip_columns: Columns of the joints with stick-slip friction.
         circuit_friction_columns: Columns of the joints with circuit friction.
         tip_body: Body of the tip, if there is one.
+        held: See `Machine.held`.
     """
 
     motion_parents: tuple[int, ...]
@@ -117,6 +121,7 @@ class FormulaStructure:
     stick_slip_columns: tuple[int, ...]
     circuit_friction_columns: tuple[int, ...]
     tip_body: int | None
+    held: tuple[int, ...]
 
     @classmethod
     def from_machine(
@@ -138,6 +143,7 @@ class FormulaStructure:
             forces.stick_slip_columns,
             forces.circuit_friction_columns,
             tip,
+            machine.held,
         )
 
     @property
@@ -148,7 +154,7 @@ class FormulaStructure:
             inertias=BODY_SIZE * bodies, joint_laws=PARAMETER_COUNT * bodies, gravity=3,
             rotor_inertias=bodies, distances=DISTANCE_SIZE * distances, moving_factor=1,
             circuit_friction=len(self.circuit_friction_columns), fixed_inertia=4,
-            tip_point=0 if self.tip_body is None else 3,
+            tip_point=0 if self.tip_body is None else 3, least_inertias=bodies,
         )  # fmt: skip
 
     @property

@@ -242,6 +242,7 @@ def hybrid_dynamics(
     driven: Sequence[bool],
     a_d: Sequence[Scalar],
     friction: bool,
+    held: Sequence[int] = (),
 ) -> tuple[Vector, Vector]:
     """`Dynamics.hybrid` from a function of inverse dynamics, for numbers or formulas.
 
@@ -252,6 +253,7 @@ def hybrid_dynamics(
         driven: (n,) whether a joint is driven.
         a_d: (k,) accelerations of the driven joints [m/s2], [rad/s2].
         friction: Whether friction is included.
+        held: See `Machine.held`.
 
     Returns:
         Forces (k,) of the driven joints and accelerations (n - k,) of the others.
@@ -267,7 +269,9 @@ def hybrid_dynamics(
     columns = [
         subtract_vectors(inverse([float(k == i) for k in range(n)], False), bias) for i in free
     ]
-    a_f = LdltFactorization([[column[i] for column in columns] for i in free]).solve(
+    free_block = [[column[i] for column in columns] for i in free]
+    held_places = [k for k, i in enumerate(free) if i in held]
+    a_f = LdltFactorization(free_block, [0.0] * len(free), held_places).solve(
         [-forces_without_free_motion[i] for i in free]
     )
     tau = add_vectors(

@@ -165,6 +165,7 @@ class JointForceFormulas:
         (self._moving_factor,) = load("moving_factor")
         self.circuit_friction = load("circuit_friction")
         self._fixed_inertia, self._tip_point = load("fixed_inertia"), load("tip_point")
+        self._least_inertias: Vector = [0.0, *load("least_inertias")]
         self.gamma = loops.gamma
         self.joint_velocities: Vector = [
             0.0,

@@ -7,12 +7,17 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from crane.common.errors import MechanismError
+from crane.common.errors import SingularMassMatrixError
 from crane.common.samples import Array, solve_linear
 from crane.common.threads import ThreadLocal
 from crane.dynamics.frame_jacobians import frame_placement, point_jacobian
 from crane.dynamics.joint_forces import REST_VELOCITY, JointForces
 from crane.machine.machine import Machine
+from crane.machine.massless_motions import (
+    MIN_INERTIA_SHARE,
+    describe_massless_motion,
+    hold_coordinates,
+)
 
 
 class ClosedState(NamedTuple):
@@ -86,6 +91,8 @@ class PinocchioDynamics:
         self._rotor_columns = np.flatnonzero(self._armature)
         self._closure, self._joint_forces = machine.closure, forces
         self._coordinates, self._carrier_bodies = machine.coordinates, motion_parents
+        self._held, self._tree = machine.held, machine.tree
+        self._least_inertias = machine.least_inertias
         self._tip = None if machine.tip is None else frame_placement(machine, machine.tip)
 
     @cached_property
@@ -180,7 +187,9 @@ class PinocchioDynamics:
                 stick_slip = list(self._joint_forces.stick_slip_columns)
                 joint_friction = gamma.T @ self._joint_forces.friction_forces(v, use_modes=True)
                 net = x - self._inverse_dynamics(state, state.drift, False) - joint_friction
-                parts = self._mass_matrix(state), gamma[stick_slip], state.drift[stick_slip], net
+                mass = hold_coordinates(self._mass_matrix(state), self._held)
+                net[list(self._held)] = 0.0
+                parts = mass, gamma[stick_slip], state.drift[stick_slip], net
                 return np.concatenate([np.ravel(part) for part in parts])
             case "statics":
                 return self._static_quantities(state)
@@ -239,16 +248,50 @@ class PinocchioDynamics:
         return a_a, joint_friction, float(min([1.0, *margins])), holding_forces
 
     def _solve_mass_matrix(self, state: ClosedState, forces: Array) -> Array:
-        """M_A^-1 of net forces."""
-        mass = self._mass_matrix(state)
+        """M_A^-1 of net forces; held coordinates do not accelerate.
+
+        Raises:
+            MechanismError: M_A is singular.
+        """
+        mass = hold_coordinates(self._mass_matrix(state), self._held)
+        error = self._singularity_error(state, mass)
+        if error is not None:
+            raise error
+        held = np.isin(np.arange(len(mass)), self._held)
+        return solve_linear(mass, np.where(held, 0.0, forces))
+
+    def singular_mass_error(
+        self, q: Array, sample: str = "", margin: float = 1.0
+    ) -> SingularMassMatrixError | None:
+        """The error of forward dynamics at a closed configuration (nq,); None if M_A is regular.
+
+        Args:
+            q: (nq,).
+            sample: Name of the sample in the error.
+            margin: Factor on the inertia that counts as none.
+        """
+        zero = np.zeros(self._closure.degrees_of_freedom)
+        state = ClosedState(q, *self._closure.gamma_velocity_drift(q, zero))
+        mass = hold_coordinates(self._mass_matrix(state), self._held)
+        return self._singularity_error(state, mass, sample, margin)
+
+    def _singularity_error(
+        self, state: ClosedState, mass: Array, sample: str = "", margin: float = 1.0
+    ) -> SingularMassMatrixError | None:
+        """The error where M_A, without held coordinates, is singular as in `LdltFactorization`."""
+        active = self._closure.active
+        least = self._least_inertias[active] + MIN_INERTIA_SHARE * np.diag(mass)
         try:
-            np.linalg.cholesky(mass)  # elimination would divide by rounding errors
-            return solve_linear(mass, forces)
+            factor = np.linalg.cholesky(np.delete(np.delete(mass, self._held, 0), self._held, 1))
+            if (np.diag(factor) ** 2 > margin * np.delete(least, self._held)).all():
+                return None
         except np.linalg.LinAlgError:
-            raise MechanismError(
-                "the mass matrix is not definite: some motion moves no mass that counts beside "
-                "the others', correct the masses and inertias"
-            ) from None
+            pass
+        place = self._coordinates.format_values(active, state.q[active])
+        motion = describe_massless_motion(
+            self._model, self._closure, self._tree, state.q, state.gamma, mass
+        )
+        return SingularMassMatrixError(f"the mass matrix is singular at {place}{sample}, {motion}")
 
     def _kinetic_and_potential_energy(self, state: ClosedState) -> Array:
         configuration = self._coordinates.configuration(state.q)

@@ -6,9 +6,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crane.closure.change_points import interpolate_limit
 from crane.closure.kinematics_formulas import tree_geometry
 from crane.codegen import FormulaTooLongError, run_with_fallback
-from crane.common.errors import CraneError, InputError, MechanismError, suggest_names
+from crane.common.errors import (
+    CraneError,
+    InputError,
+    MechanismError,
+    SingularConfigurationError,
+    SingularMassMatrixError,
+    suggest_names,
+)
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, apply_per_sample, as_samples, stack_length
 from crane.description.machine_parameters import unknown_parameter_text
@@ -22,6 +30,7 @@ from crane.dynamics.pinocchio_dynamics import PinocchioDynamics
 from crane.formats.machine_loading import MachineVariants
 from crane.machine.machine import Machine
 from crane.machine.machine_checks import has_mass
+from crane.machine.massless_motions import MIN_INERTIA_SHARE
 
 UNIT_OF_ZERO_PARAMETER = 0.1  # magnitude assumed for a parameter that is 0
 _RELATIVE_STEP = 1e-3  # step as a fraction of the parameter
@@ -160,7 +169,7 @@ class QuantityEvaluator(OneLineRepr):
         if self.backend == "compiled":
             geometry = machine.closure.compiled_closure.geometry
             self.formula_constants = np.ascontiguousarray(
-                dynamics_constants(machine, geometry, self.forces)
+                dynamics_constants(machine, geometry, self.forces, machine.least_inertias)
             )
         # constants to fold into formulas; NaN for those that change with the motion
         self.constant_pattern = self.formula_constants.copy()
@@ -194,6 +203,50 @@ class QuantityEvaluator(OneLineRepr):
                 lambda *one: self.tree_dynamics.evaluate(quantity, *one), q, v_a, x
             )
         return formula.evaluate_closed(q, np.concatenate([v_a, x], axis=-1))
+
+    def singular_mass_error(
+        self, q: Array, sample: str = "", margin: float = 1.0
+    ) -> SingularMassMatrixError | None:
+        """See `PinocchioDynamics.singular_mass_error`."""
+        return self.tree_dynamics.singular_mass_error(q, sample, margin)
+
+    def check_free_block(self, q_a: ArrayLike, free_block: Array) -> None:
+        """Raise the error of a singular mass matrix of the free joints (..., k, k)."""
+        try:
+            pivots = np.diagonal(np.linalg.cholesky(free_block), axis1=-2, axis2=-1) ** 2
+            least = MIN_INERTIA_SHARE * np.diagonal(free_block, axis1=-2, axis2=-1)
+            machine = self.machine
+            least = least + machine.least_inertias[machine.closure.active][~machine.is_driven]
+            is_singular = bool((pivots <= least).any())
+        except np.linalg.LinAlgError:
+            is_singular = True
+        if is_singular:
+            self.check_mass_matrices(self.machine.closure.solve(np.atleast_2d(q_a)))
+
+    def check_mass_matrices(self, q: Array) -> None:
+        """Raise at the first of closed configurations (N, nq) whose mass matrix is singular."""
+        for i, one in enumerate(q):
+            error = self.singular_mass_error(one, f" (sample {i})" if len(q) > 1 else "")
+            if error is not None:
+                raise error
+
+    def _evaluate_beside_change_point(
+        self, formula: CompiledQuantity, q: Array, row: Array, sample: str
+    ) -> Array:
+        """A quantity at a closed configuration (nq,), in a change point as its limit."""
+        neighbours = self.machine.closure.neighbours(q)
+        if not neighbours:
+            return formula.evaluate_closed(q, row)
+        limit = interpolate_limit(
+            np.array([formula.evaluate_closed(one, row) for one in neighbours])
+        )
+        if limit is None:
+            active = self.machine.closure.active
+            place = self.machine.coordinates.format_values(active, q[active])
+            raise SingularConfigurationError(
+                f"forces have no bounds in the change point at {place}{sample}: stay away from it"
+            )
+        return limit
 
     def set_stick_slip_modes(
         self, slip_sign: Array, is_held: Array, inverse_velocity: Array, is_moving: bool
@@ -235,9 +288,9 @@ class QuantityEvaluator(OneLineRepr):
         geometry = tree_geometry(variant.closure.equations)
         if geometry.parents != self.machine.closure.compiled_closure.geometry.parents:
             raise InputError("the tree is not the same")
-        return np.concatenate(
-            [geometry.constants, dynamics_constants(variant, geometry, JointForces(variant))]
-        )
+        least = self.machine.least_inertias  # thresholds are not differentiated
+        constants = dynamics_constants(variant, geometry, JointForces(variant), least)
+        return np.concatenate([geometry.constants, constants])
 
     def _compiled_quantity(self, quantity: str) -> CompiledQuantity | None:
         """Machine code of a quantity, or None on the Pinocchio backend."""
@@ -335,9 +388,11 @@ class QuantityEvaluator(OneLineRepr):
 
         def reach(i: int) -> None:
             sample = f" (sample {i})" if is_stack else ""
-            out[i] = formula.evaluate_closed(
-                closure.continue_from_home(formula.cursor, targets[i], sample), rows[i]
-            )
+            q = closure.continue_from_home(formula.cursor, targets[i], sample)
+            out[i] = self._evaluate_beside_change_point(formula, q, rows[i], sample)
+            error = None if np.isfinite(out[i]).all() else self.singular_mass_error(q, sample)
+            if error is not None and formula.solves_mass_matrix:
+                raise error
 
         run_with_fallback(
             len(targets),

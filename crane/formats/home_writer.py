@@ -15,6 +15,7 @@ import yaml
 from crane.common.atomic_output import check_file_is_writable, replace_file
 from crane.common.errors import CraneError, CraneWarning, OutputError
 from crane.common.package_search import NEAREST_ASSEMBLY
+from crane.common.unit_conversions import WrittenNumber
 from crane.description.machine_lookup import bundled_machines, example_robots
 from crane.formats.machine_loading import load
 from crane.formats.robot_files import is_sdf_file, is_simulator_file
@@ -71,7 +72,11 @@ def write_home(
             text = path.read_bytes().decode("utf-8")
         except UnicodeDecodeError:
             raise OutputError(f"{path}: is not UTF-8, save it so first") from None
-        home = dict(zip(machine.joints, machine.home.tolist(), strict=True))
+        written, plain = machine.written_numbers, WrittenNumber(0.0)
+        home = {
+            joint: written.get(("home", joint), plain).write(value)
+            for joint, value in zip(machine.joints, machine.home.tolist(), strict=True)
+        }
         find_edits = _yaml_edits if path.suffix.lower() in (".yaml", ".yml") else _xml_edits
         edited = text.removeprefix(_BYTE_ORDER_MARK)
         for start, end, new in sorted(find_edits(edited, home), reverse=True):
@@ -137,7 +142,7 @@ def _check_written_home(path: Path, expected: Machine) -> None:
         )
 
 
-def _yaml_edits(text: str, home: Mapping[str, float]) -> list[TextEdit]:
+def _yaml_edits(text: str, home: Mapping[str, float | str]) -> list[TextEdit]:
     line_break = "\r\n" if "\r\n" in text else "\n"
     top = yaml.compose(text, yaml.SafeLoader)
     assert isinstance(top, yaml.MappingNode), "it was read before"
@@ -152,7 +157,7 @@ def _yaml_edits(text: str, home: Mapping[str, float]) -> list[TextEdit]:
 
 
 def _mapping_edits(
-    text: str, home_node: yaml.MappingNode, home: Mapping[str, float], line_break: str
+    text: str, home_node: yaml.MappingNode, home: Mapping[str, float | str], line_break: str
 ) -> list[TextEdit]:
     span = range(home_node.start_mark.index, home_node.end_mark.index)
     has_shared_values = any(value.start_mark.index not in span for _, value in home_node.value)
@@ -179,21 +184,23 @@ def _mapping_edits(
     return [*edits, (end, end, _block_text(missing, " " * key.start_mark.column, line_break))]
 
 
-def _block_text(home: Mapping[str, float], indent: str, line_break: str) -> str:
+def _block_text(home: Mapping[str, float | str], indent: str, line_break: str) -> str:
     return "".join(
         f"{line_break}{indent}{_yaml_text(x)}: {_yaml_text(value)}" for x, value in home.items()
     )
 
 
-def _flow_text(home: Mapping[str, float]) -> str:
+def _flow_text(home: Mapping[str, float | str]) -> str:
     return ", ".join(f"{_yaml_text(joint)}: {_yaml_text(value)}" for joint, value in home.items())
 
 
 def _yaml_text(value: str | float) -> str:
-    return str(yaml.safe_dump([value], default_flow_style=True, width=10**6)).strip()[1:-1]
+    return str(
+        yaml.safe_dump([value], default_flow_style=True, width=10**6, allow_unicode=True)
+    ).strip()[1:-1]
 
 
-def _xml_edits(text: str, home: Mapping[str, float]) -> list[TextEdit]:
+def _xml_edits(text: str, home: Mapping[str, float | str]) -> list[TextEdit]:
     data = text.encode("utf-8")
     line_break = "\r\n" if "\r\n" in text else "\n"
     home_elements: list[tuple[int, int]] = []  # start of the start tag and of the end tag
@@ -253,7 +260,7 @@ def _xml_edits(text: str, home: Mapping[str, float]) -> list[TextEdit]:
     return [*edits, (last, last, f"{_joint_elements(missing, line_break).lstrip()}  ")]
 
 
-def _joint_elements(home: Mapping[str, float], line_break: str) -> str:
+def _joint_elements(home: Mapping[str, float | str], line_break: str) -> str:
     from xml.sax.saxutils import quoteattr  # slow to import
 
     return line_break + "".join(

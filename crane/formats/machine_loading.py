@@ -24,7 +24,9 @@ from crane.description.machine_lookup import CHANGES_SEPARATOR, find_machine_fil
 from crane.description.machine_parameters import GRAVITY_PREFIX, parameters
 from crane.description.parameter_changes import (
     apply_parameter_changes,
+    changes_in_si,
     lock_joints,
+    locks_in_si,
     set_active_joints,
 )
 from crane.description.rotation_vectors import add_floating_base, check_freedoms
@@ -43,8 +45,8 @@ from crane.machine.machine_checks import (
 
 def load(
     name: str | Path,
-    changes: Mapping[str, float] | None = None,
-    lock: Mapping[str, float] | None = None,
+    changes: Mapping[str, float | str] | None = None,
+    lock: Mapping[str, float | str] | None = None,
     active: Sequence[str] | None = None,
     free: Sequence[str] | None = None,
     floating: bool | Sequence[str] = False,
@@ -61,8 +63,9 @@ def load(
             file (.yaml), URDF (.urdf, .xacro, with `<loop>` elements for loops), SDF (.sdf,
             .world) or MJCF (.xml).
         changes: New values by the names of `crane.description.parameters`, such as
-            {"link3_G.x": 0.1, "link7.mass": 0.25, "payload.mass": 0.1}; SI units.
-        lock: Coordinates [m], [rad] of joints to be fixed, by name.
+            {"link3_G.x": 0.1, "link7.mass": 0.25, "payload.mass": "0.1 t"}; SI units, or texts
+            with other ones.
+        lock: Coordinates [m], [rad] of joints to be fixed, by name; or texts with other units.
         active: Active joints in the order of q_A, if not those of the file. If there are more than
             degrees of freedom, all of them are drives, see `Dynamics.drive_forces`.
         free: Free joints, which nothing drives, if not those of the file. Degrees of freedom
@@ -107,8 +110,8 @@ def load(
 
 
 def _with_gravity(
-    changes: Mapping[str, float], gravity: Sequence[float] | None
-) -> Mapping[str, float]:
+    changes: Mapping[str, float | str], gravity: Sequence[float] | None
+) -> Mapping[str, float | str]:
     """Return the changes with those by the gravity of the caller, or else of the load options.
 
     Raises:
@@ -216,13 +219,14 @@ def _read_spec(
 
 def _assemble_machine(
     spec: MachineSpec,
-    changes: Mapping[str, float] | None,
-    lock: Mapping[str, float] | None,
+    changes: Mapping[str, float | str] | None,
+    lock: Mapping[str, float | str] | None,
     chosen_joints: Mapping[str, tuple[str, ...]],
     floating: bool | tuple[str, ...],
     closure_provider: ClosureProvider = lambda *_: None,
 ) -> Machine:
     spec_before_changes = spec
+    changes, lock = changes_in_si(spec, changes), locks_in_si(spec, lock)
     if changes:
         spec = apply_parameter_changes(spec, changes)
     if lock:
@@ -234,7 +238,7 @@ def _assemble_machine(
     )
     _SPEC_BEFORE_CHANGES[closure] = spec_before_changes
     spec, model = replace_infeasible_inertias(spec, model, closure)
-    check_masses(spec, model, closure)
+    held = [closure.active_names[i] for i in check_masses(spec, model, closure)]
     check_frame_elements(spec, closure)
     coordinates = closure.equations.coordinates
     lower, upper = coordinates.lower, coordinates.upper
@@ -266,16 +270,15 @@ def _assemble_machine(
         arguments=MappingProxyType(load_options().arguments),
         trusts_xacro=load_options().trust_xacro,
         parameter_changes=MappingProxyType(
-            {name: float(value) for name, value in (changes or {}).items()}
+            {name: float(value) for name, value in changes.items()}
         ),
-        free=select_free_joints(spec, closure.active_names),
+        free=select_free_joints(spec, closure.active_names, held),
         external_forces=(),
         supports=spec.supports,
         pin_capacities=MappingProxyType(dict(spec.pin_capacities)),
         explicit_drives=select_motors(spec, closure.active_names),
-        locked_joints=MappingProxyType(
-            {name: float(value) for name, value in (lock or {}).items()}
-        ),
+        locked_joints=MappingProxyType({name: float(value) for name, value in lock.items()}),
+        written_numbers=MappingProxyType(dict(spec.written_numbers)),
     )
     return machine.with_external_forces(*spec.external_forces) if spec.external_forces else machine
 

@@ -110,7 +110,7 @@ class CircuitValues:
         self._cylinders_by_supply = {
             name: [x for x in self._cylinders if x.valve.supply == name] for name in self.pressures
         }
-        openings = {cylinder.joint: cylinder.inlet_openings for cylinder in self._cylinders}
+        openings = {cylinder.joint: cylinder.requested_openings for cylinder in self._cylinders}
         elements, pumps = circuit.hydraulics.elements, circuit.hydraulics.pumps
         # of the pumps whose regulator or valves use them
         loads = {

@@ -23,12 +23,13 @@ COUNTERBALANCE_KEYS = ("counterbalance_a", "counterbalance_b")
 
 @dataclass(frozen=True)
 class OpeningCurve:
-    """Share of a flow coefficient over the spool stroke |u|: linear between points.
+    """Share of a flow coefficient over the spool stroke: linear between points.
 
-    Before the first and behind the last point the curve is constant.
+    Before the first and behind the last point the curve is constant. The stroke is that in the
+    direction in which the edge opens; an edge with points below 0 is open around the middle.
 
     Attributes:
-        points: Pairs of |u|, increasing from 0 to 1, and shares, at least 0.
+        points: Pairs of strokes, increasing from -1 or more to 1, and shares, at least 0.
     """
 
     points: tuple[tuple[float, float], ...]
@@ -37,9 +38,9 @@ class OpeningCurve:
         if len(self.points) < 2:
             raise InputError("a curve has two points at least, give pairs [u, value]")
         strokes = [u for u, _ in self.points]
-        if strokes[0] < 0 or strokes[-1] > 1:
+        if strokes[0] < -1 or strokes[-1] > 1:
             raise InputError(
-                f"a curve goes over the share of the spool's stroke, from 0 to 1, this one from "
+                f"a curve goes over the share of the spool's stroke, up to 1, this one from "
                 f"{strokes[0]:g} to {strokes[-1]:g}"
             )
         if any(after <= before for before, after in itertools.pairwise(strokes)):
@@ -49,8 +50,13 @@ class OpeningCurve:
         if not any(share for _, share in self.points):
             raise InputError("all values of a curve are 0, leave it out")
 
+    @property
+    def is_underlapped(self) -> bool:
+        """Whether the edge is open around the middle."""
+        return self.points[0][0] < 0
+
     def evaluate(self, u: Scalar) -> Scalar:
-        """Share at the stroke |u|, a float or a formula."""
+        """Share at the stroke u, a float or a formula."""
         share: Scalar = self.points[0][1]
         for (u0, share0), (u1, share1) in itertools.pairwise(self.points):
             share = share + ((share1 - share0) / (u1 - u0)) * (clip(u, u0, u1) - u0)
@@ -198,7 +204,8 @@ class Spool:
         joint: Joint of the cylinder.
         neutral: Signal of the middle position [V].
         full: Signal of u = 1, which drains chamber B [V].
-        dead_band: Share of the spool stroke without flow.
+        dead_band: Share of the spool stroke without flow; negative: an underlap, the share over
+            which inlet and outlet of a chamber are both open, on either side of the middle.
         bandwidth: Natural frequency of the spool [rad/s]; 0 for a spool without inertia.
         damping: Damping ratio of the spool.
         rate: Largest speed of the spool, in strokes per second; 0 for no limit.
@@ -209,7 +216,7 @@ class Spool:
     joint: str
     neutral: float = signed_field(0.0)
     full: float = signed_field(1.0)
-    dead_band: float = 0.0
+    dead_band: float = signed_field(0.0)
     bandwidth: float = 0.0
     damping: float = positive_field(1.0)
     rate: float = 0.0
@@ -221,16 +228,23 @@ class Spool:
         check_parameters(self, label)
         _check_spool(self, label)
 
+    @property
+    def overlap(self) -> float:
+        """The dead band that a signal has to pass; 0 of a spool with underlap."""
+        return max(self.dead_band, 0.0)
+
 
 @dataclass(frozen=True)
 class Valve:
     """A proportional directional valve of one cylinder.
 
     The signal U [V] sets the target u = (U - neutral) / (full - neutral), from -1 to 1, that the
-    spool position follows. Outside of the dead band the opening is
-    y = sign(u) (|u| - dead_band) / (1 - dead_band). With a dead time the spool follows the signal
-    of the time t - delay, and before that the first signal. The flows through the edges are
-    equations (21) and (22) of the electro-hydraulic forwarder paper,
+    spool position follows. Outside of the dead band d the opening is
+    y = sign(u) (|u| - d) / (1 - d). Each edge has its own opening, (u - d) / (1 - d) of c1 and c2,
+    (-u - d) / (1 - d) of c3 and c4, within 0 and 1: with an underlap, d < 0, all four are open by
+    -d / (1 - d) in the middle, and oil flows from the supply to the tank. With a dead time the
+    spool follows the signal of the time t - delay, and before that the first signal. The flows
+    through the edges are equations (21) and (22) of the electro-hydraulic forwarder paper,
 
         y > 0:  Q_A = c1 y sqrt(p_S - p_A),  Q_B = -c2 y sqrt(p_B - p_R),
         y < 0:  Q_A = c3 y sqrt(p_A - p_R),  Q_B = -c4 y sqrt(p_S - p_B).
@@ -261,7 +275,8 @@ class Valve:
         margin: Pressure drop that the compensator keeps [Pa]; 0 without compensation.
         neutral: Signal of the middle position [V].
         full: Signal of u = 1 [V].
-        dead_band: Share of the spool stroke without flow.
+        dead_band: Share of the spool stroke without flow; negative: an underlap, the share over
+            which inlet and outlet of a chamber are both open, on either side of the middle.
         bandwidth: Natural frequency of the spool [rad/s]; 0 for a spool without inertia.
         damping: Damping ratio of the spool.
         rate: Largest speed of the spool, in strokes (of u from 0 to 1) per second; 0 for no limit.
@@ -293,7 +308,7 @@ class Valve:
     margin: float = 0.0
     neutral: float = signed_field(0.0)
     full: float = signed_field(1.0)
-    dead_band: float = 0.0
+    dead_band: float = signed_field(0.0)
     bandwidth: float = 0.0
     damping: float = positive_field(1.0)
     rate: float = 0.0
@@ -346,12 +361,23 @@ class Valve:
         )
 
     @property
+    def is_underlapped(self) -> bool:
+        """Whether edges are open around the middle."""
+        curves = any(curve.is_underlapped for curve in self.curves.values())
+        return curves or any(spool.dead_band < 0 for spool in self.spools.values())
+
+    @property
     def spools(self) -> "dict[str, Valve | Spool]":
         """Its spools by the names of their signals."""
         return {self.joint: self} | ({f"{self.joint}_b": self.spool_b} if self.spool_b else {})
 
+    @property
+    def overlap(self) -> float:
+        """The dead band that a signal has to pass; 0 of a spool with underlap."""
+        return max(self.dead_band, 0.0)
+
     def opening(self, u: float) -> float:
-        """Opening y at a spool position u."""
+        """Opening y at a spool position u, of the edges that it opens."""
         return math.copysign(
             min(max((abs(u) - self.dead_band) / (1.0 - self.dead_band), 0.0), 1.0), u
         )
@@ -364,7 +390,8 @@ def _check_spool(spool: Spool | Valve, label: str) -> None:
         ComponentParameterError: One is invalid.
     """
     dead_band = spool.dead_band
-    hint = f": looks like percent, write {dead_band / 100:g}" if dead_band < 100 else ""
+    is_percent = 1 <= abs(dead_band) < 100
+    hint = f": looks like percent, write {dead_band / 100:g}" if is_percent else ""
     check_conditions(
         (
             spool.hysteresis >= 0.5,
@@ -378,9 +405,10 @@ def _check_spool(spool: Spool | Valve, label: str) -> None:
             f"full and neutral of {label} are both {spool.full:g}, give two",
         ),
         (
-            dead_band >= 1,
+            abs(dead_band) >= 1,
             "dead_band",
-            f"dead_band of {label} is {dead_band:g}, it must be below 1{hint}",
+            f"dead_band of {label} is {dead_band:g}, it must be "
+            f"{'below 1' if dead_band > 0 else 'above -1'}{hint}",
         ),
         (
             spool.rate > 0 and not spool.bandwidth,

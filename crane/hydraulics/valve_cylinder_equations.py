@@ -72,8 +72,9 @@ class ValveCylinderEquations:
         joint: Joint of the cylinder.
         valve: Its valve.
         pressures: Pressures in A and B [Pa].
-        inlet_openings: Openings y of the inlets to A and B; of a single spool, for positive and
-            negative positions.
+        requested_openings: Openings y of the inlets to A and B that the spools request; of a
+            single spool, for positive and negative positions. An underlapped spool in its neutral
+            position requests none.
         force: Force of the cylinder, equation (20) [N], [N m].
         spring_rate: Rate of the compression of the series spring; empty without one.
         spring_power: Power stored in the series spring [W].
@@ -125,8 +126,18 @@ class ValveCylinderEquations:
             ]
             for u, spool in zip(spool_positions, self._spool_constants, strict=True)
         ]
-        self.inlet_openings = [openings[0][0], openings[-1][1]]
+        self._inlet_openings = [openings[0][0], openings[-1][1]]
         self._outlet_openings = [openings[0][1], openings[-1][0]]
+        self._is_underlapped = [spool.dead_band < 0 for spool in valve.spools.values()]
+        self.requested_openings = [
+            clip(position, 0.0, 1.0) if is_underlapped else opening
+            for position, opening, is_underlapped in zip(
+                (spool_positions[0], -spool_positions[-1]),
+                self._inlet_openings,
+                (self._is_underlapped[0], self._is_underlapped[-1]),
+                strict=True,
+            )
+        ]
 
     @property
     def pressures_by_node(self) -> dict[str, Scalar]:
@@ -136,11 +147,11 @@ class ValveCylinderEquations:
     @property
     def pump_demand(self) -> Scalar:
         """Share of the flow of its pump that it requests of a positive control."""
-        return self._constants["demand"] * maximum(*self.inlet_openings)
+        return self._constants["demand"] * maximum(*self.requested_openings)
 
     @property
     def _sensing_shares(self) -> list[Scalar]:
-        return [clip(y * SENSING_OPENING_GAIN, 0.0, 1.0) for y in self.inlet_openings]
+        return [clip(y * SENSING_OPENING_GAIN, 0.0, 1.0) for y in self._inlet_openings]
 
     def sensed_load_pressure(self, tank: Scalar) -> Scalar:
         """Load pressure that its valve reports; the tank pressure while it is closed [Pa]."""
@@ -164,7 +175,7 @@ class ValveCylinderEquations:
         size = maximum(self._spool_positions[0], -self._spool_positions[0])
         if (curve := self.valve.curves.get("centre")) is not None:
             return self._constants["centre"] * curve.evaluate(size)
-        return self._constants["centre"] * (1.0 - maximum(*self.inlet_openings))
+        return self._constants["centre"] * (1.0 - maximum(*self.requested_openings))
 
     def flows(
         self,
@@ -193,7 +204,8 @@ class ValveCylinderEquations:
                 flows.append(Flow(source, target, constants["relief_gain"] * excess, "cross"))
         if self.valve.regeneration > 0:
             orifice = series_coefficient(
-                constants["regeneration"] * self.inlet_openings[0], *self._outflow_restrictions(1)
+                constants["regeneration"] * self.requested_openings[0],
+                *self._outflow_restrictions(1),
             )
             rate = orifice * signed_square_root(maximum(-difference, 0.0))
             flows.append(Flow(node_b, node_a, self._limit_outflow(rate, 1), "regeneration"))
@@ -204,7 +216,7 @@ class ValveCylinderEquations:
             p = self.pressures[side]
             sign = 1.0 if side == 0 else -1.0
             inlet = self._edge_coefficient(
-                ("c1", "c4")[side], side, sign, self.inlet_openings[side]
+                ("c1", "c4")[side], side, sign, self._inlet_openings[side]
             )
             outlet = self._edge_coefficient(
                 ("c3", "c2")[side], side, -sign, self._outlet_openings[side]
@@ -266,8 +278,9 @@ class ValveCylinderEquations:
         """Coulomb friction that seals and brake add to that of the joint [N], [N m].
 
         F_K = mu (max(p_A - p_R, 0) + max(p_B - p_R, 0)) + B (1 - (|u| - d) / e), with mu of the
-        seals, B of the brake, d the dead band and e the travel that releases the brake. The last
-        factor is limited to 0 and 1; with two spools, that with the larger travel counts.
+        seals, B of the brake, d the dead band, 0 of an underlapped spool, and e the travel that
+        releases the brake. The last factor is limited to 0 and 1; with two spools, that with the
+        larger travel counts.
 
         Args:
             tank: p_R [Pa].
@@ -281,8 +294,11 @@ class ValveCylinderEquations:
             )
         if self._cylinder.brake > 0:
             travel = largest_of([
-                (apply_function("abs", u) - spool["dead_band"]) * constants["per_release"]
-                for u, spool in zip(self._spool_positions, self._spool_constants, strict=True)
+                (apply_function("abs", u) - (0.0 if is_underlapped else spool["dead_band"]))
+                * constants["per_release"]
+                for u, spool, is_underlapped in zip(
+                    self._spool_positions, self._spool_constants, self._is_underlapped, strict=True
+                )
             ])  # fmt: skip
             friction = friction + constants["brake"] * (1.0 - clip(travel, 0.0, 1.0))
         return friction
@@ -291,7 +307,9 @@ class ValveCylinderEquations:
         """Flow coefficient of an edge of a chamber that opens for spool positions of a sign."""
         if (curve := self.valve.curves.get(name)) is not None:
             u = self._spool_positions[-1 if side else 0]
-            stroke = clip(u if sign > 0 else -u, 0.0, 1.0)
+            stroke = clip(u if sign > 0 else -u, -1.0 if curve.is_underlapped else 0.0, 1.0)
+            if curve.is_underlapped:
+                return self._constants[name] * curve.evaluate(stroke)
             return self._constants[name] * where_positive(stroke, curve.evaluate(stroke), 0.0)
         return self._constants[name] * opening
 

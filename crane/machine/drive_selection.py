@@ -55,10 +55,18 @@ def specified_free_joints(spec: MachineSpec) -> tuple[str, ...]:
     )
 
 
-def select_free_joints(spec: MachineSpec, active: Sequence[str]) -> tuple[str, ...]:
-    """Those of the active joints that no drive moves."""
+def select_free_joints(
+    spec: MachineSpec, active: Sequence[str], held: Sequence[str] = ()
+) -> tuple[str, ...]:
+    """Those of the active joints that no drive moves.
+
+    Args:
+        spec: The machine.
+        active: Its active joints.
+        held: Those of them that are held for idle motions, see `Machine.held`.
+    """
     driven = specified_driven_joints(spec)
-    free = specified_free_joints(spec)
+    free = (*specified_free_joints(spec), *held)
     if not driven:
         return tuple(name for name in active if name in free)
     return tuple(name for name in active if name in free or name not in driven)

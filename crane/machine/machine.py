@@ -3,7 +3,7 @@
 import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -20,6 +20,7 @@ from crane.common.errors import InputError, LimitError, suggest_names
 from crane.common.one_line_repr import OneLineRepr, format_count
 from crane.common.package_search import LoadOptions
 from crane.common.samples import Array, as_samples, read_only_copy
+from crane.common.unit_conversions import KeyPath, WrittenNumber
 from crane.description.external_forces import ExternalForce, PhasedWrench
 from crane.description.force_elements import (
     AnyForceElement,
@@ -41,13 +42,14 @@ from crane.description.sensors import Sensor
 from crane.description.specification import Chain, Drive, EstimationSettings, PIGains, Task
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.machine.machine_checks import check_force_elements, check_limited
+from crane.machine.massless_motions import MassProperties
 from crane.machine.payload import Payload
 
 _LIMIT_TOLERANCE = 1e-9  # scaled distance beyond a limit that counts as on it
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Machine(OneLineRepr):
+class Machine(MassProperties, OneLineRepr):
     """A machine with closed kinematic chains, assembled and closed.
 
     Attributes:
@@ -56,8 +58,7 @@ class Machine(OneLineRepr):
         path: The machine file or URDF that it was read from.
         chains: Its open sub-chains.
         tree: Its links and joints, all sub-chains connected.
-        model: Pinocchio's model of the spanning tree, depth-first; nq = nv without floating bases,
-            see `coordinates`.
+        model: Pinocchio's model of the tree, depth-first; for nq and nv see `coordinates`.
         closure: Its loops.
         active: Names of the active joints, in the order of q_A.
         lower: (n,) lower limits of the active joints [m], [rad].
@@ -86,6 +87,7 @@ class Machine(OneLineRepr):
         packages: Folders in which packages were searched for.
         arguments: Values of its file's arguments.
         trusts_xacro: Whether its xacro files may run Python and read all files.
+        written_numbers: Numbers of its machine file with their units, by the keys to them.
     """
 
     name: str
@@ -121,6 +123,7 @@ class Machine(OneLineRepr):
     packages: tuple[str, ...]
     arguments: Mapping[str, str]
     trusts_xacro: bool = False
+    written_numbers: Mapping[KeyPath, WrittenNumber] = field(default_factory=dict)
 
     def _one_line(self) -> str:
         words = [
@@ -128,9 +131,8 @@ class Machine(OneLineRepr):
             format_count(len(self.active), "degree of freedom", "degrees of freedom"),
             format_count(len(self.joints), "joint"),
             format_count(len(self.closure.equations.loops), "loop"),
-            *(["hydraulic"] if self.hydraulics is not None else []),
-            *([f"{len(self.free)} free"] if self.free else []),
-        ]
+            *["hydraulic"] * bool(self.hydraulics), *[f"{len(self.free)} free"] * bool(self.free),
+        ]  # fmt: skip
         return f"Machine({', '.join(words)})"
 
     @property
@@ -205,8 +207,7 @@ class Machine(OneLineRepr):
     @cached_property
     def load_name(self) -> str:
         """Argument of `crane.load` for this machine: the bundled name, or the path."""
-        known_as = self.path.stem
-        bundle = bundled_machines()
+        known_as, bundle = self.path.stem, bundled_machines()
         named = bundle if known_as in bundle else example_robots()
         return known_as if named.get(known_as) == self.path else str(self.path)
 
@@ -279,9 +280,8 @@ class Machine(OneLineRepr):
         outside = (q_a < self.lower - slack) | (q_a > self.upper + slack)
         if outside.any():
             index = tuple(int(i) for i in np.argwhere(outside)[0])
-            joint = index[-1]
+            joint, name = index[-1], self.active[index[-1]]
             sample = f" in sample {index[0]}" if q_a.ndim == 2 else ""
-            name = self.active[joint]
             place = self.tree.joints[name].limits.source_location
             raise LimitError(
                 f"{label}: {name} = {q_a[index]:.6g}{sample} is outside of its limits "

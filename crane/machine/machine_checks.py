@@ -13,8 +13,12 @@ import pinocchio as pin
 from crane.closure.closure import Closure
 from crane.closure.coordinates import Coordinates
 from crane.closure.loop_equations import frame_id
-from crane.common.errors import CraneWarning, DescriptionError, InputError
-from crane.common.samples import Array
+from crane.common.errors import (
+    CraneWarning,
+    DescriptionError,
+    InputError,
+    SingularConfigurationError,
+)
 from crane.description.findings import is_strict, report_error
 from crane.description.force_elements import AnyForceElement, GasSpring, element_name
 from crane.description.kinematic_tree import (
@@ -26,9 +30,9 @@ from crane.description.kinematic_tree import (
     nearest_inertia,
 )
 from crane.description.specification import MachineSpec
+from crane.machine.idle_motions import judge_massless_motions
 from crane.machine.machine_assembly import assemble_tree
-
-_DEFINITE_TOLERANCE = 1e-12  # least eigenvalue of M_A scaled to unit diagonal
+from crane.machine.massless_motions import MIN_INERTIA_SHARE, massless_motions_at
 
 
 def replace_infeasible_inertias(
@@ -57,9 +61,9 @@ def replace_infeasible_inertias(
     replaced_links = [link for link, problem in findings.values() if problem.is_negative]
     spec, model = _replace_by_nearest_feasible(spec, model, replaced_links)
     others = [link for link, problem in findings.values() if not problem.is_negative]
-    if others and has_mass(model) and len(_massless_motions(model, closure)):
+    if others and has_mass(model) and _has_massless_motion(model, closure):
         improved = _replace_by_nearest_feasible(spec, model, others)
-        if not len(_massless_motions(improved[1], closure)):
+        if not _has_massless_motion(improved[1], closure):
             (spec, model), replaced_links = improved, [*replaced_links, *others]
     if not is_strict():  # otherwise reported while reading
         for link, problem in findings.values():
@@ -100,12 +104,15 @@ def _warn_about_inertia(link: Link, problem: InertiaProblem, is_replaced: bool) 
     )
 
 
-def check_masses(spec: MachineSpec, model: pin.Model, closure: Closure) -> None:
+def check_masses(spec: MachineSpec, model: pin.Model, closure: Closure) -> tuple[int, ...]:
     """Warn of moving links without mass; refuse those that make the mass matrix singular.
 
     M_A = gamma^T M gamma at home is definite if each joint moves some inertia of its own link,
-    S^T I S > 0, by induction from the ends of the tree. A machine without any mass has kinematics
-    only, which `Dynamics` refuses, not the loading.
+    S^T I S > 0, by induction from the ends of the tree; else `judge_massless_motions` decides. A
+    machine without any mass has kinematics only, which `Dynamics` refuses, not the loading.
+
+    Returns:
+        Indices of held coordinates, see `Machine.held`.
 
     Raises:
         DescriptionError: Some motion of the machine moves no mass.
@@ -123,39 +130,35 @@ def check_masses(spec: MachineSpec, model: pin.Model, closure: Closure) -> None:
         ):
             return False
         moments = np.linalg.eigvalsh(inertia.inertia)
+        extent = inertia.mass * closure.characteristic_length**2 + float(moments.sum())
+        least = MIN_INERTIA_SHARE * extent
         if (
             links[joint.parent].composite_joint is not None
         ):  # other joints of its series move the link as well
-            return not inertia.mass > 0 or bool(moments[0] <= _DEFINITE_TOLERANCE * moments[2])
+            return not inertia.mass > 0 or bool(moments[0] <= least)
         if joint.kind == "prismatic":
             return not inertia.mass > 0
         arm = inertia.mass * float(np.sum(np.cross(inertia.lever, joint.axis) ** 2))
-        own = float(joint.axis @ inertia.inertia @ joint.axis) + arm
-        return own <= _DEFINITE_TOLERANCE * (arm + float(moments[2]))
+        return float(joint.axis @ inertia.inertia @ joint.axis) + arm <= least
 
     joints_without_inertia = [joint for joint in spec.tree.moving_joints if lacks_inertia(joint)]
-    massless_joints = [joint for joint in joints_without_inertia if not body(joint).mass > 0]
-    if not joints_without_inertia:
-        return
+    # the axes of a series may line up
+    has_series = any(link.composite_joint is not None for link in spec.tree.links.values())
+    if not joints_without_inertia and not has_series:
+        return ()
     if not has_mass(model):
         text = (
             "no link that moves has a mass: kinematics only, dynamics needs an <inertial> of each"
         )
         warnings.warn(f"{spec.path.name}: {text}", CraneWarning, stacklevel=3)
-        return
-    columns = [coordinates.column(joint.name) for joint in joints_without_inertia]
-    motions = _massless_motions(model, closure)
-    for motion in motions:
-        joint = joints_without_inertia[int(np.abs(motion[columns]).argmax())]
-        link = spec.tree.links[joint.child]
-        missing = "no mass" if joint in massless_joints else "no inertia against it"
-        problem = f"joint '{joint.name}' moves link '{link.name}', which has {missing}"
-        report_error(
-            DescriptionError(f"{link.source_location}: {problem}, give it an <inertial>"),
-            harmless=True,
-        )
+        return ()
+    massless_joints = [joint for joint in joints_without_inertia if not body(joint).mass > 0]
+    try:
+        is_regular, held = judge_massless_motions(spec, model, closure, joints_without_inertia)
+    except SingularConfigurationError:  # home is no configuration to judge by
+        return ()
     ignored_joints = [joint for joint in massless_joints if not body(joint).inertia.any()]
-    if ignored_joints and not len(motions):
+    if ignored_joints and is_regular:
         first = spec.tree.links[ignored_joints[0].child]
         count = f" ({len(ignored_joints)} such)" if len(ignored_joints) > 1 else ""
         warnings.warn(
@@ -165,6 +168,7 @@ def check_masses(spec: MachineSpec, model: pin.Model, closure: Closure) -> None:
             CraneWarning,
             stacklevel=3,
         )
+    return held
 
 
 def has_mass(model: pin.Model) -> bool:
@@ -172,21 +176,8 @@ def has_mass(model: pin.Model) -> bool:
     return any(body.mass > 0 or body.inertia.any() for body in list(model.inertias)[1:])
 
 
-def _massless_motions(model: pin.Model, closure: Closure) -> Array:
-    """Velocities (k, nv) of motions at home that move no mass; empty where M_A is definite."""
-    gamma = closure.gamma_velocity_drift(closure.home, np.zeros(closure.degrees_of_freedom))[
-        0
-    ]  # uncompiled
-    upper = np.triu(
-        pin.crba(
-            model, model.createData(), closure.equations.coordinates.configuration(closure.home)
-        )
-    )
-    mass: Array = gamma.T @ (upper + np.triu(upper, 1).T) @ gamma
-    largest = np.sqrt(np.diag(mass))
-    scale = 1 / np.where(largest > 0, largest, 1.0)
-    values, vectors = np.linalg.eigh(mass * scale * scale[:, None])
-    return np.asarray((gamma @ (scale[:, None] * vectors[:, values < _DEFINITE_TOLERANCE])).T)
+def _has_massless_motion(model: pin.Model, closure: Closure) -> bool:
+    return massless_motions_at(model, closure, closure.home).shape[1] > 0
 
 
 _COINCIDENT_TOLERANCE = 1e-9  # [m]

@@ -22,6 +22,7 @@ from crane.common.errors import (
     check_name,
     suggest_names,
 )
+from crane.common.unit_conversions import UnitError, parse_number
 from crane.description.sensors import (
     PRESSURE_PREFIX,
     SENSOR_PREFIX,
@@ -190,10 +191,13 @@ def _sensor_notes(table: Table) -> dict[str, float]:
         if not name.startswith(SENSOR_PREFIX):
             continue
         try:
-            quantity, _ = parse_sensor_parameter(name)
-            parameters[name] = float(text)
+            quantity, parameter = parse_sensor_parameter(name)
             problem = f"the note '{name}' is of no column"
             check_name(quantity, table.units, problem, RecordingError)
+            unit = {"scale": "", "delay": "s"}.get(parameter, table.units[quantity])
+            parameters[name] = parse_number(text, (unit,))
+        except UnitError as error:
+            raise RecordingError(f"the note '{name}' is '{text}', {error}") from None
         except InputError as error:
             raise RecordingError(f"the note {error}") from None
         except ValueError:

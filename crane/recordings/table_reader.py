@@ -1,7 +1,7 @@
 """Reading of tables from CSV and npz files, with bounds and messages that name the line.
 
 Tables are in SI units: columns in bar, deg, mm and other units of
-`crane.common.units.SI_CONVERSIONS` are converted, those in other units stay as they are.
+`crane.common.unit_conversions` are converted, those in units that are not known stay as they are.
 """
 
 import codecs
@@ -19,7 +19,7 @@ import numpy as np
 from crane.common import scratch_arrays
 from crane.common.errors import RecordingError
 from crane.common.samples import Array
-from crane.common.units import SI_CONVERSIONS, accepted_units
+from crane.common.unit_conversions import accepted_units, column_conversion
 from crane.description.sensors import TIME
 from crane.recordings.npz import MAX_COLUMNS, MAX_NUMBERS, read_arrays, read_columns
 from crane.recordings.rotation_columns import convert_quaternions
@@ -205,9 +205,9 @@ def _convert_to_si(table: Table) -> Table:
     units, values = dict(table.units), table.values
     for i, (name, unit) in enumerate(table.units.items()):
         scratch_arrays.release_pages()
-        if unit in SI_CONVERSIONS:
-            units[name], a, b = SI_CONVERSIONS[unit]
-            values[:, i] = values[:, i] * a / b
+        units[name], size = column_conversion(unit)
+        if size != 1:  # two factors, so that 12.3 mm is 0.0123 m exactly
+            values[:, i] = values[:, i] * float(size.numerator) / float(size.denominator)
         column = values[:, i]
         is_too_large = np.isfinite(column) & (np.abs(column) > _MAX_VALUE)
         if is_too_large.any():
@@ -307,7 +307,7 @@ def _parse_header(heading: str) -> dict[str, str]:
             f"no column '{TIME}' in the header, add '{TIME} [s]', or say by a file of columns "
             "(--columns) which column of a log is which"
         )
-    check_unit(TIME, units[TIME], accepted_units("s"))
+    check_unit(TIME, column_conversion(units[TIME])[0], accepted_units("s"))
     return units
 
 

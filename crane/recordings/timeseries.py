@@ -21,7 +21,7 @@ from crane.common.atomic_output import replace_file
 from crane.common.errors import RecordingError, check_name, prefix_location
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
-from crane.common.units import accepted_units as accepted_units
+from crane.common.unit_conversions import accepted_units as accepted_units
 from crane.description.sensors import (
     FORCE_SUFFIX,
     FORCE_UNITS,

@@ -92,7 +92,7 @@ def sway_study(
     task: str,
     payloads: Sequence[float] = (0.0, 100.0, 200.0, 300.0, 400.0, 500.0),
     damping: float = DEFAULT_DAMPING_RATIO,
-    changes: Mapping[str, float] | None = None,
+    changes: Mapping[str, float | str] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> SwayStudy:
     """Compute the residual sway of a task, with and without each sway suppression method.

@@ -12,6 +12,7 @@ from lxml import etree
 from crane.common.errors import CraneWarning, InputError, suggest_names
 from crane.common.plausible_ranges import LONGEST, implausible_value_text, suggested_units_text
 from crane.common.samples import Array, as_number
+from crane.common.unit_conversions import UnitError, parse_number
 from crane.description.kinematic_tree import Inertial, Joint, Limits, Link, Vector, to_vector
 from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
 from crane.description.specification import LoopSpec
@@ -63,8 +64,8 @@ def parse_attachment_point(machine: Machine, text: str) -> AttachmentPoint:
     if text in machine.tree.links or not colon:
         link, coordinates = text, "0,0,0"
     try:
-        point = np.array([float(word) for word in coordinates.split(",")])
-    except ValueError:
+        point = np.array([parse_number(word, ("m",)) for word in coordinates.split(",")])
+    except (UnitError, ValueError):
         point = np.zeros(0)
     if point.shape != (3,) or not np.isfinite(point).all():
         raise InputError(

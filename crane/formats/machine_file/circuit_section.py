@@ -1,29 +1,30 @@
 """The section `hydraulics` of a machine file."""
 
-import csv
-import io
 import itertools
 import math
 import string
 import warnings
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-from crane.common.errors import CraneWarning, DescriptionError, InputError, suggest_names
-from crane.common.package_search import read_plain_file
+from crane.common.errors import CraneWarning, DescriptionError, suggest_names
 from crane.common.plausible_ranges import implausible_value_text
-from crane.description.circuit_schema import AREA_KEYS, BORE_KEYS, ORIFICE_KEYS
-from crane.description.findings import FollowUpError, UnknownNames, error_recovery, report_error
+from crane.description.circuit_schema import AREA_KEYS, BORE_KEYS, ORIFICE_KEYS, PUMP
+from crane.description.findings import (
+    FollowUpError,
+    UnknownNames,
+    error_recovery,
+    raise_errors,
+    report_error,
+)
+from crane.formats.machine_file.edge_curves import read_edge_curve
 from crane.formats.machine_file.structure_sections import TreeBuilder
 from crane.formats.machine_file.yaml_section import YamlSection
-from crane.formats.machine_file.yaml_text import MAX_FILE_SIZE
 from crane.hydraulics.circuit_elements import MAIN_PUMP, Supply
 from crane.hydraulics.components import (
     COUNTERBALANCE_KEYS,
     Cylinder,
-    OpeningCurve,
     Valve,
 )
 from crane.hydraulics.hydraulic_circuit import (
@@ -60,7 +61,9 @@ def read_hydraulics(
         if supply_section is None:
             raise section.error_at(None, "'hydraulics' has no 'supply', give its pressure")
         supply = read_component(
-            supply_section, supply_section.values(), check=lambda x: check_tank_pressure(x, oil)
+            supply_section,
+            _pump_values(section, supply_section),
+            check=lambda x: check_tank_pressure(x, oil),
         )
     for key in ("cylinders", "motors"):
         section.apply_common_item(key, section.item_names(key))
@@ -250,13 +253,18 @@ def _read_cylinder(
             )
         for key, value in (("bore", bore), ("rod", rod)):
             _warn_about_unit(item, key, value)
-        area = count * math.pi / 4.0
-        areas = {"area_a": area * bore**2, "area_b": area * (bore**2 - rod**2)}
+        areas = dict(zip(AREA_KEYS, piston_areas(bore, rod, int(count)), strict=True))
     constants = {"joint": joint, "count": int(count), **areas, **holding_valves}
     check = partial(_check_relief, supply)
     cylinder: Cylinder = read_component(item, values, is_rotary, check, **constants)
     _warn_about_relief(item, supply, cylinder)
     return cylinder
+
+
+def piston_areas(bore: float, rod: float, count: int) -> tuple[float, float]:
+    """Areas of the chambers A and B of equal cylinders in parallel [m2]."""
+    area = count * math.pi / 4.0
+    return area * bore**2, area * (bore**2 - rod**2)
 
 
 def _read_motor(
@@ -279,6 +287,29 @@ def _read_motor(
     return motor
 
 
+def _pump_values(circuit: YamlSection, item: YamlSection) -> dict[str, Any]:
+    """Values of a pump, its maximum flow from displacement and speed, that of the engine."""
+    values = item.values()
+    displacement, speed = values.pop("displacement", None), values.pop("speed", None)
+    if speed is not None and displacement is None:
+        raise item.error_at("speed", f"'speed' of {item.title} goes with 'displacement', give it")
+    if displacement is None:
+        return values
+    _warn_about_unit(item, "displacement", displacement)
+    if speed is None and (engine := circuit.section("engine")) is not None:
+        try:
+            with raise_errors():
+                speed = engine.number("speed")
+        except DescriptionError as error:  # which the section of the engine reports
+            raise FollowUpError(str(error)) from None
+    if speed is None:
+        raise item.error_at(
+            "displacement",
+            f"{item.title} has a displacement and no speed, give its speed or an engine",
+        )
+    return values | {"flow": displacement * speed}
+
+
 def _read_network(section: YamlSection) -> dict[str, Any]:
     """Pumps beside the first one, further nodes and elements, by fields of `Hydraulics`."""
 
@@ -286,7 +317,8 @@ def _read_network(section: YamlSection) -> dict[str, Any]:
         if not name or not set(name) <= _NAME_CHARACTERS:
             kind = item.schema.title
             raise item.error_at(None, f"a {kind} is called '{name}', use letters, digits, _")
-        return read_component(item, item.values())
+        values = _pump_values(section, item) if item.schema is PUMP else item.values()
+        return read_component(item, values)
 
     network: dict[str, Any] = {
         key: section.read_map(key, read_named) for key in (*_NODE_SECTIONS, "elements")
@@ -319,7 +351,7 @@ def _read_valve(joint: str, item: YamlSection) -> Valve:
         constants |= {"c1": inlet, "c2": outlet, "c3": outlet, "c4": inlet}
         edge_keys = edge_keys[len(ORIFICE_KEYS) :]
     for name in edge_keys:
-        curve = _read_curve(item, name)
+        curve = read_edge_curve(item, name)
         if curve is None:
             values[name] = item.number(name)
         else:
@@ -335,89 +367,3 @@ def _read_valve(joint: str, item: YamlSection) -> Valve:
         )
     valve: Valve = read_component(item, values, **constants)
     return valve
-
-
-def _read_curve(item: YamlSection, key: str) -> tuple[float, OpeningCurve] | None:
-    """A valve's edge: its coefficient when wide open, and its share over |u|.
-
-    `[[u, c], ...]`, or a mapping with `flow: [[u, Q], ...]` at a pressure `drop`,
-    c = Q / sqrt(drop), or `area: [[u, A], ...]`, c = discharge A sqrt(2 / density), or `file`, a
-    CSV with the columns u and flow (with `drop`), area or coefficient; or `coefficient` and
-    `shape`. None where it is a number.
-
-    Raises:
-        DescriptionError: With file and line.
-    """
-    value = item.raw_value(key)
-    if not isinstance(value, list | dict):
-        return None
-    try:
-        if isinstance(value, list):
-            return _normalize_curve(_read_pairs(item, key))
-        inner = item.section(key, f"'{key}' of {item.title}")
-        assert inner is not None
-        if "shape" in inner:
-            return inner.number("coefficient"), OpeningCurve(tuple(_read_pairs(inner, "shape")))
-        given_keys = [name for name in ("flow", "area", "file") if name in inner]
-        if len(given_keys) != 1:
-            raise InputError("give one of flow, area, file, or coefficient and shape")
-        quantity = given_keys[0]
-        if quantity == "file":
-            quantity, points = _read_csv_table(inner.file("file"))
-        else:
-            points = _read_pairs(inner, quantity)
-        return _normalize_curve([(u, x * _coefficient_factor(inner, quantity)) for u, x in points])
-    except InputError as error:
-        raise item.error_at(key, f"'{key}' of {item.title}: {error}") from None
-
-
-def _normalize_curve(points: Sequence[tuple[float, float]]) -> tuple[float, OpeningCurve]:
-    coefficient = max((value for _, value in points), default=0.0)
-    return coefficient, OpeningCurve(
-        tuple((u, value / coefficient if coefficient > 0 else value) for u, value in points)
-    )
-
-
-def _read_pairs(item: YamlSection, key: str) -> Sequence[tuple[float, float]]:
-    rows = item.rows(key)
-    if any(len(row) != 2 for row in rows):
-        raise InputError("give pairs [u, value]")
-    return tuple((u, value) for u, value in rows)
-
-
-def _read_csv_table(path: Path) -> tuple[str, Sequence[tuple[float, float]]]:
-    try:
-        rows = list(
-            csv.DictReader(
-                io.StringIO(read_plain_file(path, MAX_FILE_SIZE).decode("utf-8-sig"), newline=""),
-                skipinitialspace=True,
-            )
-        )
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path.name} cannot be read ({error}), give a CSV file") from None
-    names = [name for name in ("flow", "area", "coefficient") if rows and name in rows[0]]
-    if len(names) != 1 or "u" not in rows[0]:
-        raise InputError(
-            f"{path.name} has no columns u and flow, area or coefficient, name them in line 1"
-        )
-    points = []
-    for number, row in enumerate(rows, 2):
-        try:
-            pair = float(row["u"]), float(row[names[0]])
-        except (TypeError, ValueError):
-            pair = math.nan, math.nan
-        if not all(map(math.isfinite, pair)):
-            raise InputError(f"{path.name}:{number} has no two finite numbers, correct it")
-        points.append(pair)
-    return names[0], points
-
-
-def _coefficient_factor(section: YamlSection, quantity: str) -> float:
-    if quantity == "coefficient":
-        return 1.0
-    if quantity == "flow":
-        drop = section.number("drop")
-        if not drop > 0:
-            raise InputError("'drop' is 0, give the pressure drop that the flows were measured at")
-        return 1.0 / math.sqrt(drop)
-    return section.number("discharge") * math.sqrt(2.0 / section.number("density"))

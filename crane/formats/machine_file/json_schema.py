@@ -1,10 +1,13 @@
 """The JSON Schema of machine files, by which editors complete and check them."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
+from crane.common.unit_conversions import NUMBER_PATTERN, accepted_units, unit_names, unit_size
 from crane.description.key_types import (
+    QUANTITY_UNIT,
     REQUIRED,
     FlagKey,
     Key,
@@ -21,7 +24,10 @@ from crane.description.key_types import (
 from crane.description.machine_schema import EXTENDS_KEY, MACHINE
 
 SCHEMA_PATH = Path(__file__).with_name("machine_file.schema.json")  # shipped with the package
-_NUMBER_PATTERN = r"^\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*$"  # YAML 1.1 reads 2e5 as text
+_NUMBER_OR_NONE = ["number", "string", "null"]
+# products of units, which only the reader tells apart
+_COMPOUND_UNIT = r"1\s*/.*|[^\s%:0-9]+(?:[*/·^(²³0-9].*|\s+\S.*)"
+_RATIO = r"%|:\s*[1-9][0-9]*"
 
 
 def schema_text() -> str:
@@ -50,10 +56,7 @@ class _SchemaDefinitions:
     """
 
     def __init__(self) -> None:
-        self.schemas: dict[str, Any] = {
-            "number": {"type": ["number", "string"], "pattern": _NUMBER_PATTERN},
-            "number_or_none": {"type": ["number", "string", "null"], "pattern": _NUMBER_PATTERN},
-        }
+        self.schemas: dict[str, Any] = {}
         self._names: dict[tuple[int, bool], str] = {}
 
     def section(self, name: str, section: SectionSchema, is_partial: bool) -> dict[str, Any]:
@@ -78,9 +81,7 @@ class _SchemaDefinitions:
         excluded: dict[str, list[dict[str, Any]]] = {}
         for first, second, _ in section.exclusive:
             for key in first:
-                excluded.setdefault(key, []).extend(
-                    [{"required": [x]} for x in second if x != key]
-                )
+                excluded.setdefault(key, []).extend(_given(x) for x in second if x != key)
         return {
             "type": ["object", "null"],
             "properties": {
@@ -88,7 +89,12 @@ class _SchemaDefinitions:
             },
             "additionalProperties": others or False,
             "required": required,
-            "dependentSchemas": {key: {"not": {"anyOf": x}} for key, x in excluded.items()},
+            "dependentSchemas": {
+                key: {"if": _given(key), "then": {"not": {"anyOf": x}}}
+                if is_partial
+                else {"not": {"anyOf": x}}
+                for key, x in excluded.items()
+            },
         }
 
     def _described(self, name: str, key: Key, is_partial: bool) -> dict[str, Any]:
@@ -107,6 +113,24 @@ class _SchemaDefinitions:
             else {}
         )
 
+    def _number(self, key: NumberKey) -> dict[str, Any]:
+        """A number, or a text of a number with a unit; bounds are those of numbers."""
+        bounds: dict[str, Any] = {} if key.minimum is None else {"minimum": key.minimum}
+        if key.is_positive or (key.zero_error and key.minimum == 0):
+            bounds = {"exclusiveMinimum": 0}
+        columns = getattr(key, "column_units", ())
+        units = tuple(dict.fromkeys(columns or key.si_units(None, (0,))))
+        name = "_or_".join(unit or "ratio" for unit in units)
+        name = "number_" + re.sub(r"\W", "_", name.replace("/", "_per_"))
+        if name not in self.schemas:
+            pattern = rf"^\s*{NUMBER_PATTERN}\s*(?:{'|'.join(map(_unit_pattern, units))})?\s*$"
+            others = [x for unit in units if unit != QUANTITY_UNIT for x in accepted_units(unit)]
+            examples = [f"1 {unit}" for unit in others if unit]
+            number = {"type": ["number", "string"], "pattern": pattern, "examples": examples}
+            self.schemas[name] = number
+            self.schemas[f"{name}_or_none"] = number | {"type": _NUMBER_OR_NONE}
+        return {"$ref": f"#/$defs/{name}", **bounds}
+
     def _value(self, name: str, key: Key, is_partial: bool) -> dict[str, Any]:
         match key:
             case SectionKey():
@@ -123,13 +147,18 @@ class _SchemaDefinitions:
                 return {"enum": [True, False, "yes", "no", "on", "off", "true", "false"]}
             case NameListKey():
                 return _array({"type": "string"}, key.size) | {"uniqueItems": True}
-            case NumberListKey():
-                return _array(_number(key), key.size)
             case RowListKey():
-                return _array(_array(_number(key), key.size), None)
+                return _array(_array(self._number(key), key.size), None)
+            case NumberListKey():
+                return _array(self._number(key), key.size)
             case NumberKey():
-                return _number(key)
+                return self._number(key)
         return {"enum": [*key.choices]} if key.choices else {"type": "string", "minLength": 1}
+
+
+def _given(key: str) -> dict[str, Any]:
+    """A schema of mappings that have a key, and do not remove it by an empty value."""
+    return {"required": [key], "properties": {key: {"not": {"type": "null"}}}}
 
 
 def _nullable(value: dict[str, Any]) -> dict[str, Any]:
@@ -140,14 +169,18 @@ def _nullable(value: dict[str, Any]) -> dict[str, Any]:
         return value | {"enum": [*value["enum"], None]}
     if "anyOf" in value:
         return value | {"anyOf": [*value["anyOf"], {"type": "null"}]}
-    return value | {"$ref": "#/$defs/number_or_none"}
+    return value | {"$ref": f"{value['$ref']}_or_none"}
 
 
-def _number(key: NumberKey) -> dict[str, Any]:
-    bounds: dict[str, Any] = {} if key.minimum is None else {"minimum": key.minimum}
-    if key.is_positive or (key.zero_error and key.minimum == 0):
-        bounds = {"exclusiveMinimum": 0}
-    return {"$ref": "#/$defs/number", **bounds}
+def _unit_pattern(unit: str) -> str:
+    """Pattern of the units of what a unit is of: their names, with prefixes, and products."""
+    if not unit:
+        return _RATIO
+    if unit == QUANTITY_UNIT:
+        return rf"{_RATIO}|[^\s%:0-9].*"
+    names = [name for name in unit_names() if unit_size(name, unit) is not None]
+    simple = rf"[numcdhkMG\u00b5\u03bc]?(?:{'|'.join(names)})|" if names else ""
+    return simple + _COMPOUND_UNIT
 
 
 def _array(items: dict[str, Any], size: int | None) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Machine files and single URDFs, read and checked into a `MachineSpec`."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Container, Sequence
 from functools import partial
@@ -8,13 +9,14 @@ from typing import Any, TypeVar
 
 from crane.common.errors import DescriptionError, InputError, suggest_names
 from crane.common.package_search import load_options
-from crane.common.units import accepted_units
+from crane.common.unit_conversions import accepted_units, unit_size
 from crane.description.external_forces import ExternalForce
 from crane.description.findings import UnknownNames, error_recovery, report_error
 from crane.description.ground_contact import Contact
+from crane.description.key_types import NumberKey
 from crane.description.kinematic_tree import with_rotor_inertias
 from crane.description.machine_lookup import find_machine_file
-from crane.description.machine_schema import MACHINE
+from crane.description.machine_schema import MACHINE, SENSOR
 from crane.description.sensors import (
     SENSOR_PARAMETERS,
     TIME,
@@ -25,7 +27,9 @@ from crane.description.sensors import (
     signal_delay_error,
 )
 from crane.description.specification import (
+    ATTITUDE_COORDINATES,
     STANDARD_GRAVITY,
+    TIP_COORDINATES,
     Chain,
     EstimationSettings,
     LoopSpec,
@@ -136,6 +140,9 @@ def _read_machine(path: Path) -> MachineSpec:
     top = YamlSection.read(path, MACHINE)
     name, source = top.text("name"), top.text("source")
     chains, tree, friction, couplings, springs, gravity = read_chains(top, path)
+    top.turns |= dict.fromkeys(TIP_COORDINATES, False)
+    top.turns |= {x: True for group in ATTITUDE_COORDINATES for x in group}
+    top.turns |= {name: joint.kind != "prismatic" for name, joint in tree.joints.items()}
     loops = read_loops(top, tree)
     couplings += read_couplings(top, tree)
     active: tuple[str, ...] = UnknownNames()
@@ -173,7 +180,7 @@ def _read_machine(path: Path) -> MachineSpec:
         tasks = _read_or_default(read_tasks, tasks, top, tree, active, tip, valves, home)
         control = _read_or_default(_read_control, control, top, active)
     external_forces = _read_or_default(read_external_forces, (), top, tree)
-    return MachineSpec(
+    spec = MachineSpec(
         name,
         source,
         path,
@@ -203,6 +210,7 @@ def _read_machine(path: Path) -> MachineSpec:
         _read_or_default(_read_pins, {}, top, tree, loops),
         gravity,
     )
+    return dataclasses.replace(spec, written_numbers=top.written_numbers())
 
 
 def _read_supports(
@@ -372,11 +380,19 @@ def read_sensors(top: YamlSection, tree: TreeBuilder) -> dict[str, Sensor]:
             raise tree.unknown_name_error(
                 str(item.error_at(None, f"'{name}' is no quantity of this machine, {known}"))
             )
-        units = accepted_units(unit)
-        if "unit" in item and (given := item.text("unit")) not in units:
+        given = item.text("unit") or unit
+        if unit_size(given, unit) is None:
             raise item.error_at(
-                "unit", f"'{name}' is in [{given}], give {' or '.join(units) or 'no unit'}"
+                "unit",
+                f"'{name}' is in [{given}], give {' or '.join(accepted_units(unit)) or 'no unit'}",
             )
+        item.schema = dataclasses.replace(
+            SENSOR,
+            keys={
+                **SENSOR.keys,
+                **{key: NumberKey(unit=unit) for key in ("zero", "noise")},
+            },
+        )
         if name == TIME and any(key in item for key in SENSOR_PARAMETERS):
             raise item.error_at(None, "time has a column and a unit, and no numbers of a sensor")
         if name.startswith(VALVE_SIGNAL_PREFIX) and "delay" in item:

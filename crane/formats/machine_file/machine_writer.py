@@ -1,6 +1,5 @@
 """A machine file with a URDF per sub-chain."""
 
-import math
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,17 +9,8 @@ from lxml import etree
 
 from crane.common.atomic_output import portable_file_name, replace_folder
 from crane.common.errors import CraneError, CraneWarning, InputError, OutputError, format_one_line
-from crane.description.circuit_schema import (
-    BORE_KEYS,
-    CYLINDER,
-    HYDRAULICS,
-    MOTOR,
-    ORIFICE_KEYS,
-    SPOOL,
-    VALVE,
-)
+from crane.common.unit_conversions import KeyPath
 from crane.description.force_elements import Friction
-from crane.description.key_types import REQUIRED
 from crane.description.kinematic_tree import Tree
 from crane.description.machine_parameters import FieldPath, parameter_paths, value_at
 from crane.description.machine_schema import (
@@ -34,9 +24,10 @@ from crane.description.machine_schema import (
 )
 from crane.description.sensors import SENSOR_PARAMETERS, SENSOR_PREFIX, quantity_unit
 from crane.description.specification import LoopSpec, Task
+from crane.formats.machine_file.circuit_writer import circuit_data, replace_data_sheet_keys
 from crane.formats.machine_file.force_sections import external_force_data, load_data
 from crane.formats.machine_file.machine_reader import estimation_data, read_machine_spec
-from crane.formats.machine_file.yaml_text import KeyPath, format_yaml
+from crane.formats.machine_file.yaml_text import format_yaml
 from crane.formats.urdf.urdf_writer import (
     compound_drive_factors,
     copy_shapes,
@@ -46,8 +37,6 @@ from crane.formats.urdf.urdf_writer import (
     with_floating_joints,
 )
 from crane.formats.xml_file import add_joint, add_link
-from crane.hydraulics.components import Cylinder, Valve
-from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.machine.machine import Machine
 
 _ELEMENT_PATHS = {"mass": "inertial/mass", "com": "inertial/origin", "tensor": "inertial/inertia",
@@ -180,10 +169,8 @@ class MachineDraft:
             if not isinstance(step, int) and step not in parent:
                 return False
             parent = parent[step]
-        if machine.hydraulics is not None and key_path[-1] in ORIFICE_KEYS and "flow" in parent:
-            del parent["flow"], parent["meter_out"]
-            valve = machine.hydraulics.valves[str(key_path[2])]
-            parent.update({edge: getattr(valve, edge) for edge in ORIFICE_KEYS})
+        if section == "hydraulics":
+            replace_data_sheet_keys(parent, str(key_path[-1]), value_at(machine, path[:-1]))
         value = value_at(machine, path)
         if parent.setdefault(key_path[-1], value) != value:
             return False
@@ -236,7 +223,7 @@ class MachineDraft:
             nonempty["hydraulics"] = {k: value for k, value in circuit.items() if k != "oil"}
         (folder / file).write_text(
             "".join(f"# {format_one_line(line)}\n" for line in self._header_notes)
-            + format_yaml(nonempty, self._line_notes),
+            + format_yaml(nonempty, self._line_notes, self._machine.written_numbers),
             encoding="utf-8",
         )
 
@@ -283,7 +270,8 @@ def _machine_data(machine: Machine) -> dict[str, Any]:
         "rotor_inertia": rotor_inertias(machine),
         "payload": None,
         "tasks": {name: _task_data(task) for name, task in machine.tasks.items()},
-        "hydraulics": machine.hydraulics and _hydraulics_data(machine.hydraulics),
+        "hydraulics": machine.hydraulics
+        and circuit_data(machine.hydraulics, machine.written_numbers),
         "sensors": {
             name: SENSOR.values_of(sensor) or {"zero": 0.0}
             for name, sensor in machine.sensors.items()
@@ -321,62 +309,6 @@ def _task_data(task: Task) -> dict[str, Any]:
             for joint, polygon in task.levers.items()
         }
     return data
-
-
-def _hydraulics_data(circuit: Hydraulics) -> dict[str, Any]:
-    drives: dict[str, dict[str, Any]] = {"cylinders": {}, "motors": {}}
-    for joint, item in circuit.cylinders.items():
-        if item.motor:
-            drives["motors"][joint] = _motor_data(item)
-        else:
-            drives["cylinders"][joint] = CYLINDER.values_of(item, *BORE_KEYS)
-    data = HYDRAULICS.values_of(circuit, "cylinders", "valves") | {
-        **{key: value for key, value in drives.items() if value},
-        "valves": {joint: _valve_data(valve) for joint, valve in circuit.valves.items()},
-    }
-    return {key: data[key] for key in HYDRAULICS.keys if key in data}
-
-
-def _motor_data(motor: Cylinder) -> dict[str, Any]:
-    expected = {"area_b": motor.area_a, "hose_b": motor.hose_a}
-    expected |= {
-        name: key.default
-        for name, key in CYLINDER.keys.items()
-        if name not in {*MOTOR.keys, *BORE_KEYS} and key.default not in (REQUIRED, None)
-    }
-    for name, value in expected.items():
-        if getattr(motor, name) != value:
-            raise InputError(
-                f"{name} of the motor of '{motor.joint}' is {getattr(motor, name):g}, which a "
-                f"machine file has no motor with, leave it at {value:g}"
-            )
-    return {"displacement": motor.area_a, "volume": motor.hose_a} | MOTOR.values_of(
-        motor, "displacement", "gear", "volume"
-    )
-
-
-def _valve_data(valve: Valve) -> dict[str, Any]:
-    values = VALVE.values_of(valve, "margin", "spool_b")
-    if valve.spool_b:
-        values["spool_b"] = {name: getattr(valve.spool_b, name) for name in SPOOL.keys}
-    for name, curve in valve.curves.items():
-        values[name] = {
-            "coefficient": getattr(valve, name),
-            "shape": ([list(point) for point in curve.points]),
-        }
-    if not valve.margin:
-        return {"type": "sharing" if valve.sharing else "orifice"} | values
-    size = {"type": "compensated", "margin": valve.margin}
-    is_symmetric = (valve.c1, valve.c2) == (valve.c4, valve.c3)
-    if not is_symmetric or valve.curves.keys() & {*ORIFICE_KEYS}:
-        return size | values
-    root = math.sqrt(valve.margin)
-    estimate = valve.c1 * root
-    for flow in (estimate, math.nextafter(estimate, 0.0), math.nextafter(estimate, math.inf)):
-        if flow / root == valve.c1:  # so that it is read to the last bit
-            size |= {"flow": flow, "meter_out": valve.c2}
-            return size | {x: value for x, value in values.items() if x not in ORIFICE_KEYS}
-    return size | values
 
 
 def _payload_urdf(machine: Machine) -> Path | None:

@@ -81,7 +81,7 @@ class YamlSection(YamlValues):
         schema = SectionSchema(title, {}, others=getattr(spec, "item", Key()))
         if isinstance(spec, SectionKey):
             schema = spec.section
-        section = YamlSection(value, schema, title, self._data.locations[key])
+        section = YamlSection(value, schema, title, self._data.locations[key], key, self.turns)
         if schema.others is None:
             section.check_keys(schema.keys)
         return section
@@ -199,7 +199,9 @@ class YamlSection(YamlValues):
                 )
                 self.is_complete = False
                 continue
-            section = YamlSection(item, schema, _item_title(title or schema.title, item))
+            section = YamlSection(
+                item, schema, _item_title(title or schema.title, item), turns=self.turns
+            )
             if schema.others is None:
                 section.check_keys(schema.keys)
             yield section

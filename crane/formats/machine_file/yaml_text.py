@@ -1,6 +1,7 @@
 """YAML of machine files: parsed into mappings that know their lines, and written with notes."""
 
 import errno
+import re
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -10,10 +11,10 @@ import yaml
 
 from crane.common.errors import DescriptionError, format_one_line
 from crane.common.package_search import read_plain_file
+from crane.common.unit_conversions import NUMBER_PATTERN, KeyPath, WrittenNumber, is_quantity
 from crane.description.findings import report_error
 
 MAX_FILE_SIZE = 2_000_000  # bytes of a file; parsing ten million takes a minute
-KeyPath = tuple[str | int, ...]  # keys and indices down to a number
 
 
 class _BlockMapping(dict[str, Any]):
@@ -31,17 +32,22 @@ def _represent_block_mapping(dumper: _MachineFileDumper, data: _BlockMapping) ->
 _MachineFileDumper.add_representer(_BlockMapping, _represent_block_mapping)
 
 
-def format_yaml(data: Mapping[str, Any], notes: Mapping[KeyPath, str] | None = None) -> str:
+def format_yaml(
+    data: Mapping[str, Any],
+    notes: Mapping[KeyPath, str],
+    written_numbers: Mapping[KeyPath, WrittenNumber],
+) -> str:
     """The text of a machine file.
 
     A number with a note stands in a line of its own, at whose end the note is a comment.
 
     Args:
-        data: What it says.
-        notes: By the way to a number.
+        data: What it says, numbers in SI units.
+        notes: By the way to a number; in SI units.
+        written_numbers: Numbers whose units are kept, see `written_numbers_by_path`.
     """
-    notes = notes or {}
-    block_data = _with_block_mappings(dict(data), (), {way[:-1] for way in notes})
+    in_units = with_written_units(dict(data), written_numbers)
+    block_data = _with_block_mappings(in_units, (), {way[:-1] for way in notes})
     text = str(
         yaml.dump(
             block_data, Dumper=_MachineFileDumper, sort_keys=False, allow_unicode=True, width=100,
@@ -54,13 +60,16 @@ def format_yaml(data: Mapping[str, Any], notes: Mapping[KeyPath, str] | None = N
     assert top is not None, "it was just written"
     for key_path, note in notes.items():
         node: Any = top
+        value: Any = data
         for key in key_path:
+            value = value[key]
             node = (
                 node.value[key]
                 if isinstance(key, int)
                 else next(value for name, value in node.value if name.value == key)
             )
-        lines[node.end_mark.line] += f"  # {format_one_line(note)}"
+        in_si = f"{value:.6g} in SI units, " if is_quantity(node.value) else ""
+        lines[node.end_mark.line] += f"  # {in_si}{format_one_line(note)}"
     return "\n".join(lines)
 
 
@@ -81,12 +90,13 @@ def _with_block_mappings(item: Any, key_path: KeyPath, block_paths: set[KeyPath]
 
 
 class LocatedMapping(dict[str, Any]):
-    """A mapping that remembers file and line of each key."""
+    """A mapping that remembers file and line of each key, and its numbers as they are written."""
 
     def __init__(self, file: Path, line: int):
         super().__init__()
         self.file, self.line = file, line
         self.locations: dict[str, tuple[Path, int]] = {}
+        self.written_numbers: dict[KeyPath, WrittenNumber] = {}
 
     def copy_key(self, source: "LocatedMapping", key: str) -> None:
         """Take over the value of a key, and where it stands."""
@@ -106,8 +116,62 @@ class LocatedMapping(dict[str, Any]):
         self.file, self.line = variant.file, variant.line
 
 
+def written_numbers_by_path(
+    data: LocatedMapping, path: KeyPath = ()
+) -> dict[KeyPath, WrittenNumber]:
+    """The numbers that were read of a machine file, as written, by the ways to them."""
+    found = {(*path, *place): quantity for place, quantity in data.written_numbers.items()}
+    for key, value in data.items():
+        items: dict[str | int, Any] = {key: value}
+        if isinstance(value, list):
+            items = dict(zip(_item_labels(value), value, strict=True))
+        for label, item in items.items():
+            if isinstance(item, LocatedMapping):
+                way = (*path, key) if item is value else (*path, key, label)
+                found |= written_numbers_by_path(item, way)
+    return found
+
+
+def with_written_units(
+    data: Any, written_numbers: Mapping[KeyPath, WrittenNumber], path: KeyPath = ()
+) -> Any:
+    """The same with numbers in the units in which a machine file had them, to the last bit.
+
+    Args:
+        data: What a machine file says.
+        written_numbers: As `written_numbers_by_path` returns them.
+        path: The way to the data.
+    """
+    if isinstance(data, dict):
+        return {
+            key: with_written_units(value, written_numbers, (*path, key))
+            for key, value in data.items()
+        }
+    if isinstance(data, list):
+        return [
+            with_written_units(value, written_numbers, (*path, label))
+            for label, value in zip(_item_labels(data), data, strict=True)
+        ]
+    is_number = isinstance(data, int | float) and not isinstance(data, bool)
+    return written_numbers[path].write(data) if is_number and path in written_numbers else data
+
+
+def _item_labels(items: list[Any]) -> list[str | int]:
+    """What tells the items of a list apart where some are gone: names, else their numbers."""
+    labels: list[str | int] = []
+    for i, item in enumerate(items):
+        names = item if isinstance(item, dict) else {}
+        key = next((x for x in ("name", "joint", "between", "frame") if names.get(x)), None)
+        label = i if key is None else f"{names[key]}"
+        labels.append(i if label in labels else label)
+    return labels
+
+
 class _StrictConstructor(yaml.constructor.SafeConstructor):
-    """SafeConstructor with lines, and without silently taking the last of equal keys."""
+    """SafeConstructor with lines, and without silently taking the last of equal keys.
+
+    Numbers are those of YAML 1.2: 3:1 is no number in base 60, 012 is none in base 8.
+    """
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         """A value; what cannot be one (a 13th month, 0x without digits) is an error of YAML."""
@@ -126,10 +190,13 @@ class _StrictLoader(_StrictConstructor, yaml.SafeLoader):
     """Reads text, and says best what is wrong with it."""
 
 
+_LOADERS: list[Any] = [_StrictLoader]
 if yaml.__with_libyaml__:
 
     class _FastLoader(_StrictConstructor, yaml.CSafeLoader):
         """Reads text in a tenth of the time."""
+
+    _LOADERS.append(_FastLoader)
 
 
 def _construct_mapping(loader: Any, node: yaml.MappingNode) -> LocatedMapping:
@@ -161,7 +228,22 @@ def _construct_mapping(loader: Any, node: yaml.MappingNode) -> LocatedMapping:
     return data
 
 
+def _construct_integer(loader: Any, node: yaml.ScalarNode) -> int:
+    return int(loader.construct_scalar(node))
+
+
 _StrictConstructor.add_constructor("tag:yaml.org,2002:map", _construct_mapping)
+_StrictConstructor.add_constructor("tag:yaml.org,2002:int", _construct_integer)
+_FLOAT_PATTERN = rf"{NUMBER_PATTERN}|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"
+for _loader in _LOADERS:
+    _loader.yaml_implicit_resolvers = {
+        first: [x for x in resolvers if x[0].rpartition(":")[2] not in ("int", "float")]
+        for first, resolvers in _loader.yaml_implicit_resolvers.items()
+    }
+    for _kind, _pattern in (("int", "[-+]?[0-9]+"), ("float", _FLOAT_PATTERN)):
+        _loader.add_implicit_resolver(
+            f"tag:yaml.org,2002:{_kind}", re.compile(rf"(?:{_pattern})\Z"), list("-+.0123456789")
+        )
 
 
 def format_value(value: Any) -> str:

@@ -1,12 +1,18 @@
 """Values of a machine file, read as their schema says, every error with its file and line."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 from crane.common.errors import DescriptionError, suggest_names
+from crane.common.unit_conversions import (
+    KeyPath,
+    UnitError,
+    WrittenNumber,
+    parse_quantity,
+)
 from crane.description.findings import UnknownNames, error_recovery, report_error
 from crane.description.key_types import (
     REQUIRED,
@@ -16,16 +22,21 @@ from crane.description.key_types import (
     NameListKey,
     NumberKey,
     NumberListKey,
+    RowListKey,
     SectionSchema,
     TextKey,
 )
-from crane.formats.machine_file.yaml_text import LocatedMapping, format_value
+from crane.formats.machine_file.yaml_text import (
+    LocatedMapping,
+    format_value,
+    written_numbers_by_path,
+)
 
 _BOOLEAN_WORDS = {"on": True, "yes": True, "true": True, "off": False, "no": False, "false": False}
 
 
 def as_float(value: Any) -> float:
-    """A value as a number, NaN where it is none; PyYAML reads 2e5 as text."""
+    """A value as a number, NaN where it is none; in quotes it is a text."""
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         return math.nan
     try:
@@ -49,10 +60,13 @@ class YamlValues:
         schema: Its keys.
         title: What errors call it; "": the title of the schema.
         location: File and line, if not the mapping's own.
+        name: Key of the mapping in the one that holds it, often that of a joint.
+        turns: Whether joints and coordinates turn, by name, for the units of their numbers.
 
     Attributes:
         schema: See above.
         title: See above.
+        turns: See above; shared with the sections in this one.
         is_complete: Whether no item of its lists had to be left out.
     """
 
@@ -62,8 +76,11 @@ class YamlValues:
         schema: SectionSchema,
         title: str = "",
         location: tuple[Path, int] | None = None,
+        name: str = "",
+        turns: dict[str, bool] | None = None,
     ):
-        self._data, self.schema = data, schema
+        self._data, self.schema, self._name = data, schema, name
+        self.turns: dict[str, bool] = {} if turns is None else turns
         self.title = title or schema.title
         self.is_complete = True
         self._location = (data.file, data.line) if location is None else location
@@ -94,6 +111,10 @@ class YamlValues:
             if is_meant:
                 self._data[near[0]] = self._data[key]
                 self._data.locations[near[0]] = self._data.locations[key]
+
+    def written_numbers(self) -> dict[KeyPath, WrittenNumber]:
+        """The numbers that were read of the section, as written, by the ways to them."""
+        return written_numbers_by_path(self._data)
 
     def source_location(self, key: str | None = None) -> str:
         """File and line of the section or of one of its keys."""
@@ -186,8 +207,7 @@ class YamlValues:
         """A finite number within its bounds; NaN where its error is reported."""
         with error_recovery():
             number = self._read_number(key, self.raw_value(key))
-            spec = self._key(key)
-            spec = next((x for x in getattr(spec, "types", ()) if type(x) is NumberKey), spec)
+            spec = self._number_key(key, NumberKey)
             if not isinstance(spec, NumberKey):
                 return number
             if spec.minimum is not None and number < spec.minimum:
@@ -197,16 +217,46 @@ class YamlValues:
             return number
         return math.nan
 
-    def _read_number(self, key: str, value: Any) -> float:
-        number = as_float(value)
-        if math.isfinite(number):
-            return number
-        hint = "give a number"
-        if isinstance(value, float):
-            hint = "give a finite number"
-        elif isinstance(value, str) and "," in value:
-            hint = "give a number with a decimal point"
-        raise self._value_error(key, format_value(value), hint)
+    def _number_key(self, key: str, *kinds: type[Key]) -> Key:
+        """The type of a key, that of numbers of one that may have several."""
+        spec = self._key(key)
+        return next((x for x in getattr(spec, "types", ()) if type(x) in kinds), spec)
+
+    def si_units(self, key: str, position: Sequence[int] = ()) -> tuple[str, ...]:
+        """SI unit of a number, that of its joint; both, where its joint is not known.
+
+        Args:
+            key: The key.
+            position: Where it is in the list or the rows of the key.
+        """
+        lists = (NumberListKey, RowListKey)
+        spec = self._number_key(key, *(lists if position else (NumberKey,)))
+        if not isinstance(spec, NumberKey):
+            return ("",)
+        coordinate = key if key not in self.schema.keys else ""
+        joints = self._data.get("joints")
+        names = [coordinate, self._name, self._data.get("joint")]
+        names += joints if isinstance(joints, dict | list) else ()
+        kinds = {self.turns[x] for x in names if isinstance(x, str) and x in self.turns}
+        turns = kinds.pop() if len(kinds) == 1 else None
+        if "between" in self._data:
+            turns = False
+        return spec.si_units(turns, position)
+
+    def _read_number(self, key: str, value: Any, *position: int) -> float:
+        written = WrittenNumber(as_float(value))
+        if isinstance(value, str) and "," in value:
+            raise self._value_error(key, format_value(value), "give a number with a decimal point")
+        if isinstance(value, str):
+            try:
+                written = parse_quantity(value, self.si_units(key, position))
+            except UnitError as error:
+                raise self._value_error(key, format_value(value), str(error)) from None
+        if not math.isfinite(written.value):
+            hint = f"give a {'finite ' if isinstance(value, float) else ''}number"
+            raise self._value_error(key, format_value(value), hint)
+        self._data.written_numbers[key, *position] = written
+        return written.value
 
     def boolean(self, key: str) -> bool:
         """True or false, as on and off, in quotes or without."""
@@ -225,7 +275,7 @@ class YamlValues:
                 ("empty" if value == [] else format_value(value)),
                 "give a list such as [0, 1]",
             )
-        return tuple(self._read_number(key, item) for item in value)
+        return tuple(self._read_number(key, item, i) for i, item in enumerate(value))
 
     def rows(self, key: str) -> list[list[float]]:
         """A list of finite numbers, or of such lists: one row, or as many."""
@@ -236,7 +286,13 @@ class YamlValues:
             raise self._value_error(
                 key, format_value(value), "give a list such as [0, 0, 1], or one of such lists"
             )
-        return [[self._read_number(key, item) for item in row] for row in rows]
+        return [
+            [
+                self._read_number(key, item, *([i] if is_nested else []), j)
+                for j, item in enumerate(row)
+            ]
+            for i, row in enumerate(rows)
+        ]
 
     def read_list(
         self, key: str, hint: str, is_item: Callable[[Any], bool], item_hint: str

@@ -1,7 +1,5 @@
 """Write a machine as a MJCF file for MuJoCo."""
 
-import warnings
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +7,19 @@ import pinocchio as pin
 from lxml import etree
 
 from crane.common.atomic_output import replace_file
-from crane.common.errors import CraneWarning, InputError
+from crane.common.errors import InputError
 from crane.description.force_elements import ForceElement, Friction, Rope, element_name
 from crane.description.kinematic_tree import ROTATIONS
 from crane.description.rotation_vectors import ROTATION_COUNT
 from crane.description.specification import Coupling, Drive, LoopSpec
 from crane.formats.mjcf.massless_struts import find_massless_struts
+from crane.formats.mjcf.mjcf_elements import (
+    add_fixed_tendon,
+    add_inertial,
+    add_tendon,
+    placement_attributes,
+    solve_polynomial,
+)
 from crane.formats.urdf.urdf_writer import (
     format_document,
     origin_text,
@@ -25,8 +30,6 @@ from crane.formats.xml_file import finite_limits, format_numbers
 from crane.machine.machine import Machine
 
 _HINGE_POINT_DISTANCE = 0.1  # [m] between the two points that define a hinge
-_ROUNDING_TOLERANCE = 1e-9  # relative to the largest moment
-_MIN_MOMENT = 1e-14  # [kg m2] smallest moment of inertia that MuJoCo accepts
 
 
 def write_mjcf(machine: Machine, path: str | Path) -> None:
@@ -135,7 +138,7 @@ class _MjcfWriter:
                 gear = [drive.factors.get(f"{ball}_{part}", 0.0) for part, _, _ in ROTATIONS]
                 target = {"joint": ball, "gear": format_numbers(gear)}
             elif drive.factors.keys() != {drive.name}:
-                target = {"tendon": _add_fixed_tendon(tendons, drive.name, drive.factors)}
+                target = {"tendon": add_fixed_tendon(tendons, drive.name, drive.factors)}
             elif (factor := drive.factors[drive.name]) != 1.0:
                 target["gear"] = format_numbers([factor])
             add(actuator, "motor", {"name": drive.name, **target})
@@ -189,9 +192,9 @@ class _MjcfWriter:
         placements = [pin.SE3.Identity()]
         for i in series:
             placements.append(placements[-1] * self.model.jointPlacements[i])
-        attributes = {"name": self.moved_links[series[-1]]} | _placement_attributes(placements[-1])
+        attributes = {"name": self.moved_links[series[-1]]} | placement_attributes(placements[-1])
         body = etree.SubElement(parent, "body", attributes)
-        _add_inertial(body, self.model.inertias[series[-1]])
+        add_inertial(body, self.model.inertias[series[-1]])
         for i, placement in zip(series, placements[1:], strict=True):
             self._add_joint(body, i, placements[-1].actInv(placement))
         return body
@@ -207,7 +210,7 @@ class _MjcfWriter:
         values = {
             "name": name,
             "type": "hinge" if tree_joint.kind == "revolute" else "slide",
-            **_placement_attributes(pin.SE3(np.eye(3), placement.translation)),
+            **placement_attributes(pin.SE3(np.eye(3), placement.translation)),
             "axis": format_numbers(placement.rotation @ np.array(tree_joint.axis)),
         }
         if (limits := finite_limits(tree_joint.limits)) is not None:
@@ -256,7 +259,7 @@ class _MjcfWriter:
             etree.SubElement(actuator, "motor", motor | crank)
             self.unsupported += [f"{key} of {drive.name}" for key in effects]
             return
-        tendon = _add_tendon(tendons, "spatial", drive.name)
+        tendon = add_tendon(tendons, "spatial", drive.name)
         for ends, factor in zip(sites, drive.factors.values(), strict=True):
             if len(sites) > 1:
                 etree.SubElement(tendon, "pulley", divisor=format_numbers([gear / factor]))
@@ -299,7 +302,7 @@ class _MjcfWriter:
         is_ball = len(names) == ROTATION_COUNT
         values = {"name": self.model.names[joint], "type": "ball" if is_ball else "free"}
         if is_ball:
-            values |= _placement_attributes(pin.SE3(np.eye(3), placement.translation))
+            values |= placement_attributes(pin.SE3(np.eye(3), placement.translation))
             # the rotation in the axes of the body
             turn = placement.rotation @ data.joints[joint].M.rotation @ placement.rotation.T
             *_, x, y, z, w = pin.SE3ToXYZQUAT(pin.SE3(turn, np.zeros(3)))
@@ -322,7 +325,7 @@ class _MjcfWriter:
         while name in self.site_names:
             name += "_"
         self.site_names.add(name)
-        site = etree.Element("site", {"name": name} | _placement_attributes(placement))
+        site = etree.Element("site", {"name": name} | placement_attributes(placement))
         first = body.find("body")
         if first is None:
             body.append(site)
@@ -367,10 +370,10 @@ class _MjcfWriter:
         coefficients = [offset, *(derivatives or [0.0]), 0, 0, 0]
         tag = "joint"
         if coupling.powers:
-            joints, coefficients = _solve_polynomial(coupling)
+            joints, coefficients = solve_polynomial(coupling)
         if len(joints) > 2:
             tag, coefficients = "tendon", [coupling.offset, 0, 0, 0, 0]
-            joints = [_add_fixed_tendon(tendons, coupling.name, coupling.factors)]
+            joints = [add_fixed_tendon(tendons, coupling.name, coupling.factors)]
         attributes |= {f"{tag}{i}": name for i, name in enumerate(joints, start=1)}
         attributes["polycoef"] = format_numbers(coefficients)
         etree.SubElement(equality, tag, attributes)
@@ -398,72 +401,8 @@ class _MjcfWriter:
                 values["damping"] = [item.damping]
         if not values:
             return
-        tendon = _add_tendon(tendons, "spatial", "_".join(links))
+        tendon = add_tendon(tendons, "spatial", "_".join(links))
         for key, numbers in values.items():
             tendon.set(key, format_numbers(numbers))
         for link in links:
             etree.SubElement(tendon, "site", site=self._frame_site(link)[2])
-
-
-def _solve_polynomial(coupling: Coupling) -> tuple[list[str], list[float]]:
-    """Return follower and leader of a coupling with powers, and its five coefficients.
-
-    Raises:
-        InputError: It is no polynomial of one joint.
-    """
-    factors, (leader, *others) = coupling.factors, coupling.powers
-    followers = [joint for joint in coupling.joints if joint != leader]
-    if others or len(followers) != 1:
-        raise InputError(
-            f"coupling '{coupling.name}' is no polynomial of one joint, for which alone MJCF has "
-            "a constraint, write a machine file"
-        )
-    terms = [-coupling.offset, factors.get(leader, 0.0), *coupling.powers[leader]]
-    return [*followers, leader], [-x / factors[followers[0]] + 0.0 for x in terms]
-
-
-def _add_tendon(tendons: etree._Element, tag: str, name: str) -> etree._Element:
-    """Add a tendon under a unique name."""
-    while any(tendon.get("name") == name for tendon in tendons):
-        name += "_"
-    return etree.SubElement(tendons, tag, name=name)
-
-
-def _add_fixed_tendon(tendons: etree._Element, name: str, factors: Mapping[str, float]) -> str:
-    """Add a fixed tendon, and return its name."""
-    tendon = _add_tendon(tendons, "fixed", name)
-    for joint, factor in factors.items():
-        etree.SubElement(tendon, "joint", joint=joint, coef=format_numbers([factor]))
-    return str(tendon.get("name"))
-
-
-def _placement_attributes(placement: pin.SE3) -> dict[str, str]:
-    """Return the attributes of a placement that differ from the default."""
-    found = {}
-    if placement.translation.any():
-        found["pos"] = format_numbers(placement.translation)
-    if not np.array_equal(placement.rotation, np.eye(3)):
-        x, y, z, w = pin.Quaternion(placement.rotation).normalize().coeffs()
-        found["quat"] = format_numbers([w, x, y, z])
-    return found
-
-
-def _add_inertial(body: etree._Element, inertia: pin.Inertia) -> None:
-    """Add principal moments and axes; MuJoCo requires positive, physically feasible moments."""
-    moments, axes = np.linalg.eigh(inertia.inertia)
-    if np.linalg.det(axes) < 0:
-        axes[:, 0] *= -1
-    moments = np.maximum(moments, _MIN_MOMENT)
-    violation = moments[2] - moments[0] - moments[1]
-    if violation > _ROUNDING_TOLERANCE * moments[2]:
-        warnings.warn(
-            f"the inertia of '{body.get('name')}' is of no possible body by {violation:.2g} kg "
-            "m2, which MuJoCo refuses: two moments are written larger",
-            CraneWarning,
-            stacklevel=5,
-        )
-    if violation > 0:
-        moments[:2] += (0.5 + 1e-15) * violation
-    values = {"pos": format_numbers(inertia.lever), "mass": format_numbers([inertia.mass])}
-    values |= _placement_attributes(pin.SE3(axes, np.zeros(3)))
-    etree.SubElement(body, "inertial", {**values, "diaginertia": format_numbers(moments)})

@@ -254,10 +254,11 @@ def _spool_candidates(
     """Candidates of a spool and of the orifices that it opened."""
     name = f"valve.{spool.joint}" + ("" if isinstance(spool, Valve) else ".spool_b")
     drift, dead = 0.02 * abs(spool.full - spool.neutral), spool.dead_band
+    lowest = max(dead - 0.15, 0.0 if dead >= 0 else -0.5)  # an overlap stays one
     if len(directions) == 2:  # in one direction neutral and dead band are not separable
         least, most = spool.neutral - 3.0 * drift, spool.neutral + 3.0 * drift
         yield _candidate(f"{name}.neutral", spool.neutral, drift, least, most)
-    yield _candidate(f"{name}.dead_band", dead, 0.05, max(dead - 0.15, 0.0), dead + 0.15)
+    yield _candidate(f"{name}.dead_band", dead, 0.05, lowest, dead + 0.15)
     for orifice in (
         x
         for way in sorted(directions, reverse=True)

@@ -77,7 +77,7 @@ class PulseSignals(ValveCommand):
         self._areas = np.array([(x.area_a, x.area_b) for x in cylinders])
         self._neutral = np.array([valve.neutral for valve in valves])
         self._signal_ranges = np.array([valve.full - valve.neutral for valve in valves])
-        self._dead_bands = np.array([valve.dead_band for valve in valves])
+        self._dead_bands = np.array([valve.overlap for valve in valves])
         self._valve_indices = [
             circuit.joints.index(spool.joint) for spool in circuit.spools.values()
         ]
@@ -233,7 +233,7 @@ class ExchangeAlgorithm:
         self._valve_count = len(require_circuit(information.machine).joints)
         self._rejection_reason = ""
         for joint, valve in require_circuit(information.machine).valves.items():
-            min_rate = 2 * valve.dead_band / self._slot_duration
+            min_rate = 2 * valve.overlap / self._slot_duration
             if not rate > min_rate:
                 raise InputError(
                     f"signals of {rate:g} strokes per second do not leave the dead band of "

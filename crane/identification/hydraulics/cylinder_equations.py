@@ -183,7 +183,16 @@ def cylinder_signals(
 
 
 def valve_opening(valve: Valve, u: Array) -> Array:
-    """Opening (N,) for spool positions u (N,), see `Valve`."""
+    """Opening (N,) for spool positions u (N,), see `Valve`.
+
+    Raises:
+        InputError: The spool has an underlap, so that several edges are open at once.
+    """
+    if valve.dead_band < 0:
+        raise InputError(
+            f"the valve of '{valve.joint}' has an underlap, whose edges this method does not "
+            "separate: fit its parameters with crane calibrate"
+        )
     return np.copysign(np.clip((np.abs(u) - valve.dead_band) / (1 - valve.dead_band), 0.0, 1.0), u)
 
 

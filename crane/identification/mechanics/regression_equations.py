@@ -232,7 +232,8 @@ class RegressionEquations:
             samples: Samples of the motion.
             values: (r,) parameters b.
         """
-        free_joints = np.flatnonzero(~self._model.machine.is_driven)
+        machine = self._model.machine
+        free_joints = np.setdiff1d(np.flatnonzero(~machine.is_driven), machine.held)
         term_states = dict(samples.term_states)  # states of terms with memory
         W, known = self._sides(samples)
         residual = (W @ values + known)[:, free_joints]

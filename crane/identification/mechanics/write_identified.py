@@ -13,6 +13,7 @@ from lxml import etree
 from crane.common.atomic_output import replace_folder
 from crane.common.errors import CraneError, CraneWarning, InputError, OutputError
 from crane.common.samples import Array
+from crane.common.unit_conversions import KeyPath
 from crane.description.force_elements import Friction
 from crane.description.kinematic_tree import inertia_problem
 from crane.description.machine_parameters import GRAVITY_PREFIX
@@ -22,7 +23,7 @@ from crane.description.specification import Chain, MachineSpec
 from crane.dynamics.dynamics import Dynamics
 from crane.formats.machine_file.machine_reader import read_machine_spec, read_plain_data
 from crane.formats.machine_file.machine_writer import friction_data
-from crane.formats.machine_file.yaml_text import KeyPath, format_yaml
+from crane.formats.machine_file.yaml_text import format_yaml
 from crane.formats.machine_loading import load
 from crane.formats.parallel_robots import is_parallel_robot
 from crane.identification.mechanics.base_parameters import random_samples
@@ -252,7 +253,8 @@ def _machine_file_content(
     for key in ("loops", "forces", "gas_springs", "ropes", "end_stops", "rotor_inertia"):
         if not data.get(key):
             data.pop(key, None)
-    return format_yaml(data, _uncertainty_notes(result, data)), motor_urdfs
+    notes = _uncertainty_notes(result, data)
+    return format_yaml(data, notes, spec.written_numbers), motor_urdfs
 
 
 def _uncertainty_notes(result: Identification, data: Mapping[str, Any]) -> dict[KeyPath, str]:

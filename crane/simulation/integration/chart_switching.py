@@ -29,6 +29,7 @@ from crane.simulation.integration.machine_formulas import raise_undetermined
 from crane.simulation.integration.python_stepper import IntegrationHaltError, StepProgress
 from crane.simulation.integration.run_notes import RunNotes
 
+_NEARLY_SINGULAR_MARGIN = 1e5  # on the inertia that counts as none, of what explains a halt
 _LIMIT_RELAXATION = np.array([2.0, 0.1])  # factors of the limits where no chart is better
 _MAX_RECENT_STATES = 500
 _CONFIGURATION_TOLERANCE = 1e-6  # between predicted and closed configuration, coordinate units
@@ -103,7 +104,7 @@ class ChartSwitchingIntegrator:
                 continue
             next_index = self._pass_branch_crossing(times, i, state, step, rows)
             if next_index is None and halt is not None:
-                raise halt
+                raise self._explain_by_mass_matrix(times[0] + i * step, state) or halt
             if next_index is not None:
                 i = next_index
             else:
@@ -161,6 +162,15 @@ class ChartSwitchingIntegrator:
         states[:, velocities] = np.einsum("nij,nj->ni", rows, states[:, velocities])
         state[:], self._recent_states = states[-1], states[:-1]
         return True
+
+    def _explain_by_mass_matrix(self, time: float, state: Array) -> IntegrationHaltError | None:
+        """The halt where the mass matrix of the user is (nearly) singular, else None."""
+        q = self._row_layout.view(np.resize(state, self._row_layout.size)).q
+        chart = self._known_integrators[0][0]
+        error = chart.dynamics.singular_mass_error(q, margin=_NEARLY_SINGULAR_MARGIN)
+        if error is None:
+            return None
+        return IntegrationHaltError(time, q[chart.user_columns], f": {error}", "")
 
     def _pass_branch_crossing(
         self, times: Array, i: int, state: Array, step: float, rows: Array

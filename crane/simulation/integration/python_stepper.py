@@ -5,7 +5,13 @@ from collections.abc import Callable
 import numpy as np
 
 from crane.codegen import LayoutView
-from crane.common.errors import ClosureError, InputError, SimulationError
+from crane.common.errors import (
+    ClosureError,
+    CraneError,
+    InputError,
+    SimulationError,
+    SingularMassMatrixError,
+)
 from crane.common.samples import Array
 from crane.control.control_law import Controller
 from crane.control.valve_drive import ValveDrive
@@ -22,7 +28,8 @@ class IntegrationHaltError(SimulationError):
         time: Time of the halt [s].
         q_a: (n,) active coordinates of the user.
         description: The cause, a continuation of the message after the time.
-        default_remedy: Remedy if no joint passed a limit and no shorter step helps.
+        default_remedy: Remedy if no joint passed a limit and no shorter step helps; empty where
+            the cause names the remedy.
 
     Attributes:
         time: Time of the halt [s].
@@ -61,6 +68,8 @@ def explain_halt(
         finer_step: A step size with which the motion continues [s]; 0 if unknown.
     """
     hint = f"; with a step of {finer_step:g} s it goes on: shorten the step"
+    if not halt.default_remedy:
+        return SimulationError(str(halt))
     if not finer_step:
         hint = _passed_limit_text(machine, halt, times, q_a, reference) or halt.default_remedy
     return SimulationError(f"{halt}{hint}")
@@ -151,8 +160,8 @@ class PythonStepper:
             forces = chart.chart_forces(at.q, tau)
             forces += chart.external_forces(time, at.q, at.v_a, at.contacts).generalized_forces
             at.v_a[:] = chart.stick_slip.find_modes(self._dynamics, at.q, at.v_a, forces)
-        except ClosureError as error:
-            raise IntegrationHaltError(time, self.user_coordinates(state), f": {error}") from None
+        except (ClosureError, SingularMassMatrixError) as error:
+            raise self._closure_halt(time, state, error) from None
 
     def exceeds_chart_limits(self, state: Array) -> bool:
         """Whether a state is outside of the limits of the chart."""
@@ -222,16 +231,21 @@ class PythonStepper:
         return after
 
     def close_loops(self, time: float, state: Array) -> None:
-        """Close the loops of a state.
+        """Close the loops of a state on the branch of the chart.
 
         Raises:
-            IntegrationHaltError: They do not close.
+            IntegrationHaltError: They do not close, or pass a change point.
         """
         machine, q = self._dynamics.machine, self.state_layout.view(state).q
+        closure = machine.closure
         try:
-            closed = machine.closure.solve(q[machine.closure.active], initial_guess=q)
-        except ClosureError as error:
-            raise IntegrationHaltError(time, self.user_coordinates(state), f": {error}") from None
+            closed = closure.solve(q[closure.active], initial_guess=q)
+        except (ClosureError, SingularMassMatrixError) as error:
+            raise self._closure_halt(time, state, error) from None
+        if closure.is_compiled and closure.compiled_closure.least_determinant(closed) <= 0:
+            raise IntegrationHaltError(
+                time, self.user_coordinates(state), ": the loops come to a change point"
+            )
         q[:] = machine.coordinates.wrap_rotations(closed)
 
     def halt_error(self, time: float, state: Array) -> IntegrationHaltError:
@@ -242,8 +256,8 @@ class PythonStepper:
                 at.q[closure.active] + _EXTRAPOLATION_TIME * closure.characteristic_time * at.v_a,
                 initial_guess=at.q,
             )
-        except ClosureError as error:
-            return IntegrationHaltError(time, self.user_coordinates(state), f": {error}")
+        except (ClosureError, SingularMassMatrixError) as error:
+            return self._closure_halt(time, state, error)
         speed = np.abs(at.v_a).max()
         return IntegrationHaltError(
             time,
@@ -251,6 +265,11 @@ class PythonStepper:
             f" the motion cannot be followed, the fastest joint moves at {speed:.3g} m/s or rad/s",
             ": look at its forces and gains, or give end stops damping",
         )
+
+    def _closure_halt(self, time: float, state: Array, error: CraneError) -> IntegrationHaltError:
+        """The halt of a machine that does not close there, or whose mass matrix is singular."""
+        remedy = {"default_remedy": ""} if isinstance(error, SingularMassMatrixError) else {}
+        return IntegrationHaltError(time, self.user_coordinates(state), f": {error}", **remedy)
 
     def _state_rate(self, time: float, state: Array) -> tuple[Array, Array]:
         at, chart = self.state_layout.view(state), self._chart
@@ -261,8 +280,8 @@ class PythonStepper:
             external_values = chart.external_forces(time, at.q, at.v_a, at.contacts)
             forces = chart.chart_forces(at.q, tau) + external_values.generalized_forces
             rates = self._dynamics.evaluate_closed("rates", at.q, at.v_a, forces)
-        except ClosureError as error:
-            raise IntegrationHaltError(time, self.user_coordinates(state), f": {error}") from None
+        except (ClosureError, SingularMassMatrixError) as error:
+            raise self._closure_halt(time, state, error) from None
         self.transition_margin = float(rates[-1])
         energies = [tau @ v_a, *external_values.powers, rates[-2]]
         return np.concatenate(

@@ -140,7 +140,10 @@ class StickSlipModes:
         mass, rows = parts[: n * n].reshape(n, n), parts[n * n : n * (n + k)].reshape(k, n)
         v = rows @ v_a
         resting: Indices = np.flatnonzero(np.abs(v) * self._inverse_velocities <= REST_VELOCITY)
-        cholesky_factor = np.linalg.cholesky(mass).astype(np.float64)
+        try:
+            cholesky_factor = np.linalg.cholesky(mass).astype(np.float64)
+        except np.linalg.LinAlgError as error:
+            raise dynamics.singular_mass_error(q) or error from None
         if len(resting) and v_a.any():
             v_a = self._remove_resting_velocities(
                 closure, cholesky_factor, resting, rows[resting], v[resting], v_a

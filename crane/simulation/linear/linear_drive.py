@@ -87,12 +87,16 @@ class LinearizedDrive:
             self._program = self._build_program(machine)
 
     def moving_mask(self, v_a: Array, include_shared: bool) -> Array:
-        """(k + m,) whether states and signals belong to moving joints, or to none if shared."""
+        """(k + m,) whether states and signals belong to moving joints, or to none if shared.
+
+        An underlapped valve, which is never closed, counts as that of a moving joint.
+        """
         assert self._valve_drive is not None
+        circuit = self._valve_drive.circuit
         moving = {
             x
-            for x, i in zip(self._valve_drive.circuit.joints, self._active_indices, strict=True)
-            if v_a[i]
+            for x, i in zip(circuit.joints, self._active_indices, strict=True)
+            if v_a[i] or circuit.hydraulics.valves[x].is_underlapped
         }
         initial_states = [
             self._joint_of_state[name] in moving

@@ -68,7 +68,7 @@ class _TrimEquations:
 
     The valves of joints at rest are closed: the pressure of the loaded chamber holds the machine,
     leakage is neglected, and series springs carry the forces of their cylinders. All other states
-    have to be constant.
+    have to be constant, those of cylinders with underlapped valves too.
 
     Args:
         dynamics: Dynamics of the machine.
