@@ -81,18 +81,15 @@ def independent_accelerations(path, machine, q, v, tau):
     """
     robot = etree.parse(path).getroot()
     model = pin.buildModelFromXML(single_freedoms(robot))
-    ours, order = machine.model, []
-    for name in model.names[1:]:
-        joint = ours.joints[ours.getJointId(name)]
-        order += range(joint.idx_v, joint.idx_v + joint.nv)
-    order = np.array(order)
-    configuration = machine.closure.equations.coordinates.configuration(q)
-    theirs = np.concatenate(
-        [
-            configuration[joint.idx_q : joint.idx_q + joint.nq]
-            for joint in (ours.joints[ours.getJointId(name)] for name in model.names[1:])
-        ]
+    order = np.array([machine.column(name) for name in model.names[1:]])
+    # three revolute joints there are a rotation vector here
+    coordinates, h = machine.coordinates, 1e-4
+    angles, rates = coordinates.cardan_angles(q)
+    ahead, before = (
+        coordinates.cardan_angles(q + coordinates.coordinate_derivatives(q, x * v))[1]
+        for x in (h, -h)
     )
+    theirs, tau = angles[order], np.linalg.solve(rates.T, tau)
     loops = [loop_frames(model, loop) for loop in robot.iterfind("loop")]
     gears = np.array([gear(robot, model, one) for one in robot.iterfind("coupling")])
     data = model.createData()
@@ -103,7 +100,7 @@ def independent_accelerations(path, machine, q, v, tau):
         rows = [row for loop in loops for row in loop_rows(model, data, *loop)]
         return np.vstack([*rows, *gears])
 
-    speed, step = v[order], 1e-4
+    speed, step = (rates @ v)[order], 1e-4
     rows = jacobian(theirs)
     far = [jacobian(pin.integrate(model, theirs, k * step * speed)) for k in (-2, -1, 1, 2)]
     bias = (8 * (far[2] - far[1]) - (far[3] - far[0])) @ speed / (12 * step)
@@ -115,7 +112,7 @@ def independent_accelerations(path, machine, q, v, tau):
     found = particular + free @ np.linalg.solve(free.T @ mass @ free, free.T @ rest)
     out = np.zeros_like(found)
     out[order] = found
-    return out
+    return np.linalg.solve(rates, out - (ahead - before) @ v / (2 * h))
 
 
 def single_freedoms(robot):

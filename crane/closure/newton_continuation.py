@@ -34,7 +34,7 @@ _MIN_REGULARITY = 2.0
 _CHANGE_POINT_ZONE = 1e-5  # least singular value, as a share of that at home, to which steps lead
 _CHANGE_POINT_TOLERANCE = 1e-11  # relative least singular value below which gamma has no digits
 _MIN_PASSAGE = 1e-4  # scaled distance of the two sides of a change point
-_INTERPOLATION_STEP = 4e-3  # scaled distance of the neighbours of a change point
+_INTERPOLATION_STEP = 1e-2  # scaled distance of the neighbours of a change point
 
 
 class NewtonContinuation(ContinuationErrors):
