@@ -337,7 +337,8 @@ def payload(
     trust: Trust = False,
 ) -> None:
     """Estimate mass and centre of mass of the payload."""
-    com = None if centre is None else parse_numbers(centre.split(","), "--centre takes X,Y,Z in m")
+    message = f"--centre is '{centre}', write X,Y,Z in m, as 0.2,0,0"
+    com = None if centre is None else parse_numbers(centre.split(","), message, ("m",))
     loaded = options.load(machine)
     (carried,) = _read([recording], loaded, reading)
     with progress_bar("estimating") as progress:
