@@ -12,6 +12,8 @@ import crane
 from crane.cli.command import OptionBlock, command, refuse_options
 from crane.cli.option_units import joint_units, number_option, parameter_units
 from crane.cli.options import (
+    Bandwidth,
+    CentreOfMass,
     ComparedColumns,
     Fit,
     Frame,
@@ -25,6 +27,7 @@ from crane.cli.options import (
     RecordingFiles,
     RecordingOptions,
     Seed,
+    ShiftedRecordingOptions,
     TrainingWindow,
     Trust,
     Validation,
@@ -32,6 +35,7 @@ from crane.cli.options import (
 from crane.cli.parsing import (
     parse_fits,
     parse_names,
+    parse_numbers,
     parse_priors,
     parse_terms,
     parse_trials,
@@ -196,15 +200,12 @@ def identify(
     recording: RecordingFiles,
     model: ModelOptions,
     options: ParameterOptions,
-    reading: RecordingOptions,
+    reading: ShiftedRecordingOptions,
     output: OutputFolder,
     train: TrainingWindow = None,
     validation: Validation = None,
     method: Method = "wls",
-    bandwidth: Annotated[
-        float | None,
-        number_option("Hz", "Passband of the filter; derived from the motion by default."),
-    ] = None,
+    bandwidth: Bandwidth = None,
     min_speed: Annotated[
         list[str] | None,
         typer.Option(
@@ -249,7 +250,7 @@ def identify(
             stacklevel=1,
         )
     names = _recording_names(recording, validation, train, bool(judges))
-    judges += _read(validation or [], loaded, RecordingOptions(columns=reading.columns))
+    judges += _read(validation or [], loaded, replace(reading, since=None, until=None))
     if bandwidth is not None:
         shortest = max(min(float(x.time[-1] - x.time[0]) for x in inside), 1e-3)
         as_number(bandwidth, "the bandwidth", "Hz", greater_than=5 / shortest)
@@ -331,17 +332,20 @@ def payload(
     machine: MachineName,
     recording: RecordingFile,
     options: ParameterOptions,
-    reading: RecordingOptions,
+    reading: ShiftedRecordingOptions,
     frame: Frame = None,
+    centre: CentreOfMass = None,
     method: Method = "wls",
     trust: Trust = False,
 ) -> None:
     """Estimate mass and centre of mass of the payload."""
+    message = f"--centre is '{centre}', write X,Y,Z in m, as 0.2,0,0"
+    com = None if centre is None else parse_numbers(centre.split(","), message, ("m",))
     loaded = options.load(machine)
     (carried,) = _read([recording], loaded, reading)
     with progress_bar("estimating") as progress:
         estimate = crane.identification.identify_payload(
-            loaded, carried, frame, method, trust=trust, progress=progress
+            loaded, carried, frame, method, trust=trust, progress=progress, com=com
         )
     print(estimate.to_text(), end="")
 

@@ -11,7 +11,7 @@ import typer
 import crane
 from crane.cli.command import OptionBlock
 from crane.cli.option_units import number_option
-from crane.cli.parsing import parse_arguments, parse_changes, parse_names
+from crane.cli.parsing import parse_arguments, parse_changes, parse_names, parse_values
 from crane.cli.terminal import status
 from crane.common.atomic_output import check_file_is_writable, check_folder_is_writable
 from crane.common.errors import OutputError
@@ -52,6 +52,17 @@ Frame = Annotated[
     typer.Option(
         metavar="LINK",
         help="Link that carries the load or represents the tool; the tip by default.",
+    ),
+]
+Bandwidth = Annotated[
+    float | None,
+    number_option("Hz", "Passband of the filter; derived from the motion by default."),
+]
+CentreOfMass = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y,Z",
+        help="Known centre of mass of the load in the frame, in m; estimated by default.",
     ),
 ]
 Bucket = Annotated[
@@ -287,6 +298,31 @@ class RecordingOptions(TimeOptions):
         from crane.recordings.measured_recordings import read_run
 
         return read_run(path, machine, self.columns, self.span, needs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShiftedRecordingOptions(RecordingOptions):
+    """Which part and which columns of a recording are read, without their delays."""
+
+    shift: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="COLUMN=SECONDS",
+            help="Delay of a column that is taken out, negative if it is ahead of the others, "
+            "e.g. *_force=0.03; may be repeated.",
+        ),
+    ] = None
+
+    def read(
+        self, path: Path, machine: "crane.Machine | None" = None, needs: Any = ()
+    ) -> "crane.Recording":
+        """Read a recording, and shift its columns."""
+        recording = super().read(path, machine, needs)
+        if not self.shift:
+            return recording
+        return crane.recordings.shift_columns(
+            recording, parse_values("--shift", self.shift, lambda _: ("s",))
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,6 +17,7 @@ from crane.common.units import format_table
 from crane.identification.estimation.estimators import Estimate, EstimatedValues
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.force_comparison import ForceComparison
+from crane.identification.mechanics.force_delays import ForceDelays
 from crane.identification.mechanics.identifiability import weak_directions
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.machine.machine import Machine
@@ -49,6 +50,7 @@ class Identification(EstimatedValues, Result):
         bandwidth: Bandwidth of the low-pass [Hz].
         min_speed: (n,) standstill velocities, below which rows were omitted [m/s], [rad/s].
         validation: Comparison of forces on held-out data, None without them.
+        delays: Delays of the forces, one object per recording.
     """
 
     model: IdentificationModel
@@ -66,6 +68,7 @@ class Identification(EstimatedValues, Result):
     bandwidth: float
     min_speed: Array
     validation: ForceComparison | None = None
+    delays: tuple[ForceDelays, ...] = ()
 
     def _one_line(self) -> str:
         """Machine, number of parameters, method, and errors."""
@@ -112,8 +115,15 @@ class Identification(EstimatedValues, Result):
         return weak_directions(self.names, self.covariance, self.magnitude)
 
     @property
+    def delay_text(self) -> str:
+        """Text about delays of forces, "" without any."""
+        return "; ".join(filter(None, (one.text for one in self.delays)))
+
+    @property
     def remedy(self) -> str:
         """Text of measures that would determine more parameters."""
+        if self.delay_text:
+            return "take the delays of the forces out first"
         if self.parameters is not None:
             return f"leave such terms out, or {self.advice}"
         return f"give a prior, require physically feasible bodies, or {self.advice}"
