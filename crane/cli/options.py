@@ -58,7 +58,8 @@ Bandwidth = Annotated[
     float | None,
     number_option(
         "Hz",
-        "Cutoff of the low-pass on both sides of the equations; by default derived from the motion.",
+        "Cutoff of the low-pass on both sides of the equations; derived from the motion by "
+        "default.",
     ),
 ]
 CentreOfMass = Annotated[
