@@ -185,8 +185,7 @@ class ModelOptions(OptionBlock):
         typer.Option(
             metavar="[NAME=]STD",
             help="Prior standard deviation: one relative value for all parameters, e.g. 0.3, or "
-            "by name, e.g. bodies=10% or q1.viscous=200+-50 (value +- std). none: without the "
-            "prior of the machine file. May be repeated.",
+            "by name, e.g. bodies=10%, q1.viscous=200+-50 (value +- std); none: no prior.",
         ),
     ] = None
     feasible: Annotated[

@@ -56,11 +56,7 @@ Frame = Annotated[
 ]
 Bandwidth = Annotated[
     float | None,
-    number_option(
-        "Hz",
-        "Cutoff of the low-pass on both sides of the equations; derived from the motion by "
-        "default.",
-    ),
+    number_option("Hz", "Cutoff of the low-pass filter; derived from the motion by default."),
 ]
 CentreOfMass = Annotated[
     str | None,
