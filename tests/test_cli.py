@@ -98,7 +98,7 @@ def test_info_says_what_the_machine_is():
     assert "4: 8 independent equations, 12 redundant" in result.stdout
     assert "q4+q9, then q10+q2, then q6+q11, then q7+q3" in result.stdout
     assert "task        lift, 10 s: lifts along a straight line" in result.stdout
-    assert "\n  independent coordinates: condition 2.71 at home\n" in result.stdout
+    assert "coordinates condition number of the active ones 2.71 at home\n" in result.stdout
     assert re.search(r"^  driven ", result.stdout, re.M) is None  # free ones are among them
 
 
@@ -153,7 +153,7 @@ def test_info_has_the_whole_home_posture_and_the_path(mini):
     assert set(told) == set(mini.joints)
     for joint, value in told.items():
         assert float(value) == pytest.approx(mini.home[mini.column(joint)], rel=1e-4)
-    assert "  computed    compiled" in lines
+    assert "  dynamics    compiled to machine code" in lines
 
 
 SLOW = (
@@ -267,7 +267,7 @@ def test_without_a_task_a_controller_holds_and_none_lets_go(free_run, tmp_path):
     assert (runs[0].tau == 0).all() and np.ptp(runs[0].q, axis=0).max() > 1e-5
     assert np.ptp(runs[1].q, axis=0).max() < 1e-9
     words = " ".join(typed("simulate", "-h").stdout.replace("│", " ").split())
-    assert "a given controller holds the home configuration; without one," in words
+    assert "without it, drive forces are zero and valves stay at neutral." in words
 
 
 @pytest.mark.parametrize("arguments", [["info", "ur5_robot"], ["--version"]])

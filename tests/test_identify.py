@@ -18,7 +18,7 @@ from crane.common.threads import with_single_threaded_blas
 from crane.dynamics import Dynamics
 from crane.identification.estimation.estimators import least_squares
 from crane.identification.excitation.periodic_excitation import excite
-from crane.identification.mechanics import force_comparison
+from crane.identification.mechanics import force_delays
 from crane.identification.mechanics.base_parameters import base_parameters, random_samples
 from crane.identification.mechanics.feasible_parameters import pseudo_inertia
 from crane.identification.mechanics.identification_model import IdentificationModel
@@ -69,7 +69,7 @@ def test_noise_is_all_that_is_left(mini, method):
     joints = slice(1, 3) if method == "ols" else slice(0, 3)
     assert np.all(result.training.rmse[joints] < 1.1 * floor[joints])
     assert np.all(result.validation.rmse[joints] < 1.1 * floor[joints])
-    assert "validation, moving rows" in result.to_text()
+    assert "validation, samples near standstill excluded" in result.to_text()
 
 
 @pytest.mark.slow
@@ -372,7 +372,7 @@ def recording(mini):
 @pytest.fixture
 def undelayed(monkeypatch):
     """Without the search for delays, which looks at samples of its own."""
-    nothing = np.full(3, np.nan), np.full(3, np.nan), 0
+    nothing = force_delays.ForceDelays(("q1", "X1", "X2"), *np.full((3, 3), np.nan), 0)
     monkeypatch.setattr("crane.identification.mechanics.identify.force_delays", lambda *_: nothing)
 
 
@@ -391,7 +391,7 @@ def test_delays_are_looked_for_in_few_samples(mini, recording, monkeypatch):
     N = len(recording.time)
     with passes(monkeypatch) as count:
         identify(mini, recording)
-    assert count["closed"] <= N + min(force_comparison._MAX_SAMPLES, N) + ASIDE
+    assert count["closed"] <= N + min(force_delays._MAX_SAMPLES, N) + ASIDE
 
 
 def test_a_sample_is_closed_once_on_its_way_to_the_payload(mini, recording, monkeypatch):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hydraulic_rig import rig
+from hydraulic_rig import COMPENSATED, rig
 from scipy.integrate import solve_ivp
 
 import crane
@@ -112,6 +112,95 @@ def test_peak_forces_are_smaller_without_the_cycle(tmp_path):
         moving = run.time > 0.5
         peaks.append(np.abs(run.tau[moving]).max())
     assert peaks[0] > 1.1 * peaks[1]
+
+
+@pytest.mark.parametrize(("frequency", "damping"), [(7.0, 0.002), (30.0, 0.008)])
+def test_a_transient_that_grows_and_fades_is_none(frequency, damping):
+    """While the command stands still; eight periods about its top hardly change."""
+    phase = 2 * np.pi * frequency * TIME
+    hump = 2e6 * (damping * phase) * np.exp(1 - damping * phase) * np.sin(phase)
+    lever = np.interp(TIME, [0.0, 0.01], [0.0, 1.0])
+    assert damping * phase[-1] > 0.7
+    fading = hump * np.exp(-np.maximum(TIME - 2.0, 0.0) * 4.0)
+    assert sustained_oscillation(TIME, 1e7 + fading, 1e5, [lever]) is None
+    assert sustained_oscillation(TIME, 1e7 + 2e6 * np.sin(phase), 1e5, [lever]) is not None
+
+
+@pytest.mark.parametrize("kind", ["white", "smooth", "resonant"])
+def test_coloured_noise_is_none(kind):
+    t = np.arange(200)
+    kernel = {
+        "white": np.ones(1), "smooth": np.hanning(15),
+        "resonant": np.exp(-t / 20) * np.sin(2 * np.pi * t / 30),
+    }[kind]  # fmt: skip
+    for seed in range(15):
+        noise = np.convolve(np.random.default_rng(seed).normal(size=len(TIME)), kernel, "same")
+        assert sustained_oscillation(TIME, 1e7 + 2e5 * noise / noise.std(), 1e5) is None
+
+
+def test_a_cycle_of_uneven_halves_and_jolts_is_found():
+    """Short peaks over a flat bottom; every sixth period is another one."""
+    pulses = np.maximum(np.sin(2 * np.pi * 5 * TIME), 0.0) ** 4
+    pulses = np.where(np.floor(5 * TIME) % 6 == 5, 0.2 * pulses, pulses)
+    found = sustained_oscillation(TIME, 1e7 + 4e6 * pulses, 1e5)
+    assert found.frequency == pytest.approx(5.0, rel=0.02)
+    assert found.amplitude == pytest.approx(2e6, rel=0.1)
+    assert found.start < 1.0 and found.end > 8.5
+
+
+@pytest.mark.parametrize("order", [2, 3])
+def test_a_cycle_whose_period_doubles_or_triples_is_found(order):
+    """As of bouncing loads: one large swing, then smaller ones."""
+    size = np.where(np.floor(5 * TIME) % order == 0, 4e6, 1e6)
+    found = sustained_oscillation(TIME, 1e7 + size * np.sin(2 * np.pi * 5 * TIME), 1e5)
+    assert found.frequency == pytest.approx(5.0, rel=0.02) and found.end - found.start > 8
+
+
+def test_revolutions_are_no_cycle():
+    """Pressures of a crank that turns on, at one and two ripples per revolution."""
+    turned = 2 * np.pi * 1.5 * TIME
+    for harmonic in (1, 2):
+        run = crane.Recording(
+            TIME, ("a",), turned[:, None], np.zeros((len(TIME), 1)), np.zeros((len(TIME), 1)),
+            {"a": "rad"}, {"pressure_p": 1e7 + 2e6 * np.sin(harmonic * turned)},
+            {"pressure_p": "Pa"},
+        )  # fmt: skip
+        assert limit_cycles(run) == []
+        still = replace(run, q=0.05 * np.sin(run.q))  # it swings with the pressure
+        (found,) = limit_cycles(still)
+        assert found.frequency == pytest.approx(1.5 * harmonic, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "coefficient", "hertz"), [(4.0, 2e-6, 9.2), (4.0, 4e-7, 11.6), (1.5, 4e-7, 12.1)]
+)
+def test_a_counterbalance_valve_that_swings_is_told(tmp_path, ratio, coefficient, hertz):
+    """A load of 6 t that is lowered over it: the pump side cavitates, the valve opens, shuts."""
+    holding = {"pressure": 9.7e6, "pilot_ratio": ratio, "range": 3e6, "coefficient": coefficient}
+    machine = rig(
+        tmp_path, COMPENSATED, {"counterbalance_a": holding}, {"pressure": 20e6}, mass=6000.0
+    )
+    lever = crane.control.ValveSignals(machine, [0, 0.2, 0.3, 5], {"x": [5.8, 5.8, 7.3, 7.3]})
+    run = crane.simulate(machine, lever, [0.5], duration=5.0, step=1e-3)
+    (found,) = [x for x in limit_cycles(run) if x.channel == "pressure_x_a"]
+    part = run["pressure_x_a"][1000:4000]
+    assert found.amplitude == pytest.approx(np.ptp(part) / 2, rel=0.1) and np.ptp(part) > 6e6
+    lines = np.abs(np.fft.rfft((part - part.mean()) * np.hanning(len(part)), 16 * len(part)))
+    peak = np.fft.rfftfreq(16 * len(part), 1e-3)[lines.argmax()]
+    assert found.frequency == pytest.approx(peak, rel=0.05) == pytest.approx(hertz, rel=0.05)
+    assert f"pressure_x_a by {1e-5 * found.amplitude:.3g} bar at" in summarize(run).to_markdown()
+
+
+def test_a_counterbalance_valve_that_settles_is_not(tmp_path):
+    """The same with little flow through it: eight even periods, then rest."""
+    holding = {"pressure": 1.5e7, "pilot_ratio": 8.0, "range": 3e6, "coefficient": 1.45e-7}
+    machine = rig(
+        tmp_path, COMPENSATED, {"counterbalance_a": holding}, {"pressure": 9.25e6}, mass=6000.0
+    )
+    lever = crane.control.ValveSignals(machine, [0, 0.2, 0.3, 8], {"x": [5.8, 5.8, 7.3, 7.3]})
+    run = crane.simulate(machine, lever, [0.5], duration=8.0, step=1e-3)
+    assert np.ptp(run["pressure_x_b"][:600]) > 6e6 and np.ptp(run["pressure_x_b"][-3000:]) < 2e5
+    assert limit_cycle_message(run) == ""
 
 
 def supplies(count=40):

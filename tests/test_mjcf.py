@@ -391,7 +391,7 @@ def test_a_key_far_from_closed_is_refused_and_taken_where_that_is_asked_for(tmp_
     pytest.importorskip("mujoco")
     path = tmp_path / "key.xml"
     path.write_text(LOOPED.replace('qpos="0.05 1 0 0 0 0 ', 'qpos="0.05 1 0 0 0 2 '))
-    with pytest.raises(CraneError, match="far from the home of the file: rocker is 1.9"):
+    with pytest.raises(CraneError, match="far from the home of the file: rocker is 1.88"):
         crane.load(path)
     anyway = {"nearest_assembly": True}
     report = check(path, arguments=anyway)

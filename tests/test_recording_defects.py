@@ -94,7 +94,7 @@ def test_a_clean_recording_is_told_nothing_of(mini, clean):
 def test_forces_that_come_late(mini, clean, seconds):
     """At least q1, whose time is known best, within 3 ms."""
     (line,) = told(lambda: identify(mini, late(clean, seconds), bandwidth=20.0))
-    assert line.startswith("'q1_force' is ") and line.endswith("with one clock, or shift them")
+    assert line.startswith("'q1_force' is ") and line.endswith("shift_columns)")
     found = float(line.split(" is ")[1].split(" ms")[0])
     assert abs(found - 1e3 * seconds) < 3 and "behind its motion" in line
 

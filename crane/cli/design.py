@@ -52,7 +52,7 @@ def study(
     draws: Annotated[int | None, typer.Option(help="Number of random variants.")] = None,
     seed: Seed = 0,
 ) -> None:
-    """Compute measures of variants, on a grid or at random."""
+    """Evaluate measures for parameter values (grid, random)."""
     loaded = options.load(machine)
     units_of = parameter_units(loaded)
     axes = parse_grids(vary, units_of) if draws is None else parse_ranges(vary, units_of)

@@ -12,6 +12,8 @@ import crane
 from crane.cli.command import OptionBlock, command, refuse_options
 from crane.cli.option_units import joint_units, number_option, parameter_units
 from crane.cli.options import (
+    Bandwidth,
+    CentreOfMass,
     ComparedColumns,
     Fit,
     Frame,
@@ -25,6 +27,7 @@ from crane.cli.options import (
     RecordingFiles,
     RecordingOptions,
     Seed,
+    ShiftedRecordingOptions,
     TrainingWindow,
     Trust,
     Validation,
@@ -32,6 +35,7 @@ from crane.cli.options import (
 from crane.cli.parsing import (
     parse_fits,
     parse_names,
+    parse_numbers,
     parse_priors,
     parse_terms,
     parse_trials,
@@ -180,8 +184,9 @@ class ModelOptions(OptionBlock):
         list[str] | None,
         typer.Option(
             metavar="[NAME=]STD",
-            help="Prior standard deviation, relative of all parameters, e.g. 0.3; or by name, "
-            "e.g. bodies=10%, q1.viscous=200+-50; none: no prior; may be repeated.",
+            help="Prior standard deviation: one relative value for all parameters, e.g. 0.3, or "
+            "by name, e.g. bodies=10% or q1.viscous=200+-50 (value +- std). none: without the "
+            "prior of the machine file. May be repeated.",
         ),
     ] = None
     feasible: Annotated[
@@ -195,15 +200,12 @@ def identify(
     recording: RecordingFiles,
     model: ModelOptions,
     options: ParameterOptions,
-    reading: RecordingOptions,
+    reading: ShiftedRecordingOptions,
     output: OutputFolder,
     train: TrainingWindow = None,
     validation: Validation = None,
     method: Method = "wls",
-    bandwidth: Annotated[
-        float | None,
-        number_option("Hz", "Passband of the filter; derived from the motion by default."),
-    ] = None,
+    bandwidth: Bandwidth = None,
     min_speed: Annotated[
         list[str] | None,
         typer.Option(
@@ -217,16 +219,16 @@ def identify(
         typer.Option(
             "--try",
             metavar="NAME=VALUES",
-            help="Values from which cross-validation of the training data selects one, e.g. "
-            "bandwidth=5,10 or, for a prior, bodies=1%,10%; may be repeated.",
+            help="Candidate values, e.g. bandwidth=5,10 or, for a prior, bodies=1%,10%; the best "
+            "is selected by cross-validation on the training data. May be repeated.",
         ),
     ] = None,
     trust: Trust = False,
 ) -> None:
     """Estimate inertial parameters and joint friction.
 
-    The recordings contain coordinates and forces. --train or --validation select held-out data,
-    which validate the estimate.
+    The recordings contain coordinates and forces. The estimate is validated
+    with the data that --train leaves out, or with another file (--validation).
     """
     from crane.common.samples import as_number
     from crane.identification.mechanics.cross_validation import format_trials, identify_options
@@ -248,7 +250,7 @@ def identify(
             stacklevel=1,
         )
     names = _recording_names(recording, validation, train, bool(judges))
-    judges += _read(validation or [], loaded, RecordingOptions(columns=reading.columns))
+    judges += _read(validation or [], loaded, replace(reading, since=None, until=None))
     if bandwidth is not None:
         shortest = max(min(float(x.time[-1] - x.time[0]) for x in inside), 1e-3)
         as_number(bandwidth, "the bandwidth", "Hz", greater_than=5 / shortest)
@@ -330,17 +332,20 @@ def payload(
     machine: MachineName,
     recording: RecordingFile,
     options: ParameterOptions,
-    reading: RecordingOptions,
+    reading: ShiftedRecordingOptions,
     frame: Frame = None,
+    centre: CentreOfMass = None,
     method: Method = "wls",
     trust: Trust = False,
 ) -> None:
     """Estimate mass and centre of mass of the payload."""
+    message = f"--centre is '{centre}', write X,Y,Z in m, as 0.2,0,0"
+    com = None if centre is None else parse_numbers(centre.split(","), message, ("m",))
     loaded = options.load(machine)
     (carried,) = _read([recording], loaded, reading)
     with progress_bar("estimating") as progress:
         estimate = crane.identification.identify_payload(
-            loaded, carried, frame, method, trust=trust, progress=progress
+            loaded, carried, frame, method, trust=trust, progress=progress, com=com
         )
     print(estimate.to_text(), end="")
 
@@ -378,7 +383,7 @@ def circuit(
     ] = None,
     validation: Validation = None,
 ) -> None:
-    """Estimate orifices, valve or friction of a cylinder.
+    """Estimate valve parameters or friction of one cylinder.
 
     The recordings contain valve signals and pressures. The model 'orifices' also
     estimates the bulk modulus.

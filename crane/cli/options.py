@@ -11,7 +11,7 @@ import typer
 import crane
 from crane.cli.command import OptionBlock
 from crane.cli.option_units import number_option
-from crane.cli.parsing import parse_arguments, parse_changes, parse_names
+from crane.cli.parsing import parse_arguments, parse_changes, parse_names, parse_values
 from crane.cli.terminal import status
 from crane.common.atomic_output import check_file_is_writable, check_folder_is_writable
 from crane.common.errors import OutputError
@@ -52,6 +52,17 @@ Frame = Annotated[
     typer.Option(
         metavar="LINK",
         help="Link that carries the load or represents the tool; the tip by default.",
+    ),
+]
+Bandwidth = Annotated[
+    float | None,
+    number_option("Hz", "Passband of the filter; derived from the motion by default."),
+]
+CentreOfMass = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y,Z",
+        help="Known centre of mass of the load in the frame, in m; estimated by default.",
     ),
 ]
 Bucket = Annotated[
@@ -113,12 +124,14 @@ TrainingWindow = Annotated[
     typer.Option(
         "--train",
         metavar="FROM:TO",
-        help="Start and end of the training data in s; the rest is used for validation.",
+        help="Start and end of the training data in s; the rest validates the estimate.",
     ),
 ]
 Validation = Annotated[
     list[Path] | None,
-    typer.Option(metavar="FILE", help="A held-out recording for validation; may be repeated."),
+    typer.Option(
+        metavar="FILE", help="Another recording that validates the estimate; may be repeated."
+    ),
 ]
 Trust = Annotated[
     bool,
@@ -197,7 +210,8 @@ class PackageOptions(OptionBlock):
     packages: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="FOLDER", help="A folder of packages to which files refer; may be repeated."
+            metavar="FOLDER",
+            help="A folder with ROS packages (package:// paths); may be repeated.",
         ),
     ] = None
     argument: Annotated[
@@ -229,7 +243,8 @@ class AssemblyOptions(PackageOptions):
     floating: Annotated[
         bool,
         typer.Option(
-            "--floating", help="Give the root a floating base, e.g. of a vehicle or humanoid."
+            "--floating",
+            help="Connect the root to the world by a 6-DOF joint (vehicle, humanoid).",
         ),
     ] = False
 
@@ -283,6 +298,31 @@ class RecordingOptions(TimeOptions):
         from crane.recordings.measured_recordings import read_run
 
         return read_run(path, machine, self.columns, self.span, needs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShiftedRecordingOptions(RecordingOptions):
+    """Which part and which columns of a recording are read, without their delays."""
+
+    shift: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="COLUMN=SECONDS",
+            help="Delay of a column that is taken out, negative if it is ahead of the others, "
+            "e.g. *_force=0.03; may be repeated.",
+        ),
+    ] = None
+
+    def read(
+        self, path: Path, machine: "crane.Machine | None" = None, needs: Any = ()
+    ) -> "crane.Recording":
+        """Read a recording, and shift its columns."""
+        recording = super().read(path, machine, needs)
+        if not self.shift:
+            return recording
+        return crane.recordings.shift_columns(
+            recording, parse_values("--shift", self.shift, lambda _: ("s",))
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -208,12 +208,15 @@ class ExactConstraints:
 
     def _reduce_residual(self, q: Array, movable: Indices, tolerance: float) -> Array:
         """Damped Gauss-Newton steps towards a scaled residual."""
-        q = q.copy()
+        q, units = q.copy(), self._equations.step_units[movable]
         for _ in range(200):
-            phi, jacobian = self._equations.evaluate_scaled(q)
-            if np.abs(phi).max(initial=0.0) < tolerance:
+            phi, jacobian = self._equations.evaluate(q)
+            if np.abs(phi / self._residual_units).max(initial=0.0) < tolerance:
                 break
-            step = least_squares_step(jacobian[:, movable], phi)
+            scales = self._equations.step_residual_units
+            scaled_jacobian = jacobian[:, movable] / scales[:, None] * units
+            step = least_squares_step(scaled_jacobian, phi / scales)
+            step *= units / self._coordinate_units[movable]
             q = self._equations.displace(q, movable, step)
         return q
 
@@ -290,7 +293,9 @@ class ExactConstraints:
         self, home: Array, passive: Indices, rank: int, tolerance: float
     ) -> tuple[Indices, Indices] | None:
         """Independent rows (rank,) and the others; None if the rank of J_P is lower."""
-        jacobian = self._equations.evaluate_scaled(home)[1][:, passive]
+        equations = self._equations
+        jacobian = equations.evaluate(home)[1] / equations.step_residual_units[:, None]
+        jacobian = (jacobian * equations.step_units)[:, passive]
         from scipy.linalg import qr  # slow to import, only needed with loops
 
         _, upper, pivots = qr(jacobian.T, mode="economic", pivoting=True)

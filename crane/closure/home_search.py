@@ -105,6 +105,7 @@ def find_home(
     Raises:
         MechanismError: There is no home configuration, or see `analyse_constraints`.
     """
+    initial_guess = _follow_couplings(equations, initial_guess, specified or ())
     search = MultiStartSearch(
         equations, initial_guess, np.array(sorted(specified or ()), dtype=np.intp)
     )
@@ -153,6 +154,26 @@ def find_home(
     if search.largest_specified_deviation(first.home)[1] <= FAR:
         return first, None
     return first, _search_result(search, equations, reason, alternative_count + 1, passive, first)
+
+
+def _follow_couplings(
+    equations: LoopEquations, initial_guess: Array, specified: Collection[int]
+) -> Array:
+    """The guess (nq,) with geared joints that the file does not specify placed by the others.
+
+    Where a geared joint is specified and the others of its coupling are not, these follow it.
+    """
+    q = initial_guess.copy()
+    is_specified = np.isin(np.arange(len(q)), list(specified))
+    for row, column in equations.geared_columns:
+        factors = equations.coupling_factors[row]
+        weights = np.where(np.arange(len(q)) == column, factors, 0.0)
+        if is_specified[column]:
+            weights = np.where(is_specified, 0.0, factors)
+        if weights.any():
+            gap = equations.coupling_offsets[row] - factors @ q
+            q += weights * gap / (weights @ weights)
+    return q
 
 
 def find_cached_home(

@@ -77,6 +77,10 @@ class LoopEquations:
         coordinate_units: See `Coordinates.units`.
         motion_scales: See `Coordinates.motion_scales`.
         residual_units: (m,) units of the residuals: 1 rad, and the characteristic length [m].
+        geared_columns: (row of `coupling_factors`, column) of coordinates in no loop that a
+            coupling gives from others, such as rotors; after those that they follow from.
+        step_units: (nv,) coordinate units; of geared columns, how far they move with the others.
+        step_residual_units: (m,) residual units; of their couplings, those of their motion.
     """
 
     def __init__(
@@ -136,6 +140,32 @@ class LoopEquations:
         self.coordinate_units = self.coordinates.units
         self.motion_scales = self.coordinates.motion_scales
         self.residual_units = np.where(self.is_translation, self.characteristic_length, 1.0)
+        self.geared_columns = self._find_geared_columns()
+        self.step_units = self.coordinate_units.copy()
+        self.step_residual_units = self.residual_units.copy()
+        for row, column in self.geared_columns:
+            factor = abs(self.coupling_factors[row, column])
+            moved = np.abs(self.coupling_factors[row]) @ self.step_units
+            ratio = moved / factor - self.step_units[column]
+            self.step_units[column] = max(self.step_units[column], ratio)
+            self.step_residual_units[len(self._loop_index) + row] = factor * ratio
+
+    def _find_geared_columns(self) -> list[tuple[int, int]]:
+        """Columns in no loop and one coupling, then those in one of the remaining couplings."""
+        found: list[tuple[int, int]] = []
+        involved, is_in_loop = self.is_coupled, (self.sign != 0).any(axis=0)
+        is_linear = ~self.coupling_powers.any(axis=(0, 2))
+        is_left = np.ones(len(involved), dtype=bool)
+        while True:
+            ends = (involved[is_left].sum(axis=0) == 1) & ~is_in_loop
+            rows = np.flatnonzero(is_left & is_linear & (involved & ends).any(axis=1))
+            # a row without any other joint fixes its own
+            rows = rows[involved[rows].sum(axis=1) > 1]
+            if not len(rows):
+                return found[::-1]
+            column = int(np.flatnonzero(involved[rows[0]] & ends)[-1])
+            found.append((int(rows[0]), column))
+            is_left[rows[0]] = False
 
     def coupled_groups(self, columns: Indices) -> tuple[Indices, Indices]:
         """Groups of joints that equations connect, directly or through others.

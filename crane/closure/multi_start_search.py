@@ -191,6 +191,9 @@ class MultiStartSearch:
             equations.coordinates,
             equations.coordinate_units,
         )
+        self._step_units = equations.step_units
+        self._is_geared = np.zeros(len(initial_guess), dtype=bool)
+        self._is_geared[[column for _, column in equations.geared_columns]] = True
         self.specified, self._extra_starts = specified, extra_starts
         self._in_loops = (equations.sign != 0).any(axis=0)
         self._periodic = periodic_coordinates(equations)
@@ -250,7 +253,7 @@ class MultiStartSearch:
 
     def distance_from_guess(self, q: Array) -> tuple[float, float, float]:
         """Distances from the guess: largest of specified joints, their norm, largest of all."""
-        differences = self.coordinate_differences(q, self.initial_guess)
+        differences = self._differences_from_guess(q)
         specified = differences[self.specified]
         return (
             round(float(specified.max(initial=0.0)), 3),
@@ -284,10 +287,14 @@ class MultiStartSearch:
 
     def largest_deviation(self, q: Array) -> tuple[int, float]:
         """Column of the joint that is farthest from the guess, and its distance [m], [rad]."""
-        differences = self.coordinate_differences(q, self.initial_guess)
+        differences = self._differences_from_guess(q)
         return int(differences.argmax()), float(
             (differences * self._coordinate_units)[differences.argmax()]
         )
+
+    def _differences_from_guess(self, q: Array) -> Array:
+        """(nq,) scaled distances from the guess; 0 of geared joints, which others place."""
+        return np.where(self._is_geared, 0.0, self.coordinate_differences(q, self.initial_guess))
 
     def coordinate_differences(self, first: Array, second: Array) -> Array:
         """(nq,) scaled distances of two configurations by joint."""
@@ -308,7 +315,7 @@ class MultiStartSearch:
             share = 2 * np.remainder(0.5 + count * steps, 1.0) - 1
             start = self.initial_guess.copy()
             start[movable] += (
-                _START_RADII[count % len(_START_RADII)] * self._coordinate_units[movable] * share
+                _START_RADII[count % len(_START_RADII)] * self._step_units[movable] * share
             )
             yield start
 
@@ -347,10 +354,8 @@ class MultiStartSearch:
                 break
             step = np.zeros(len(q))
             step[free_columns] = (
-                damped_step(
-                    jacobian[:, free_columns] * self._coordinate_units[free_columns], residual
-                )
-                * self._coordinate_units[free_columns]
+                damped_step(jacobian[:, free_columns] * self._step_units[free_columns], residual)
+                * self._step_units[free_columns]
             )
             step = self._coordinates.coordinate_derivatives(q, step)
             accepted = self._line_search(q, step, cost, lambda way: np.clip(way, lower, upper))

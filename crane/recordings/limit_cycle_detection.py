@@ -1,6 +1,7 @@
 """Limit cycles: sustained oscillations that are not commanded, of a circuit or controller."""
 
-from collections.abc import Iterable, Sequence
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,9 +12,14 @@ from crane.description.sensors import VELOCITY_SUFFIX
 from crane.recordings.recording import REFERENCE_PREFIX, Recording
 
 _MIN_PERIODS = 8  # least number of periods
-_MIN_DECAY_RATIO = 0.85  # ratio of the last to the first swings: a damping ratio below 0.003
-_MAX_PERIOD_SPREAD = 0.15  # standard deviation of the periods over their mean
-_MAX_SWING_SPREAD = 0.25  # standard deviation of the half swings over their mean
+_MIN_DECAY_RATIO = 0.85  # of swings eight periods apart: a damping ratio below 0.003
+_MIN_TIME_SHARE = 0.5  # of the time without a change of command, least duration
+_MAX_WIDTH = 2.5  # periods, width of moving means
+_ORDERS = (1, 2, 3)  # periods after which a cycle repeats: some double or triple their period
+_MANY_PERIODS = 60  # number of periods that counts as sustained in any case
+_MIN_EVEN_SHARE = 0.75  # of the swings of a side and of the periods, which are even
+_MAX_PERIOD_RANGE = 0.33  # range of the even periods over their median
+_MAX_SWING_RANGE = 0.5  # range of the even half swings of one side over their median
 _MIN_RELATIVE_AMPLITUDE = 0.01  # of the largest value of a channel, least amplitude
 _MIN_PRESSURE_AMPLITUDE = 1e5  # least amplitude of a pressure [Pa]
 _MIN_PERIOD_SAMPLES = 4  # least number of samples per period
@@ -41,14 +47,16 @@ class LimitCycle:
 
 
 def sustained_oscillation(
-    time: Array, values: Array, least: float, commands: Iterable[Array] = (), name: str = ""
+    time: Array, values: Array, least: float, commands: Sequence[Array] = (), name: str = ""
 ) -> LimitCycle | None:
     """Largest oscillation of samples that lasts eight even periods without decay.
 
     Moving means of doubling widths are subtracted from the samples; the difference crosses zero
     twice per period. Widths of one to two and a half periods are used. An oscillation decays if
-    the swings of its last quarter of eight periods are below 0.85 of those of the first; it is
-    commanded if a command reverses in at least half of the periods.
+    its swings fall below 0.85 in eight periods, by their largest and their last quarter. One that
+    begins and ends while commands do not change is a transient, or noise, unless it lasts half of
+    that time or sixty periods. It is commanded if a command reverses in at least half of the
+    periods.
 
     Args:
         time: Equidistant instants (N,) [s].
@@ -59,15 +67,20 @@ def sustained_oscillation(
     """
     least = max(least, _MIN_RELATIVE_AMPLITUDE * float(np.abs(values).max(initial=0.0)))
     found: LimitCycle | None = None
+    changes = np.concatenate([[0, len(values)], *map(_command_changes, commands)])
     width = _MIN_PERIOD_SAMPLES
-    while width * _MIN_PERIODS <= 2.5 * len(values):
-        for first, last, period in _oscillation_spans(
-            values - _moving_mean(values, width), width, 0.5 * least
-        ):
+    while width * _MIN_PERIODS <= _MAX_WIDTH * len(values):
+        deviation = values - _moving_mean(values, width)
+        spans = [_oscillation_spans(deviation, width, 0.5 * least, x) for x in _ORDERS]
+        for first, last, period in itertools.chain(*spans):
             amplitude = 0.5 * float(np.median(_peak_to_peak(values, first, last, period)))
             if amplitude < max(least, 0.0 if found is None else found.amplitude):
                 continue
             cycles = (last - first) / period
+            since = changes[changes <= first + period].max()
+            until = changes[changes >= last - period].min()
+            if cycles < _MANY_PERIODS and last - first < _MIN_TIME_SHARE * (until - since):
+                continue
             if any(2 * _reversal_count(command[first:last]) >= cycles for command in commands):
                 continue
             length = period * float(time[last - 1] - time[first]) / (last - 1 - first)
@@ -80,7 +93,8 @@ def sustained_oscillation(
 def limit_cycles(recording: Recording) -> list[LimitCycle]:
     """Limit cycles of pressures, the largest first.
 
-    Commands are the references, without these the valve signals, and external loads.
+    Commands are the references, without these the valve signals, external loads, and revolutions
+    of joints that turn on.
     """
     channels, units = recording.channels, recording.channel_units
     names = [x for x in channels if x.startswith("pressure_") and units.get(x) == "Pa"]
@@ -92,7 +106,7 @@ def limit_cycles(recording: Recording) -> list[LimitCycle]:
     ]
     prefixes = _COMMAND_PREFIXES[:1] if references else _COMMAND_PREFIXES
     references += [x for x in channels if x.startswith(prefixes)]
-    commands = [channels[x] for x in references]
+    commands = [channels[x] for x in references] + _revolutions(recording) + _arrivals(recording)
     found = []
     for name in names:
         release_pages()
@@ -102,6 +116,27 @@ def limit_cycles(recording: Recording) -> list[LimitCycle]:
             )
         )
     return sorted((x for x in found if x is not None), key=lambda one: -one.amplitude)
+
+
+def _revolutions(recording: Recording) -> list[Array]:
+    """Cosines (N,) of how far joints have turned, of those that turn by more than a revolution."""
+    units, columns = recording.units | recording.channel_units, recording.columns()
+    turned = [columns[x] - columns[x][0] for x, unit in units.items() if unit == "rad"]
+    return [
+        np.cos(np.maximum.accumulate(np.sign(angle[-1]) * angle))
+        for angle in turned
+        if abs(angle[-1]) > 2 * np.pi
+    ]
+
+
+def _arrivals(recording: Recording) -> list[Array]:
+    """Steps (N,) from 1 to 0 where a joint arrives at the end of its motion, as at an end stop."""
+    return [
+        np.maximum.accumulate(np.abs(x - x[-1])[::-1] > _MIN_RELATIVE_AMPLITUDE * np.ptp(x))[
+            ::-1
+        ].astype(float)
+        for x in recording.q.T
+    ]
 
 
 def limit_cycle_message(recording: Recording) -> str:
@@ -130,32 +165,56 @@ def _moving_mean(values: Array, width: int) -> Array:
 
 
 def _oscillation_spans(
-    deviation: Array, width: int, least: float
+    deviation: Array, width: int, least: float, order: int
 ) -> Sequence[tuple[int, int, float]]:
-    """Start, end and median period, in samples, of sustained oscillations."""
+    """Start, end and median period, in samples, of what repeats after `order` periods."""
+    from scipy.ndimage import binary_closing
+
     up = deviation > 0
     edges = np.flatnonzero(up[1:] != up[:-1]) + 1  # starts of half periods
-    count = 2 * _MIN_PERIODS
+    count = 2 * _MIN_PERIODS * order
     if len(edges) <= count:
         return []
     sizes = np.maximum.reduceat(np.abs(deviation), edges)[:-1]  # amplitude of each half period
     # interpolated zero crossings
     exact = edges - deviation[edges] / (deviation[edges] - deviation[edges - 1])
-    periods = exact[2:] - exact[:-2]
+    periods = (exact[2 * order :] - exact[: -2 * order]) / order
     rows = np.lib.stride_tricks.sliding_window_view(sizes, count)
-    lengths = np.lib.stride_tricks.sliding_window_view(periods, count - 1)[: len(rows)]
-    mean = lengths.mean(axis=1)
-    quarter = count // 4
-    good = rows.min(axis=1) >= least
-    good &= rows[:, -quarter:].mean(axis=1) >= _MIN_DECAY_RATIO * rows[:, :quarter].mean(axis=1)
-    good &= rows.std(axis=1) <= _MAX_SWING_SPREAD * rows.mean(axis=1)
-    good &= lengths.std(axis=1) <= _MAX_PERIOD_SPREAD * mean
-    good &= (mean >= _MIN_PERIOD_SAMPLES) & (mean <= width) & (width <= 2.5 * mean)
+    size = count + 1 - 2 * order
+    lengths = np.lib.stride_tricks.sliding_window_view(periods, size)
+    # from here on only windows that may pass; outliers shorten the mean by less than this share
+    total = np.append(0.0, np.cumsum(periods))
+    least_total = 0.5 * _MIN_EVEN_SHARE * size * width / _MAX_WIDTH
+    at = np.flatnonzero(total[size:] - total[:-size] >= least_total)
+    length, is_even = _evenness(lengths[at], _MAX_PERIOD_RANGE)
+    is_even &= (length >= _MIN_PERIOD_SAMPLES) & (length <= width) & (width <= _MAX_WIDTH * length)
+    at = at[is_even]
+    for half in range(2 * order):  # above and below, which may differ
+        at = at[_evenness(rows[at, half :: 2 * order], _MAX_SWING_RANGE)[1]]
+    quarters = np.median(rows[at].reshape(len(at), 4, count // 4), axis=2)
+    at = at[quarters[:, -1] >= np.maximum(_MIN_DECAY_RATIO**0.75 * quarters.max(axis=1), least)]
+    if not len(at):
+        return []
+    good = np.zeros(len(rows), dtype=bool)
+    good[at] = True
+    good = binary_closing(np.pad(good, count), np.ones(count + 1, dtype=bool))[
+        count:-count
+    ]  # single jolts
     marks = np.flatnonzero(np.diff(good.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+    last_period = count - 2 * order
     return [
-        (int(edges[a]), int(edges[b - 1 + count]), float(np.median(periods[a : b + count - 2])))
+        (int(edges[a]), int(edges[b - 1 + count]), float(np.median(periods[a : b + last_period])))
         for a, b in marks.tolist()
     ]
+
+
+def _evenness(values: Array, max_range: float) -> tuple[Array, np.ndarray]:
+    """Medians (n,) of rows (n, k), and a mask of those of which most values are close together."""
+    values, count = np.sort(values, axis=1), values.shape[1]
+    even = int(_MIN_EVEN_SHARE * count)
+    ranges = values[:, even - 1 :] - values[:, : count - even + 1]
+    median = values[:, count // 2]
+    return median, ranges.min(axis=1) <= max_range * median
 
 
 def _peak_to_peak(values: Array, first: int, last: int, period: float) -> Array:
@@ -168,6 +227,16 @@ def _peak_to_peak(values: Array, first: int, last: int, period: float) -> Array:
 
 
 def _reversal_count(command: Array) -> int:
+    directions = _directions(command)
+    return int(np.count_nonzero(np.diff(directions[directions != 0])))
+
+
+def _command_changes(command: Array) -> np.ndarray:
+    """Indices of samples where a command starts, stops or reverses."""
+    return np.flatnonzero(np.diff(_directions(command))) + 1
+
+
+def _directions(command: Array) -> Array:
+    """Signs (N - 1,) of the steps of a command, 0 without a step."""
     steps = np.diff(command)
-    steps = steps[np.abs(steps) > 1e-9 * max(float(np.ptp(command)), 1e-300)]
-    return int(np.count_nonzero(np.signbit(steps[1:]) != np.signbit(steps[:-1])))
+    return np.sign(np.where(np.abs(steps) > 1e-9 * max(float(np.ptp(command)), 1e-300), steps, 0))

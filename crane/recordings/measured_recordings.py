@@ -26,6 +26,7 @@ from crane.description.machine_lookup import find_machine_file, without_changes
 from crane.description.sensors import PRESSURE_PREFIX, SENSOR_PREFIX, Sensor
 from crane.formats.machine_loading import load_from_expression
 from crane.machine.machine import Machine
+from crane.recordings.angle_unwrapping import unwrap_table
 from crane.recordings.measured_configurations import (
     HELD_JOINT_TOLERANCE,
     MissingMeasurementError,
@@ -132,7 +133,7 @@ def read_run(
     name = table.notes.get("machine", "")
     if name and is_measured(table):
         machine = recorded_machine(path, name)
-        table = quantities_from_readings(table, path, machine, span)
+        table = quantities_from_readings(unwrap_table(machine, table), path, machine, span)
         return complete_recording(machine, table, path)
     return Recording.from_table(quantities_from_readings(table, path, None, span), path)
 

@@ -37,6 +37,7 @@ from crane.description.sensors import (
 )
 from crane.machine.machine import Machine
 from crane.recordings import logs, table_reader
+from crane.recordings.angle_unwrapping import unwrap_table
 from crane.recordings.recording import IDEAL_SENSORS, SENSORS_NOTE
 from crane.recordings.timeseries import Table, located_errors, table_column
 
@@ -86,11 +87,16 @@ def quantities_from_readings(
 def read_sensor_readings(
     path: str | Path, machine: Machine | None = None, columns: str | Path | None = None
 ) -> Table:
-    """Read all sensor readings of a file, without correction.
+    """Read all sensor readings of a file, without correction of other than whole revolutions.
 
     Raises:
         RecordingError: A file is missing or malformed, or misspells a quantity of the machine.
     """
+    table = _read_table(path, machine, columns)
+    return table if machine is None else unwrap_table(machine, table)
+
+
+def _read_table(path: str | Path, machine: Machine | None, columns: str | Path | None) -> Table:
     if columns is not None:
         table = logs.read_log(path, columns)
         if machine is not None:

@@ -1,6 +1,6 @@
 """Recording of a simulation: its channels, and readings of ideal sensors."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -53,7 +53,7 @@ class IntegrationResult(NamedTuple):
     time: Array
     array: Array
     layout: Layout
-    notes: list[str]
+    notes: Iterable[str]
     start_text: str = ""
     stop: BaseException | None = None
 

@@ -287,7 +287,7 @@ def integrate(
     except (Exception, KeyboardInterrupt) as stop:  # a controller in Python may raise anything
         return run.first_instants(integrator.done, stop)
     else:
-        run.notes.extend(chart.stick_slip.notes)
+        run = run._replace(notes=[*run.notes, *chart.stick_slip.notes])
         if progress is not None:
             progress(1.0)
     is_exact = dynamics.formulation == "exact"

@@ -17,6 +17,7 @@ from crane.common.result import UNFINISHED, Result
 from crane.formats.machine_file.machine_writer import write_machine
 from crane.formats.machine_loading import load_from_expression
 from crane.machine.machine import Machine
+from crane.recordings.limit_cycle_detection import limit_cycle_message
 from crane.recordings.measured_recordings import RECORDING, RECORDING_NPZ
 from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import heading, result_title, summarize
@@ -181,9 +182,11 @@ def _write_page(result: Any, folder: Path) -> None:
 
 
 def _comparison_text(comparison: Any, **_: object) -> str:
-    run = comparison.recording
-    title = "" if run is None else f"# {heading(run)}\n\n"
-    return title + str(comparison.to_markdown())
+    run, text = comparison.recording, str(comparison.to_markdown())
+    if run is None:
+        return text
+    ringing = limit_cycle_message(run)
+    return f"# {heading(run)}\n\n{text}" + (f"\n{ringing}\n" if ringing else "")
 
 
 def _write_comparison(comparison: Any, folder: Path, npz: bool = False) -> None:

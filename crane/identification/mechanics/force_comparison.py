@@ -1,4 +1,4 @@
-"""Comparison of measured and modelled forces: errors, delays, checks of recordings."""
+"""Comparison of measured and modelled forces: errors, checks of recordings."""
 
 import itertools
 import math
@@ -11,32 +11,14 @@ import numpy as np
 from crane.common.errors import CraneWarning
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
-from crane.identification.mechanics.base_parameters import BaseParameters
-from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.smoothed_motion import (
-    delay_message,
-    reject_unless_trusted,
-    signal_delay,
-)
+from crane.identification.mechanics.recording_rejection import reject_delay, reject_unless_trusted
+from crane.identification.mechanics.smoothed_motion import signal_delay
 from crane.identification.signals.signal_processing import (
     Motion,
-    low_pass,
     sampling_step,
 )
-from crane.identification.signals.signal_quality import spectral_edge_frequency
 from crane.recordings.recording import Recording
 
-_CUTOFF_FACTOR = 10.0  # cutoff, times the frequency of the motion
-_SAMPLES_PER_PERIOD = 20.0  # samples of the regressor per period of the cutoff
-_ROW_STRIDE = 5  # samples per row
-_MAX_SAMPLES = 30_000  # samples that are used
-_STANDSTILL_SHARE = 0.05  # of a joint's largest velocity, below which rows are omitted
-_MAX_BLOCKS, _MIN_BLOCKS = 20, 5  # number of blocks for standard errors
-_PERIODS_PER_BLOCK = 2.0  # periods of the motion per block
-_MAX_ITERATIONS = 10
-_TINY = 1e-300
-_MAX_SHIFT_STEP = 0.25  # largest shift of an iteration in periods of the cutoff
-_SINGULAR_VALUE_TOLERANCE = 1e-9  # singular values, relative, that count as zero
 _MAX_FORCE_FACTOR = 30.0  # largest ratio of a force to that of the model
 _MIN_CORRELATION = 0.9  # least correlation for a significant factor
 _BLOCK_COUNT = 10  # of time, for the standard error of that factor
@@ -44,111 +26,6 @@ _VALIDATION_FACTOR = 4.0  # times the error on training data, above which a warn
 _NEGLIGIBLE_ERROR = 1e-6  # negligible error relative to the forces
 _MAX_SHARED_SHARE = 0.2  # of the samples of a recording that another one may contain
 _COMPARED_SAMPLES = 2000  # compared samples
-_DELAY_CONFIDENCE = 0.999  # confidence level of a reported delay
-
-
-def force_delays(
-    model: IdentificationModel, base: BaseParameters, motion: Motion, min_speed: Array
-) -> tuple[Array, Array, int]:
-    """Delays of the forces (n,) [s], their standard errors (n,), and the number of blocks.
-
-    A force with the delay d is tau(t) = m(t - d), to first order m - d m'. The column -m' of each
-    joint is added to those of the model, so that effects that parameters can explain are not
-    attributed to a delay:
-
-        tau = W beta - sum_j d_j m_j' + noise,
-
-    It is solved for beta and d with forces shifted back by d, until d converges. Both sides are
-    low-passed at ten times the frequency of the motion; rows near standstill and within the reach
-    of the filter are omitted. Standard errors use blocks of two periods as independent; the result
-    is nan for fewer than five blocks or too few rows.
-
-    Presliding friction makes forces lead by some milliseconds; late forces are caused by clocks,
-    filters or sensors only.
-
-    Args:
-        model: The model.
-        base: Base parameters of the model.
-        motion: Recorded motion.
-        min_speed: Standstill velocities (n,), if above a share of the largest velocity.
-    """
-    from scipy.ndimage import binary_dilation
-
-    n = motion.tau.shape[1]
-    unknown = np.full(n, np.nan), np.full(n, np.nan), 0
-    step = float(motion.time[1] - motion.time[0])
-    frequency = spectral_edge_frequency(motion.q, step)
-    cutoff = min(_CUTOFF_FACTOR * frequency, 0.2 / step)
-    decimation = max(1, int(1 / (_SAMPLES_PER_PERIOD * cutoff * step)))
-    chosen = slice(0, decimation * _MAX_SAMPLES, decimation)
-    time = motion.time[chosen]
-    filter_reach = int(np.ceil(1 / (cutoff * step * decimation)))
-    blocks = min(_MAX_BLOCKS, int(frequency * (time[-1] - time[0]) / _PERIODS_PER_BLOCK))
-    if blocks < _MIN_BLOCKS or len(time) < 10 * filter_reach:
-        return unknown
-    at = model.samples(motion.q[chosen], motion.v[chosen], motion.a[chosen], step * decimation)
-    W = model.regressor(at)[:, :, base.independent]
-    for i in range(n):
-        W[:, i] = low_pass(time, W[:, i], cutoff)
-    known = low_pass(time, model.known_forces(at), cutoff)
-    force = low_pass(motion.time, motion.tau, cutoff)[chosen]
-    speed = np.abs(motion.v)
-    is_resting = (speed <= np.maximum(min_speed, _STANDSTILL_SHARE * speed.max(axis=0)))[chosen]
-    is_used = ~binary_dilation(is_resting, np.ones((2 * filter_reach + 1, 1), dtype=bool))
-    is_used[:filter_reach] = is_used[-filter_reach:] = False
-    is_used[:, ~model.machine.is_driven] = False  # forces of free joints are zero
-    rows = np.zeros_like(is_used)
-    rows[::_ROW_STRIDE] = is_used[::_ROW_STRIDE]
-    if rows.sum() < 4 * (W.shape[2] + n):
-        return unknown
-    shifts, std = _iterate_delays(time, W, known, force, rows, _MAX_SHIFT_STEP / cutoff, blocks)
-    return shifts, std, blocks
-
-
-def _iterate_delays(
-    time: Array, W: Array, known: Array, force: Array, rows: np.ndarray, stride: float, blocks: int
-) -> tuple[Array, Array]:
-    """Delays and standard errors (n,) from the rows (N, n) of force = W beta + known."""
-    from scipy.interpolate import CubicSpline
-
-    n = force.shape[1]
-    joint, instant = np.nonzero(rows.T)
-    count = np.bincount(joint, minlength=n)
-    is_identifiable = count > 4 * blocks
-    A, shifts = W[instant, joint], np.zeros(n)
-    splines = [CubicSpline(time, column) for column in force.T]
-    min_noise = _SINGULAR_VALUE_TOLERANCE * force.std(axis=0) + _TINY
-    noise = force.std(axis=0) + _TINY
-    for _ in range(_MAX_ITERATIONS):
-        shifted = np.stack([f(time + d) for f, d in zip(splines, shifts, strict=True)], axis=1)
-        # truncated singular value decomposition with columns of length one
-        weighted = A / noise[joint][:, None]
-        length = np.linalg.norm(weighted, axis=0)
-        length[length == 0] = 1.0
-        U, values, V = np.linalg.svd(weighted / length, full_matrices=False)
-        is_significant = values > _SINGULAR_VALUE_TOLERANCE * values[0]
-        U, values, V = U[:, is_significant], values[is_significant], V[is_significant] / length
-        y = (shifted - known)[instant, joint] / noise[joint]
-        projected = U.T @ y
-        rate = np.gradient(W @ (V.T @ (projected / values)) + known, time, axis=0)
-        X = np.zeros((len(y), n))
-        X[np.arange(len(y)), joint] = -rate[instant, joint] / noise[joint]
-        X = X[:, is_identifiable] - U @ (U.T @ X[:, is_identifiable])
-        found = np.linalg.lstsq(X, y - U @ projected, rcond=None)[0]
-        e = y - U @ projected - X @ found
-        shifts[is_identifiable] += np.clip(found, -stride, stride)
-        spread = np.sqrt(np.bincount(joint, e**2, minlength=n) / np.maximum(count, 1))
-        noise = np.maximum(noise * spread, min_noise)
-    block = instant * blocks // len(time)
-    score = np.stack([np.bincount(block, x * e, minlength=blocks) for x in X.T], axis=1)
-    inverse = np.linalg.pinv(X.T @ X)
-    covariance = inverse @ (score.T @ score) @ inverse * blocks / (blocks - 1)
-    std = np.full(n, np.nan)
-    std[is_identifiable] = np.sqrt(np.diag(covariance))
-    not_converged = is_identifiable.copy()
-    not_converged[is_identifiable] = np.abs(found) > std[is_identifiable]
-    shifts[~is_identifiable | not_converged] = std[not_converged] = np.nan
-    return shifts, std
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -265,40 +142,13 @@ def check_forces(
         if abs(lag) > longest_delay and shifted_correlation > max(
             0.9, _shifted_correlation(expected, measured, 0) + 0.05
         ):
-            reject_unless_trusted(delay_message(f"{joint}_force", lag, "its model"), trust)
+            reject_delay(f"{joint}_force", lag, "its model", trust)
     if messages:
         text = (
             f"{', '.join(messages)}: friction and rotors may outweigh the bodies there, or the "
             "unit is wrong, this recording cannot say"
         )
         warnings.warn(text, CraneWarning, stacklevel=3)
-
-
-def warn_delays(
-    joints: Sequence[str], delays: Array, std: Array, blocks: int, longest_delay: float = 0.05
-) -> None:
-    """Warn of delays (n,) [s] of forces, see `force_delays`.
-
-    Early forces are reported only above `longest_delay`, as friction causes small leads.
-    """
-    from scipy.stats import t
-
-    if not blocks:
-        return
-    limit, messages = float(t.ppf(_DELAY_CONFIDENCE, blocks - 1)), []
-    for joint, seconds, error in zip(joints, delays, std, strict=True):
-        if seconds > limit * error or seconds < -max(longest_delay, limit * error):
-            side = "behind" if seconds > 0 else "ahead of"
-            messages.append(
-                f"'{joint}_force' is {1e3 * abs(seconds):.0f} ms (+- {1e3 * error:.1g}) {side} its"
-                " motion"
-            )
-    if messages:
-        warnings.warn(
-            f"{', '.join(messages)}: record them with one clock, or shift them",
-            CraneWarning,
-            stacklevel=3,
-        )
 
 
 def warn_validation(training: ForceComparison, validation: ForceComparison) -> None:

@@ -17,6 +17,7 @@ from crane.common.units import format_table
 from crane.identification.estimation.estimators import Estimate, EstimatedValues
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.force_comparison import ForceComparison
+from crane.identification.mechanics.force_delays import ForceDelays
 from crane.identification.mechanics.identifiability import weak_directions
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.machine.machine import Machine
@@ -49,6 +50,7 @@ class Identification(EstimatedValues, Result):
         bandwidth: Bandwidth of the low-pass [Hz].
         min_speed: (n,) standstill velocities, below which rows were omitted [m/s], [rad/s].
         validation: Comparison of forces on held-out data, None without them.
+        delays: Delays of the forces, one object per recording.
     """
 
     model: IdentificationModel
@@ -66,6 +68,7 @@ class Identification(EstimatedValues, Result):
     bandwidth: float
     min_speed: Array
     validation: ForceComparison | None = None
+    delays: tuple[ForceDelays, ...] = ()
 
     def _one_line(self) -> str:
         """Machine, number of parameters, method, and errors."""
@@ -112,8 +115,15 @@ class Identification(EstimatedValues, Result):
         return weak_directions(self.names, self.covariance, self.magnitude)
 
     @property
+    def delay_text(self) -> str:
+        """Text about delays of forces, "" without any."""
+        return "; ".join(filter(None, (one.text for one in self.delays)))
+
+    @property
     def remedy(self) -> str:
         """Text of measures that would determine more parameters."""
+        if self.delay_text:
+            return "take the delays of the forces out first"
         if self.parameters is not None:
             return f"leave such terms out, or {self.advice}"
         return f"give a prior, require physically feasible bodies, or {self.advice}"
@@ -181,24 +191,21 @@ class Identification(EstimatedValues, Result):
         for title, fit in (("training", self.training), ("validation", self.validation)):
             if fit is None:
                 continue
-            rows = [["force", "RMS error", "", "relative", "PE (9)"]]
+            rows = [["force", "RMS error", "", "relative error"]]
             for i, joint in enumerate(fit.joints):
                 unit = "N" if self.described_machine.unit(joint) == "m" else "N m"
-                shares = [
-                    f"{100 * fit.relative_error[i]:.2f} %",
-                    f"{fit.percentage_error[i]:.3f} %",
-                ]
+                share = f"{100 * fit.relative_error[i]:.2f} %"
                 if joint in self.described_machine.free:
-                    shares = ["free", ""]
-                row = [joint, f"{fit.rmse[i]:.4g}", unit, *shares]
-                rows.append(row if fit.is_moving[:, i].any() else [joint, "-", "", "-", "-"])
+                    share = "free"
+                row = [joint, f"{fit.rmse[i]:.4g}", unit, share]
+                rows.append(row if fit.is_moving[:, i].any() else [joint, "-", "", "-"])
             if not np.isnan(fit.overall_relative_error):
                 mean = f"{100 * np.nanmean(fit.relative_error):.2f} %"
-                rows.append(["mean of the joints", "", "", mean, ""])
-                rows.append(
-                    ["all, stacked", "", "", f"{100 * fit.overall_relative_error:.2f} %", ""]
-                )
-            lines += [f"{title}, moving rows", *format_table(rows, (0, 2)), ""]
+                overall = f"{100 * fit.overall_relative_error:.2f} %"
+                rows.append(["mean of the joints", "", "", mean])
+                rows.append(["all joints together", "", "", overall])
+            heading = f"{title}, samples near standstill excluded"
+            lines += [heading, *format_table(rows, (0, 2)), ""]
         rows = [["parameter", "value", "std", "rel. std", "description", ""]]
         for name, value, std, before, mark in zip(
             self.names, self.values, self.std, self.nominal, self.marks, strict=True
@@ -209,7 +216,7 @@ class Identification(EstimatedValues, Result):
         if self.undetermined_directions:
             lines += [
                 "",
-                "not determined by this motion (std in multiples of the plausible magnitude):",
+                "not determined by this motion (std in multiples of the plausible size):",
             ]
             lines += [
                 f"  +- {std:.2g}  {words}"

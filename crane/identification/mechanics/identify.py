@@ -28,10 +28,9 @@ from crane.identification.mechanics.force_comparison import (
     ForceComparison,
     check_forces,
     check_shared_samples,
-    force_delays,
-    warn_delays,
     warn_validation,
 )
+from crane.identification.mechanics.force_delays import ForceDelays, force_delays
 from crane.identification.mechanics.identifiability import (
     check_identifiable,
     check_prior,
@@ -43,12 +42,13 @@ from crane.identification.mechanics.identifiability import (
 from crane.identification.mechanics.identification_model import IdentificationModel, TermChanges
 from crane.identification.mechanics.identification_result import Identification
 from crane.identification.mechanics.model_terms import FrictionTerm, ModelTerm, body_names
+from crane.identification.mechanics.recording_rejection import reject_unless_trusted
 from crane.identification.mechanics.regression_equations import (
     CombinedRegressor,
     RegressionEquations,
     is_long_enough,
 )
-from crane.identification.mechanics.smoothed_motion import reject_unless_trusted, smoothed_motion
+from crane.identification.mechanics.smoothed_motion import smoothed_motion
 from crane.identification.signals.signal_processing import Motion, Progress
 from crane.identification.signals.signal_quality import spectral_edge_frequency
 from crane.machine.machine import Machine
@@ -134,8 +134,7 @@ def identify(
     check_shared_samples(as_list(recording), as_list(validation), trust)
     motions = prepare_motions(machine, recording, trust, progress)
     equations, identifiable = build_equations(model, motions, bandwidth, min_speed, progress)
-    if model.bodies:
-        _check_forces(model, motions, equations, trust)
+    delays = _check_forces(model, motions, equations, trust) if model.bodies else ()
     selection = equations.column_selection(identifiable)
     columns = CombinedRegressor(equations, selection)
     factors = columns.triangular_factors(equations.y, equations.groups)
@@ -180,7 +179,7 @@ def identify(
     magnitudes = np.sqrt(identifiable.grouping**2 @ parameter_sizes**2)
     identification = Identification(
         model, identifiable, values, covariance, parameters, estimate, method, feasible, training,
-        magnitudes, advice, speeds, bandwidth, min_speeds, validation_comparison,
+        magnitudes, advice, speeds, bandwidth, min_speeds, validation_comparison, delays,
     )  # fmt: skip
     if all(mark == "not determined" for mark in identification.marks):
         reject_unless_trusted(identification.warning, trust)
@@ -257,16 +256,19 @@ def _check_forces(
     motions: Sequence[Motion],
     equations: RegressionEquations,
     trust: bool,
-) -> None:
+) -> tuple[ForceDelays, ...]:
+    """Check the forces of motions; returns their delays, with warnings about significant ones."""
     modelled, first = equations.compare(equations.base.values(model.nominal)).modelled, 0
+    delays = []
     for motion, thinned in zip(motions, equations.thinned_motions(), strict=True):
         here = modelled[first : first + len(thinned.time)]
         if len(here) >= _MIN_COMPARED_ROWS:
             check_forces(thinned, here, model.machine.active, trust=trust)
-        warn_delays(
-            model.machine.active, *force_delays(model, equations.base, motion, equations.min_speed)
-        )
+        delays.append(force_delays(model, equations.base, motion, equations.min_speed))
+        if delays[-1].warning:
+            warnings.warn(delays[-1].warning, CraneWarning, stacklevel=3)
         first += len(here)
+    return tuple(delays)
 
 
 def build_equations(

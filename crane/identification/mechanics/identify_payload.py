@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 from typing import NoReturn
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from crane.common.errors import InputError, RecordingError, check_name
 from crane.common.progress import progress_reporter
-from crane.common.samples import Array
+from crane.common.samples import Array, as_sample
 from crane.common.threads import with_single_threaded_blas
 from crane.dynamics.dynamics import Dynamics
 from crane.identification.estimation.estimators import Estimate
@@ -28,10 +29,11 @@ from crane.identification.mechanics.payload_estimate import (
     static_cutoff,
     static_mass,
 )
+from crane.identification.mechanics.recording_rejection import reject_unless_trusted
 from crane.identification.mechanics.regression_equations import (
     RegressionEquations,
 )
-from crane.identification.mechanics.smoothed_motion import reject_unless_trusted, smoothed_motion
+from crane.identification.mechanics.smoothed_motion import smoothed_motion
 from crane.identification.signals.signal_processing import Motion, Progress
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
@@ -40,6 +42,7 @@ _IDENTIFIABLE_TOLERANCE = 1e-6  # part of a direction outside of the identifiabl
 _SEGMENT_COUNT = 10  # segments of a recording in the jackknife
 _MIN_RETURN_SHARE = 0.1  # least share of a drive's travel in the other direction
 _MAX_INTERVAL_SHARE = 0.1  # largest half width of an interval, relative to the moving mass
+_CENTRE_STEP = 0.01  # [m] step of derivatives by the centre of a point load
 
 
 @with_single_threaded_blas
@@ -51,6 +54,7 @@ def identify_payload(
     inertia: bool = True,
     trust: bool = False,
     progress: Progress | None = None,
+    com: ArrayLike | None = None,
 ) -> PayloadEstimate:
     """Identify a payload from the forces that the machine alone does not explain.
 
@@ -61,11 +65,11 @@ def identify_payload(
     direction only. The machine is otherwise taken as known; its errors show as different loads in
     parts of the recording, which widens the intervals (delete-one jackknife over ten segments).
 
-    If this does not determine the mass, the load is taken as a point at the origin of the frame:
-    one mass beside friction, with signals low-passed at ten times the frequency of the motion. The
-    friction of a drive that moved in one direction only has a prior of the described friction, at
-    least a hundredth of the drive force. A different mass by the forces at rest widens the
-    interval.
+    If this does not determine the mass, the load is taken as a point at `com`, or at the origin of
+    the frame: one mass beside friction, with signals low-passed at ten times the frequency of the
+    motion. The friction of a drive that moved in one direction only has a prior of the described
+    friction, at least a hundredth of the drive force. A different mass by the forces at rest
+    widens the interval.
 
     Args:
         machine: Identified machine without the load.
@@ -75,9 +79,11 @@ def identify_payload(
         inertia: Whether to estimate the inertia of the load about the frame, or neglect it.
         trust: As for `identify`.
         progress: Called with the finished share, 0 to 1.
+        com: (3,) known centre of mass of the load in the frame [m]; estimated, where the motion
+            determines it, if not given.
 
     Raises:
-        InputError: The frame or method is unknown, or the frame does not move.
+        InputError: The frame or method is unknown, the frame does not move, or `com` is no point.
         RecordingError: The recording is not suitable, does not determine the mass to within itself
             and a tenth of the machine's mass, or the mass is significantly negative.
 
@@ -97,19 +103,20 @@ def identify_payload(
     travel = np.sort([np.maximum(v, 0).sum(axis=0), np.maximum(-v, 0).sum(axis=0)], axis=0)
     moves_one_way = travel[0] < _MIN_RETURN_SHARE * travel[1]
     one_way_drives = [x for x, one_way in zip(names, moves_one_way, strict=True) if one_way]
-    case = _PayloadCase(machine, frame, motion, method, names, one_way_drives)
-    first = case.estimate_body(10 if inertia else 4, trust, progress)
+    centre = None if com is None else as_sample(com, 3, "the load's com")
+    case = _PayloadCase(machine, frame, motion, method, names, one_way_drives, centre)
+    first = case.estimate_body(inertia, trust, progress)
     if first is not None and not case.is_uncertain(first):
         low, high = first.confidence_interval()[0].tolist()
         _check_mass(first, trust)
         if low <= 0 <= high:  # not significant
             return first
-        com = np.nan_to_num(first.com)
-        held_mass = static_mass(machine, frame, motion, first.friction_corrections, com)
+        found = np.nan_to_num(first.com)
+        held_mass = static_mass(machine, frame, motion, first.friction_corrections, found)
         return replace(first, static_mass=held_mass)
     point = case.estimate_point_mass(progress)
     if point is None or case.is_uncertain(point):
-        held_mass = static_mass(machine, frame, motion, {}, np.zeros(3))
+        held_mass = static_mass(machine, frame, motion, {}, case.point)
         _raise_unidentifiable(one_way_drives, first or point, held_mass)
     _check_mass(point, trust)
     return point
@@ -126,6 +133,7 @@ class _PayloadCase:
         method: Method of the estimate.
         moving_drives: Drives that moved.
         one_way_drives: Drives that moved in one direction only.
+        com: (3,) known centre of mass in the frame [m], None if it is not known.
     """
 
     machine: Machine
@@ -134,9 +142,15 @@ class _PayloadCase:
     method: str
     moving_drives: Sequence[str]
     one_way_drives: Sequence[str]
+    com: Array | None
 
-    def model(self, parameter_count: int) -> IdentificationModel:
-        """Model of a load with a number of parameters, and of corrections of Coulomb friction."""
+    @property
+    def point(self) -> Array:
+        """Position (3,) of a point load in the frame [m]."""
+        return np.zeros(3) if self.com is None else self.com
+
+    def model(self, has_inertia: bool, com: Array | None) -> IdentificationModel:
+        """Model of a load, see `PayloadTerm`, and of corrections of Coulomb friction."""
         dynamics = Dynamics(self.machine)
 
         def machine_forces(at: MotionSamples) -> Array:
@@ -146,16 +160,16 @@ class _PayloadCase:
             friction={}, forces=(), gas_springs=(), ropes=(), end_stops=()
         )
         terms: list[ModelTerm] = [
-            PayloadTerm(self.machine, self.frame, parameter_count),
+            PayloadTerm(self.machine, self.frame, has_inertia, com),
             *(friction_term(bare_machine, x, ("coulomb",), 0.0) for x in self.moving_drives),
         ]
         return IdentificationModel(bare_machine, terms, machine_forces)
 
     def estimate_body(
-        self, parameter_count: int, trust: bool, progress: Progress | None
+        self, has_inertia: bool, trust: bool, progress: Progress | None
     ) -> PayloadEstimate | None:
-        """Estimate a load with 10 or 4 parameters; None if nothing determines its mass."""
-        model = self.model(parameter_count)
+        """Estimate a load with its moments; None if nothing determines its mass."""
+        model = self.model(has_inertia, self.com)
         # the weight determines the load: smoothing of accelerations does not limit the bandwidth
         motion = replace(self.motion, passband=math.inf)
         equations, base = build_equations(model, [motion], progress=progress)
@@ -172,14 +186,15 @@ class _PayloadCase:
         equations, estimate = equations.estimate(
             columns, METHODS[self.method], None, np.zeros(len(columns))
         )
-        combinations, directions = _identifiable_moments(base)
+        combinations, directions = _identifiable_moments(base, 4 if self.com is None else 1)
         if not combinations[:, 0].any():
             return None
         mass, *first = (combinations.T @ estimate.values).tolist()
         com = np.where(combinations[:, 1:].any(axis=0), np.array(first) / mass, np.nan)
+        com = com if self.com is None else self.com
         derivatives = np.eye(4)  # of mass and com by mass and first moments
         derivatives[1:] /= mass
-        derivatives[1:, 0] = -np.nan_to_num(com) / mass
+        derivatives[1:, 0] = -np.nan_to_num(com) / mass if self.com is None else 0.0
         derivatives = derivatives @ combinations.T
         covariance, freedom = _widen_covariance(equations, columns, estimate, derivatives)
         unknown = np.append(False, np.isnan(com))
@@ -192,13 +207,14 @@ class _PayloadCase:
         }
         fit = self._force_comparison(equations, columns @ estimate.values)
         return PayloadEstimate(
-            self.frame, mass, com, covariance, freedom, directions, corrections, None, fit
-        )
+            self.frame, mass, com, covariance, freedom, directions, corrections, None, fit,
+            self.com is not None,
+        )  # fmt: skip
 
     def estimate_point_mass(self, progress: Progress | None) -> PayloadEstimate | None:
-        """Estimate a mass at the frame's origin; None if its weight loads no moving drive."""
-        motion, model = low_passed_motion(self.motion), self.model(1)
-        load = PayloadTerm(self.machine, self.frame, 1)
+        """Estimate a mass at a point; None if its weight loads no moving drive."""
+        motion, model = low_passed_motion(self.motion), self.model(False, None)
+        load = PayloadTerm(self.machine, self.frame, False, self.point)
         q = motion.q[:: max(1, len(motion.q) // 100)]
         at = IdentificationModel(self.machine, [load]).samples(q, 0 * q, 0 * q)
         drive_indices = [self.machine.active.index(joint) for joint in self.moving_drives]
@@ -212,7 +228,13 @@ class _PayloadCase:
             )
         except RecordingError:  # no row is far enough from standstill
             return None
-        columns = equations.column_selection(base) @ base.grouping
+        all_columns = equations.column_selection(base) @ base.grouping
+
+        def columns_of(point: Array) -> Array:
+            mass = all_columns[:, :4] @ np.append(1.0, point)
+            return np.column_stack([mass, all_columns[:, 4:]])
+
+        columns = columns_of(self.point)
         std = [math.inf]
         for joint in self.moving_drives:
             i = self.machine.active.index(joint)
@@ -220,15 +242,21 @@ class _PayloadCase:
             band = max(breakaway_force(self.machine, joint), least)
             std.append(band if joint in self.one_way_drives else math.inf)
         prior = np.zeros(len(std)), np.array(std)
-        equations, parameters = equations.estimate(
-            columns, METHODS[self.method], prior, np.zeros(len(columns))
-        )
+        start = np.zeros(len(columns))
+        gradient = np.zeros(3)
+        for i, step in enumerate(_CENTRE_STEP * np.eye(3)):
+            masses = [
+                equations.estimate(columns_of(x), METHODS[self.method], prior, start)[1].values[0]
+                for x in (self.point - step, self.point + step)
+            ]
+            gradient[i] = (masses[1] - masses[0]) / (2 * _CENTRE_STEP)
+        equations, parameters = equations.estimate(columns, METHODS[self.method], prior, start)
         derivatives = np.zeros((4, len(std)))
         derivatives[0, 0] = 1.0
         covariance, freedom = _widen_covariance(
             equations, columns, parameters, derivatives, np.diag(1 / prior[1])
         )
-        covariance[1:] = covariance[:, 1:] = np.nan
+        covariance[1:] = covariance[:, 1:] = np.nan if self.com is None else 0.0
         corrections = {
             joint: float(value)
             for joint, value in zip(self.moving_drives, parameters.values[1:], strict=True)
@@ -237,13 +265,15 @@ class _PayloadCase:
         estimate = PayloadEstimate(
             self.frame,
             float(parameters.values[0]),
-            np.full(3, np.nan),
+            np.full(3, np.nan) if self.com is None else self.com,
             covariance,
             freedom,
             np.zeros((0, 3)),
             corrections,
-            static_mass(self.machine, self.frame, self.motion, corrections, np.zeros(3)),
+            static_mass(self.machine, self.frame, self.motion, corrections, self.point),
             self._force_comparison(equations, columns @ parameters.values),
+            self.com is not None,
+            gradient,
         )
         if estimate.static_mass is not None:  # the difference of both estimates is an uncertainty
             covariance[0, 0] += (estimate.static_mass[0] - estimate.mass) ** 2
@@ -335,16 +365,20 @@ def _raise_unidentifiable(
     raise RecordingError(text)
 
 
-def _identifiable_moments(base: BaseParameters) -> tuple[Array, Array]:
+def _identifiable_moments(base: BaseParameters, count: int) -> tuple[Array, Array]:
     """Mass and first moments as combinations (r, 4) of base parameters, zero if unidentifiable.
 
     Also returns the identifiable directions (k, 3) of first moments. A combination of parameters
-    is identifiable if it is in the row space of K, orthogonal to the null space of K.
+    is identifiable if it is in the row space of K, orthogonal to the null space of K. Of mass and
+    first moments, `count` are parameters.
     """
     K = base.grouping
-    share = np.array(np.linalg.lstsq(K.T, np.eye(K.shape[1])[:, :4], rcond=None)[0])
-    missing = np.abs(K.T @ share - np.eye(K.shape[1])[:, :4]).max(axis=0)
+    wanted = np.eye(K.shape[1])[:, :count]
+    share = np.array(np.linalg.lstsq(K.T, wanted, rcond=None)[0])
+    missing = np.abs(K.T @ share - wanted).max(axis=0)
     share[:, missing > _IDENTIFIABLE_TOLERANCE] = 0.0
+    if count < 4:
+        return np.pad(share, ((0, 0), (0, 4 - count))), np.zeros((0, 3))
     unseen = np.linalg.svd(K)[2][len(K) :]
     _, sizes, axes = np.linalg.svd(unseen[:, 1:4]) if len(unseen) else (0, np.zeros(3), np.eye(3))
     sizes = np.append(sizes, np.zeros(3 - len(sizes)))

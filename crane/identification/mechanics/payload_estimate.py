@@ -29,27 +29,33 @@ _MIN_PERIODS = 5.0  # periods of the cutoff in a recording
 
 
 class PayloadTerm:
-    """Term of a rigid body on a frame: its ten parameters about the origin of the frame.
+    """Term of a rigid body on a frame: its parameters about the origin of the frame.
+
+    With a known centre of mass these are its mass and its inertia about the centre.
 
     Args:
         machine: The machine.
         frame: Name of a moving link.
-        parameter_count: Number of the parameters: 10, 4 without inertia, 1 for a point mass.
+        has_inertia: Whether the inertia is among the parameters.
+        com: (3,) centre of mass in the frame [m], None if the first moments are parameters.
     """
 
-    def __init__(self, machine: Machine, frame: str, parameter_count: int = 10):
+    def __init__(
+        self, machine: Machine, frame: str, has_inertia: bool = True, com: Array | None = None
+    ):
         model_frame = machine.model.frames[machine.frame(frame)]
         if model_frame.parentJoint == 0:
             raise InputError(f"frame '{frame}' does not move, choose another")
         first = 10 * (model_frame.parentJoint - 1)
         A = model_frame.placement.homogeneous  # the pseudo-inertia about the joint is A P A^T
-        self._frame_transform = body_parameters(A @ pseudo_inertia(np.eye(10)) @ A.T)[
-            :parameter_count
-        ].T
+        if com is not None:
+            A[:3, 3] += A[:3, :3] @ com
+        kept = np.r_[0 : 4 if com is None else 1, 4 : 10 if has_inertia else 4]
+        self._frame_transform = body_parameters(A @ pseudo_inertia(np.eye(10)) @ A.T)[kept].T
         self._body_columns = slice(first, first + 10)
         self._dynamics = Dynamics(machine)
-        self.names = tuple(f"load.{key}" for key in BODY_PARAMETERS[:parameter_count])
-        self.nominal, self.nonnegative = np.zeros(parameter_count), (False,) * parameter_count
+        self.names = tuple(f"load.{BODY_PARAMETERS[i]}" for i in kept)
+        self.nominal, self.nonnegative = np.zeros(len(kept)), (False,) * len(kept)
 
     def columns(self, samples: MotionSamples) -> Array:
         """See `model.ModelTerm`."""
@@ -66,8 +72,8 @@ class PayloadEstimate(EstimatedValues):
     Attributes:
         frame: Name of the link.
         mass: Mass [kg].
-        com: (3,) centre of mass in the frame [m]; nan along axes that the motion does not
-            determine, all nan if the load was taken as a point at the origin.
+        com: (3,) centre of mass in the frame [m], as given or estimated; nan along axes that the
+            motion does not determine, all nan if the load was taken as a point at the origin.
         covariance: (4, 4) covariance of mass and com to first order, the larger of that by noise
             and that by the jackknife; nan as for `com`.
         degrees_of_freedom: (4,) degrees of freedom of each variance.
@@ -78,6 +84,9 @@ class PayloadEstimate(EstimatedValues):
         static_mass: Mass by the forces at rest for this centre of mass, and its uncertainty by
             friction [kg]; None without rest.
         fit: Forces beyond those of the machine, measured and by the load.
+        is_com_given: Whether the centre of mass was given.
+        mass_gradient: (3,) derivatives of the mass by the centre of a load that was taken as a
+            point [kg/m], None otherwise.
     """
 
     frame: str
@@ -89,6 +98,8 @@ class PayloadEstimate(EstimatedValues):
     friction_corrections: dict[str, float]
     static_mass: tuple[float, float] | None
     fit: ForceComparison
+    is_com_given: bool = False
+    mass_gradient: Array | None = None
 
     @property
     def values(self) -> Array:  # type: ignore[override]
@@ -118,10 +129,20 @@ class PayloadEstimate(EstimatedValues):
             if np.isnan(value):
                 rows.append([name, "-", "", "not determined by this motion", ""])
                 continue
+            if self.is_com_given and name != "mass":
+                rows.append([name, f"{value:.5g}", "", "given", ""])
+                continue
             interval = f"{low:.5g} to {high:.5g} {unit}"
             rows.append([name, f"{value:.5g}", f"{deviation:.2g}", interval, ""])
-        at = ", modelled as a point mass at this frame" if np.isnan(self.com).all() else ""
-        lines = [f"load on {self.frame}{at}", *format_table(rows, (0, 3))]
+        point = ", modelled as a point mass" if self.mass_gradient is not None else ""
+        at = " at this frame" if point and not self.is_com_given else ""
+        lines = [f"load on {self.frame}{point}{at}", *format_table(rows, (0, 3))]
+        if at and self.mass_gradient is not None:
+            changes = ", ".join(f"{0.1 * x:+.2g}" for x in self.mass_gradient)
+            lines.append(
+                f"per 0.1 m of its centre along x, y, z the mass changes by {changes} kg: give "
+                "the centre (--centre X,Y,Z)"
+            )
         if self.confidence_interval()[0, 0] <= 0:
             lines.append("the mass may be zero: do not trust its centre")
         if self.static_mass is not None:
@@ -176,7 +197,7 @@ def static_mass(
     tau = np.array([motion.tau[i:j].mean(axis=0) for i, j in runs])
     zero = np.zeros_like(q)
     tau = tau - Dynamics(machine).inverse(q, zero, zero)
-    load = PayloadTerm(machine, frame, 4)
+    load = PayloadTerm(machine, frame, has_inertia=False)
     at = IdentificationModel(machine, [load]).samples(q, zero, zero)
     unit_forces = load.columns(at) @ np.append(1.0, com)
     friction_forces = np.array([breakaway_force(machine, joint) for joint in machine.active])

@@ -11,6 +11,7 @@ from crane.common.samples import Array
 from crane.common.scratch_arrays import BLOCK_SIZE, release_pages, stack_columns
 from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.dynamics.dynamics import Dynamics
+from crane.identification.mechanics.recording_rejection import reject_delay, reject_unless_trusted
 from crane.identification.signals.signal_processing import (
     Motion,
     Progress,
@@ -27,6 +28,7 @@ from crane.identification.signals.signal_quality import (
     strongest_spectral_line,
 )
 from crane.machine.machine import Machine
+from crane.recordings.angle_unwrapping import unwrap_angles
 from crane.recordings.measured_recordings import locked_joint_conflicts
 from crane.recordings.recording import FORCE_SUFFIX, VELOCITY_SUFFIX, VELOCITY_UNITS, Recording
 from crane.recordings.timeseries import time_derivative
@@ -69,7 +71,8 @@ def smoothed_motion(
     Raises:
         RecordingError: The recording is not suitable; the message names column and time.
     """
-    original, recording = recording, _select_active_joints(machine, recording)
+    unwrapped = unwrap_angles(machine, recording.time, recording.columns())
+    original, recording = recording, _select_active_joints(machine, recording, unwrapped)
     locked_columns = {
         x: column for x, column in original.columns().items() if x in machine.locked_joints
     }
@@ -84,6 +87,11 @@ def smoothed_motion(
     recorded = None
     if np.any(recording.v):  # for comparison only, without outliers
         recorded = stack_columns((replace_outliers(x, outlier_mask(x)) for x in recording.v.T), n)
+        is_derived = [
+            np.array_equal(v, time_derivative(q, time))
+            for q, v in zip(recording.q.T, recording.v.T, strict=True)
+        ]
+        recorded[:, is_derived] = np.nan  # no column of the file
     limits = np.column_stack([machine.lower, machine.upper])
     check_recording(
         time,
@@ -126,15 +134,24 @@ def smoothed_motion(
     return Motion(time, found.q, v, a, columns[:, n:], passband)
 
 
-def _select_active_joints(machine: Machine, recording: Recording) -> Recording:
+def _select_active_joints(
+    machine: Machine, recording: Recording, unwrapped: Mapping[str, Array]
+) -> Recording:
     """Select the active joints of a machine from a recording, in their order.
 
-    Free joints may be among the channels; their forces are zero.
+    Free joints may be among the channels; their forces are zero. Coordinates are taken from
+    `unwrapped` where they jump by revolutions, with velocities that are their derivatives there.
 
     Raises:
         RecordingError: A joint is missing or has another unit, or a free joint has a force.
     """
     recorded_columns, units = recording.columns(), recording.units | recording.channel_units
+    for joint in unwrapped.keys() & set(machine.active):
+        name, jumps = joint + VELOCITY_SUFFIX, recorded_columns[joint] - unwrapped[joint]
+        near = np.convolve(np.abs(np.diff(jumps, prepend=jumps[0])) > 1, np.ones(5), "same") > 0
+        rate = time_derivative(unwrapped[joint], recording.time)
+        recorded_columns[name] = np.where(near, rate, recorded_columns.get(name, rate))
+    recorded_columns |= unwrapped
     available = {*recording.joints, *(x for x in machine.free if x in recorded_columns)}
     missing = [joint for joint in machine.active if joint not in available]
     if missing:
@@ -272,17 +289,6 @@ def _products(one: Array, other: Array, reach: int) -> Array:
     return total
 
 
-def reject_unless_trusted(text: str, trust: bool) -> None:
-    """Reject a recording that is probably wrong, or warn if it is trusted.
-
-    Raises:
-        RecordingError: It is not trusted.
-    """
-    if not trust:
-        raise RecordingError(f"{text}; if the recording is right, trust it (trust)")
-    warnings.warn(f"{text}: trusted", CraneWarning, stacklevel=3)
-
-
 def remove_outliers(
     time: Array, names: Sequence[str], columns: Array, trust: bool = False
 ) -> Array:
@@ -353,7 +359,7 @@ def check_recording(
         tau: Generalized forces (N, n).
         joints: Names (n,).
         units: "rad" or "m" of each coordinate.
-        v: Recorded velocities (N, n), compared with the derivatives of q.
+        v: Recorded velocities (N, n), compared with the derivatives of q; nan for none.
         limits: Lower and upper limits (n, 2).
         longest_delay: Largest delay [s] between recorded velocity and q, for filters of sensors.
         free: Names of free joints.
@@ -376,7 +382,9 @@ def check_recording(
             )
         if limits is not None:
             _check_range(q[:, i], limits[i], joint, units[joint], trust)
-        if v is not None and np.var(np.diff(q[:, i])) < np.var(q[:, i]):
+        if v is None or np.isnan(v[:, i]).any():
+            continue
+        if np.var(np.diff(q[:, i])) < np.var(q[:, i]):
             _check_velocity(time, q[:, i], v[:, i], joint, units[joint], longest_delay, trust)
 
 
@@ -433,11 +441,5 @@ def _check_velocity(
             trust,
         )
     if abs(delay) > longest_delay:
-        reject_unless_trusted(delay_message(f"{joint}_velocity", delay, f"'{joint}'"), trust)
+        reject_delay(f"{joint}_velocity", delay, f"'{joint}'", trust)
     return None
-
-
-def delay_message(name: str, delay: float, reference: str) -> str:
-    """Message about the delay [s] of a column with respect to another."""
-    side = "behind" if delay > 0 else "ahead of"
-    return f"'{name}' is {abs(delay) * 1e3:.0f} ms {side} {reference}, record them with one clock"

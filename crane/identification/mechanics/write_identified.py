@@ -39,6 +39,7 @@ from crane.identification.mechanics.identified_description import (
 from crane.identification.mechanics.model_terms import BODY_PARAMETERS, FrictionTerm
 from crane.machine.machine import Machine
 
+_FEASIBLE_REMEDY = "give feasible=True"
 _FORCE_TOLERANCE = 1e-9  # of the largest force, for the check of the written machine
 
 
@@ -72,6 +73,18 @@ def write_identified(identification: Identification, folder: str | Path) -> Path
             terms of the model.
         OutputError: The folder cannot be written, or contains the files of the machine.
     """
+    try:
+        return _write_identified(identification, folder)
+    except InputError as error:
+        text = str(error)
+        if not text.endswith(_FEASIBLE_REMEDY) or not identification.delay_text:
+            raise
+        # feasible parameters would hide what the delay does to them
+        problem = text.removesuffix(f", {_FEASIBLE_REMEDY}")
+        raise InputError(f"{problem}: {identification.delay_text}, take that out first") from None
+
+
+def _write_identified(identification: Identification, folder: str | Path) -> Path:
     machine, parameters = identification.described_machine, identification.parameters
     check_rewritable(machine)
     if parameters is None or not identification.model.bodies:

@@ -27,6 +27,7 @@ from crane.simulation.integration.charts import (
 from crane.simulation.integration.integrators import StickSlipIntegrator
 from crane.simulation.integration.machine_formulas import raise_undetermined
 from crane.simulation.integration.python_stepper import IntegrationHaltError, StepProgress
+from crane.simulation.integration.run_notes import RunNotes
 
 _NEARLY_SINGULAR_MARGIN = 1e5  # on the inertia that counts as none, of what explains a halt
 _LIMIT_RELAXATION = np.array([2.0, 0.1])  # factors of the limits where no chart is better
@@ -67,7 +68,7 @@ class ChartSwitchingIntegrator:
         self._row_layout = row_layout(chart.machine, control, controller_state_count)
         self._segment_start = self.done = 0
         self._recent_states = np.zeros((0, self._row_layout.start_index("tau")))
-        self.notes: list[str] = []
+        self.notes = RunNotes()
         self._orientation, self._has_passed_dead_centre = 1.0, False
 
     def run(
@@ -147,8 +148,8 @@ class ChartSwitchingIntegrator:
                 raise IntegrationHaltError(
                     time,
                     at.q[chart.user_columns],
-                    f": {names} {'come' if len(left) > 1 else 'comes'} to a dead centre, where "
-                    "inverse dynamics has no answer",
+                    f": {'joints' if len(left) > 1 else 'joint'} {names} at a dead centre, where "
+                    "inverse dynamics is undefined",
                     ": keep the reference away from there, or drive other joints",
                 )
             return False
@@ -312,9 +313,11 @@ class ChartSwitchingIntegrator:
             self._integrator.run(instants, state, part, np.empty((len(instants), rows.shape[1])))
             if self._integrator.offset < 0:
                 raise self._integrator.python_stepper.halt_error(behind_time, state)
-        self.notes.append(
-            f"at t = {behind_time:.4g} s the linkage passes a configuration from which it could "
-            "go on in several ways: it goes on as it moves"
+        self.notes.add(
+            behind_time,
+            "",
+            " the linkage passes a configuration from which it could go on in several ways: it "
+            "goes on as it moves",
         )
         return i
 
@@ -363,10 +366,11 @@ class ChartSwitchingIntegrator:
             left_columns = np.setdiff1d(user_machine.closure.active, chart.machine.closure.active)
             names = " and ".join(f"'{user_machine.joints[i]}'" for i in left_columns)
             verb = "pass" if len(left_columns) > 1 else "passes"
-            self.notes.append(
-                f"{names} {verb} a dead centre at t = {times[behind_indices[0]]:.4g} s: from "
-                "there on active coordinates alone do not determine the configuration, take "
-                "passive joints with them"
+            self.notes.add(
+                float(times[behind_indices[0]]),
+                f"{names} {verb} a dead centre ",
+                ": from there on active coordinates alone do not determine the configuration, "
+                "take passive joints with them",
             )
         at.v_a[:] = np.einsum("nij,nj->ni", velocity_maps, at.v_a)
         at.friction[:] = np.einsum(

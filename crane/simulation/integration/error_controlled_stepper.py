@@ -27,6 +27,7 @@ from crane.common.samples import Array
 from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
 from crane.dynamics.external_forces import state_count
+from crane.machine.machine import Machine
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.machine_code_stepper import MachineCodeStepper
 from crane.simulation.integration.machine_formulas import reference_samples, wrap_rotations
@@ -45,10 +46,10 @@ _STEP_REDUCTION_AFTER_EVENT = 0.2  # ratio of the first step size after an event
 _TIME_TOLERANCE = 1e-9  # share of the output interval: difference of equal instants
 
 
-def characteristic_energy(chart: Chart) -> float:
+def characteristic_energy(machine: Machine) -> float:
     """Kinetic energy of the mass of a machine at its characteristic speed, doubled [J]."""
-    closure = chart.machine.closure
-    mass = sum(inertia.mass for inertia in chart.machine.model.inertias)
+    closure = machine.closure
+    mass = sum(inertia.mass for inertia in machine.model.inertias)
     return float(mass * (closure.characteristic_length / closure.characteristic_time) ** 2)
 
 
@@ -61,7 +62,7 @@ def error_tolerances(chart: Chart, controller_state_count: int, tolerance: float
     rates = closure.units[closure.active] / closure.characteristic_time
     energies = np.full(
         2 + len(chart.machine.external_forces),
-        ENERGY_TOLERANCE_FACTOR * characteristic_energy(chart),
+        ENERGY_TOLERANCE_FACTOR * characteristic_energy(chart.machine),
     )
     contact_scales = np.full(
         state_count(chart.machine.external_forces), closure.characteristic_length

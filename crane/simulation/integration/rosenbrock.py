@@ -118,7 +118,9 @@ class RosenbrockStepper(ErrorControlledStepper):
             ]
         )
         method = ("stiff", self._stiff_state_count)
-        energy = MIN_SCALE * ENERGY_TOLERANCE_FACTOR * tolerance * characteristic_energy(chart)
+        energy = (
+            MIN_SCALE * ENERGY_TOLERANCE_FACTOR * tolerance * characteristic_energy(chart.machine)
+        )
         errors = np.append(
             ROSENBROCK_TOLERANCE / tolerance / accuracies, [tolerance, 1.0 / energy]
         )
