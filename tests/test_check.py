@@ -310,8 +310,8 @@ INERTIAS = [
     seen(
         [
             "ground.urdf:21: warning: link 'crank_arm' has a radius of gyration of 63.2 m, "
-            "and its joints and its centre of mass are at most 0.2 m away, correct the "
-            "inertia (kg m2, about the centre of mass) or the mass (kg)"
+            "and its joints and its centre of mass are at most 0.2 m from its origin, correct "
+            "the inertia (kg m2, about the centre of mass) or the mass (kg)"
         ],
         swap(
             CRANK_INERTIA,
@@ -322,8 +322,8 @@ INERTIAS = [
     seen(
         [
             "ground.urdf:21: warning: link 'crank_arm' has a radius of gyration of 8.16e-05"
-            " m, and its joints and its centre of mass are at most 0.2 m away, correct the "
-            "inertia (kg m2, about the centre of mass) or the mass (kg)"
+            " m, and its joints and its centre of mass are at most 0.2 m from its origin, correct "
+            "the inertia (kg m2, about the centre of mass) or the mass (kg)"
         ],
         swap(
             CRANK_INERTIA,
@@ -443,8 +443,8 @@ MECHANISM = [
     seen(
         [
             "four_bar.yaml:10: error: loop 'pin' cannot be closed from the home guess "
-            "(crank = 1.2): it stays 0.0961 rad open, correct the frames or the guess (it "
-            "is 10 mm apart and 5.73 deg askew)"
+            "(crank = 1.2): its smallest gap is 10 mm and 5.73 deg, correct the frames or "
+            "the guess"
         ],
         swap('<origin xyz="0.3 0 0"/>', '<origin xyz="0.3 0 0.01" rpy="0.1 0 0"/>', ROCKER),
     ),
@@ -469,8 +469,8 @@ MECHANISM = [
     seen(
         [
             "four_bar.yaml:10: error: loop 'pin' cannot be closed from the home guess "
-            "(crank = 1.2): it stays 0.101 m open, correct the frames or the guess (it is "
-            "102 mm apart and 0.0723 deg askew)",
+            "(crank = 1.2): its smallest gap is 102 mm and 0.0723 deg, correct the frames or the "
+            "guess",
             "four_bar.yaml:20: error: 'coulomb' of friction of 'crank' is -0.3, give at least 0",
             "four_bar.yaml:38: error: 'duration' of task 'reach' is 'soon', give a number "
             "in s, as in 5 ms",
@@ -504,11 +504,10 @@ MECHANISM = [
         [
             "mini_forwarder.yaml:{line of - {name: A1}: error: loop 'A1_eye' cannot be "
             "closed from the home "
-            "guess (q1 = 0, X1 = 0.0221, X2 = 0.0108): it stays 0.1 m open, correct the "
-            "frames or the guess (it is 100 mm apart and 0 deg askew)",
+            "guess (q1 = 0, X1 = 0.0221, X2 = 0.0108): its smallest gap is 100 mm and 0 deg, "
+            "correct the frames or the guess",
             "mini_forwarder.yaml:{line of - {name: K}: error: loop 'K' stays open,"
-            " too: it is 50 mm apart and"
-            " 0 deg askew",
+            " too: its smallest gap is 50 mm and 0 deg",
         ],
         swap('<origin xyz="0.0825 0 0"/>', '<origin xyz="0.0825 0 0.1"/>', CHAIN_B1),
         swap('<origin xyz="0.0431 0 0"/>', '<origin xyz="0.0431 0 0.05"/>', CHAIN_B2),

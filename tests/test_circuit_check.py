@@ -230,7 +230,8 @@ def test_valves_that_take_more_than_the_pump_gives_are_a_note(base):
     circuit = {"supply": {"pressure": 9.25e6, "flow": 0.5e-3}, "valves": {"x": COMPENSATED}}
     report = check(written(base, **circuit))
     assert report.notes == (
-        "hydraulics: the valves of 'supply' take 40 l/min together, it gives 30 l/min",
+        "hydraulics: fully open valves of pump 'supply' need 40 l/min together, it delivers "
+        "at most 30 l/min",
     )
     assert report.status == 0
     done = typed("check", base[0] / "changed.yaml")
@@ -323,7 +324,8 @@ def test_units_that_people_write_are_told(base, key, numbers, what, unit):
 
 def test_the_note_on_a_bundled_circuit():
     assert check("patu655").notes == (
-        "hydraulics: the valves of 'supply' take 160 l/min together, it gives 100 l/min",
+        "hydraulics: fully open valves of pump 'supply' need 160 l/min together, it delivers "
+        "at most 100 l/min",
     )
 
 

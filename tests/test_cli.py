@@ -98,7 +98,7 @@ def test_info_says_what_the_machine_is():
     assert "4: 8 independent equations, 12 redundant" in result.stdout
     assert "q4+q9, then q10+q2, then q6+q11, then q7+q3" in result.stdout
     assert "task        lift, 10 s: lifts along a straight line" in result.stdout
-    assert "\n  independent coordinates: condition 2.71 at home\n" in result.stdout
+    assert "coordinates condition number of the active ones 2.71 at home\n" in result.stdout
     assert re.search(r"^  driven ", result.stdout, re.M) is None  # free ones are among them
 
 
@@ -153,7 +153,7 @@ def test_info_has_the_whole_home_posture_and_the_path(mini):
     assert set(told) == set(mini.joints)
     for joint, value in told.items():
         assert float(value) == pytest.approx(mini.home[mini.column(joint)], rel=1e-4)
-    assert "  computed    compiled" in lines
+    assert "  dynamics    compiled to machine code" in lines
 
 
 SLOW = (
@@ -267,7 +267,7 @@ def test_without_a_task_a_controller_holds_and_none_lets_go(free_run, tmp_path):
     assert (runs[0].tau == 0).all() and np.ptp(runs[0].q, axis=0).max() > 1e-5
     assert np.ptp(runs[1].q, axis=0).max() < 1e-9
     words = " ".join(typed("simulate", "-h").stdout.replace("│", " ").split())
-    assert "a given controller holds the home configuration; without one," in words
+    assert "without it, drive forces are zero and valves stay at neutral." in words
 
 
 @pytest.mark.parametrize("arguments", [["info", "ur5_robot"], ["--version"]])
@@ -312,9 +312,67 @@ def test_interrupt_is_one_line_and_leaves_nothing(tmp_path, delay):
         out, rest = process.communicate(timeout=300)
     assert (process.returncode, out) == (130, "")
     *before_it, line = rest.splitlines()
-    assert line == "error: interrupted, nothing was written"
+    assert line == "error: interrupted, no result was written"
+    left = set(tmp_path.rglob("*")) - before
+    if left:  # variants were finished
+        file = tmp_path / "new" / "run" / "unfinished.csv"
+        assert left == {file, *file.parents[:2]}
+        said = f"what is finished is kept in {file}: add --resume to go on"
+        assert before_it.pop() == said
     assert all(other.startswith("warning: ") for other in before_it)
-    assert set(tmp_path.rglob("*")) == before
+
+
+DRAWN = """
+import os, time
+import crane.view.plots.figure_style as figure_style
+
+
+class Object:
+    def __del__(self):  # where Python ignores what is raised
+        os.kill(os.getpid(), {number})
+        for _ in range(1000):
+            pass
+
+
+def ignored():
+    Object()
+    time.sleep(30)
+
+
+def replaced():
+    try:
+        os.kill(os.getpid(), {number})
+        time.sleep(30)
+    except BaseException as error:
+        raise RuntimeError("something of a library's own") from error
+
+
+def write_figure(path, draw):
+    path.write_bytes(b"half")
+    {what}()
+
+
+figure_style.write_figure = write_figure
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["ignored", "replaced"])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_while_figures_are_drawn_is_one_line_and_leaves_no_parts(tmp_path, what, number):
+    out = tmp_path / "new" / "run"
+    code = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n{DRAWN}"
+    command = [sys.executable, "-c", code.format(number=int(number), what=what) + MAIN, "study"]
+    command += ["mini_forwarder", "--vary", "payload.mass=0:0.3:2", "--measure", "mass"]
+    command += ["--processes", "1", "--out", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (128 + number, "")
+    assert done.stderr.splitlines() == [
+        f"what is finished is kept in {out / 'unfinished.csv'}: add --resume to go on",
+        "error: interrupted, no result was written",
+    ]
+    left = [path.relative_to(tmp_path) for path in tmp_path.rglob("*")]
+    assert sorted(map(str, left)) == ["new", "new/run", "new/run/unfinished.csv"]
 
 
 CUT = """

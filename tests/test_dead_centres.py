@@ -299,7 +299,7 @@ def test_inverse_dynamics_at_a_dead_centre_is_one_line(tmp_path, made):
         warnings.simplefilter("ignore", CraneWarning)
         crane.simulate(machine, made(machine, path))
     text = str(caught.value)
-    assert "'s' comes to a dead centre" in text and "\n" not in text
+    assert "joint 's' at a dead centre" in text and "\n" not in text
 
 
 @pytest.mark.slow

@@ -619,7 +619,7 @@ def test_from_a_simulated_file_to_a_folder(run, simulated, tmp_path):
     command = ("identify", "mini_forwarder", file, "--validation", file, "--feasible")
     status, out, errors = run(*command, "--out", "result")
     assert (status, errors) == (0, [])
-    assert "mini_forwarder: " in out and "validation, moving rows" in out
+    assert "mini_forwarder: " in out and "validation, samples near standstill excluded" in out
     assert out.endswith("\nwritten to result; see result/report.html\n")
     written = {path.name for path in (tmp_path / "result").iterdir()}
     assert written == {"report.html", "parameters.csv", "machine"}

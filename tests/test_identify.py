@@ -69,7 +69,7 @@ def test_noise_is_all_that_is_left(mini, method):
     joints = slice(1, 3) if method == "ols" else slice(0, 3)
     assert np.all(result.training.rmse[joints] < 1.1 * floor[joints])
     assert np.all(result.validation.rmse[joints] < 1.1 * floor[joints])
-    assert "validation, moving rows" in result.to_text()
+    assert "validation, samples near standstill excluded" in result.to_text()
 
 
 @pytest.mark.slow

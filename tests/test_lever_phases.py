@@ -184,7 +184,7 @@ def test_a_phase_that_never_ends_is_named(tmp_path):
     )
     assert (
         " m on its way from 0.2 to 0.3 m: give it more time or lever, or a position that it "
-        "reaches; the run until t = 1.5 s is in "
+        "reaches; results until t = 1.5 s are written to "
     ) in done.stderr
     part = crane.Recording.read(tmp_path / "out/recording.csv")
     assert part.time[-1] == pytest.approx(1.5) and part.stopped

@@ -1,6 +1,7 @@
 """Live views: closed loops after every move, limits, access, end of the process."""
 
 import asyncio
+import gc
 import http.client
 import os
 import re
@@ -379,6 +380,65 @@ def test_strangers_get_nothing(live, who):
     assert get(port, path.format(**said), **headers) == 403
     with pytest.raises(InvalidStatus, match="403"):
         connect(port, path.format(**said), **headers)
+
+
+def ask(port, lines):
+    """First line of the answer to a request of any bytes."""
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as there:
+        there.sendall(lines)
+        return there.makefile("rb").readline()
+
+
+REQUESTS = {
+    "bytes above 127": b"GET /\xe9\xff/ HTTP/1.1\r\nHost: 127.0.0.1:%d\r\n\r\n",
+    "an origin that is none": b"GET / HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nOrigin: http://[\r\n\r\n",
+    "a host that is none": b"GET / HTTP/1.1\r\nHost: \xff[%d\r\n\r\n",
+}
+
+
+@pytest.mark.parametrize("what", REQUESTS)
+def test_a_request_of_any_bytes_is_refused_without_a_word(live, what, capfd):
+    port, door, *_ = live
+    for path in (b"", door.token.encode()[:-1]):
+        line = ask(port, REQUESTS[what].replace(b"GET /", b"GET /" + path) % port)
+        assert line == b"HTTP/1.1 403 Forbidden\r\n"
+    line = ask(port, b"\xff\0 garbage\r\n\r\n")
+    assert line == b"" or b" 400 " in line
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_a_window_sends_and_nobody_can_read_is_dropped(live, capfd):
+    import msgspec
+    from websockets.exceptions import ConnectionClosed
+
+    port, door, page, requests = live
+    name = next(iter(page._sliders.values()))._impl.uuid
+    messages = [
+        "a text", b"", b"\xc1" * 100, bytes(range(256)), b"\x93\x01",
+        *(
+            msgspec.msgpack.encode(x)
+            for x in (
+                None, [1], {"type": "GuiUpdateMessage"}, {"type": "Nothing"}, {"type": 3},
+                {"type": "GuiUpdateMessage", "uuid": name, "updates": 3},
+                {"type": "GuiUpdateMessage", "uuid": [name], "updates": {"value": 0.1}},
+                {"type": "ViewerCameraMessage", "wxyz": "x"},
+                {"messages": [{"type": "ViewerCameraMessage", "wxyz": 1}], "timestampSec": 1.0},
+            )
+        ),
+    ]  # fmt: skip
+    for message in messages:
+        with connect(port, f"/{door.token}") as client:
+            assert client.recv(timeout=10)
+            try:
+                for _ in range(3):
+                    client.send(message)
+            except ConnectionClosed:
+                continue
+    assert get(port, f"/{door.token}/") == 200  # it goes on
+    with connect(port, f"/{door.token}") as client:
+        assert client.recv(timeout=10)
+    gc.collect()  # tasks whose errors nobody took
+    assert requests.empty() and capfd.readouterr() == ("", "")
 
 
 def test_those_with_the_address_come_in(live):

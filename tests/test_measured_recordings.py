@@ -388,8 +388,8 @@ def test_sensors_that_disagree_are_told(machine, columns, truth, tmp_path, full)
         read_measured(machine, write(tmp_path, columns))
     (line,) = [str(one.message) for one in caught if "disagree" in str(one.message)]
     assert line.startswith(
-        f"sensors disagree: 'q3' is {off.mean():+.3g} deg off on average ({off.min():+.3g} to "
-        f"{off.max():+.3g} over the motion) against X2: residual "
+        "sensors disagree: 'q3' deviates from the value computed from X2 by "
+        f"{off.mean():+.3g} deg on average ({off.min():+.3g} to {off.max():+.3g}); residual "
     )
     (numbers,) = re.findall(r"an offset and a delay \((.*?)\)", line)
     told = dict(part.split(" = ") for part in numbers.split(", "))

@@ -331,7 +331,10 @@ def test_a_window_is_trained_on_and_the_rest_judges(tmp_path, crank):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "cross-validation within the training" in done.stdout
-    assert "validation, moving rows" in done.stdout and "mean of the joints" in done.stdout
+    assert (
+        "validation, samples near standstill excluded" in done.stdout
+        and "mean of the joints" in done.stdout
+    )
     data = yaml.safe_load((tmp_path / "out" / "machine" / "four_bar.yaml").read_text())
     assert data["rotor_inertia"]["crank"] > 0
 
@@ -355,7 +358,10 @@ def test_what_judges_nothing_is_told(tmp_path, crank, arguments, message):
     done = typed("identify", *crank, *arguments, "--prior", "0.3",
                  "--out", tmp_path / "out")  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert message in done.stderr and "validation, moving rows" not in done.stdout
+    assert (
+        message in done.stderr
+        and "validation, samples near standstill excluded" not in done.stdout
+    )
     assert "<dt>validation</dt>" not in (tmp_path / "out" / "report.html").read_text()
 
 

@@ -12,7 +12,8 @@ import crane
 
 # What one word alone may name. A name of several words says more, and needs no list.
 CLASSES = """
-Accumulator Batch Breakout Buckling Calibration Capacity Chain Chart Closure Cluster Comparison
+Accumulator Batch Breakout Buckling Calibration Capacity Chain Chart Checkpoint Closure Cluster
+Comparison
 Contact Controller Coordinates Coupling Cylinder Derivatives Design Dimension Drive Dynamics
 Engine Estimate Excitation Finding Findings Flow Formula Friction Gearbox Gradient Ground
 Hydraulics Identification Inertial Jackknife Joint Key Kinematics Layout Limits Link Machine
@@ -22,7 +23,7 @@ Supply Sway Table Tape Task Torques Trajectory Transmission Tree Unknown Valve V
 Wrench _Line _Stream _Subtree
 """
 FILES = """
-attitude batch buckling calibrate charts closure clusters command components coordinates
+attitude batch buckling calibrate charts checkpoint closure clusters command components coordinates
 describe design differentiation dynamics entry errors estimators exchange findings
 identifiability identify integrators kinematics levers linearization logs machine measures
 misfit notebook npz options parsing payload priors program progress radau rate reactions

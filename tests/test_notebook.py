@@ -94,7 +94,9 @@ def test_a_machine_has_its_sketch_and_its_facts(mini):
 
 def test_a_circuit_and_free_joints_are_told():
     found = looked_at(crane.load("patu655_grapple"))
-    assert "compensated valve" in found.text and "78.54 and 53.91 cm2" in found.text
+    assert (
+        "compensated valve" in found.text and "cylinder areas A 78.54, B 53.91 cm2" in found.text
+    )
     assert "free" in found.text
 
 

@@ -1,7 +1,10 @@
 """Numbers in options, in output, and in lines of tables."""
 
+import re
+
 import numpy as np
 import pytest
+from command_line import typed
 
 import crane
 from crane.cli.parsing import parse_changes
@@ -21,7 +24,9 @@ from crane.common.samples import (
     as_seed,
 )
 from crane.common.units import display_unit, format_number, format_quantity
+from crane.description.specification import ParameterPrior
 from crane.recordings.recording_summary import recorded_machine_name, result_title
+from crane.recordings.table_reader import read_csv
 from crane.studies.variant_study import StudyJob, measure_variant
 
 
@@ -58,6 +63,33 @@ def test_numbers_within_bounds_are_kept():
 def test_counts(value):
     with pytest.raises(InputError, match=f"the count is {value}, give a whole number from 1 to 9"):
         as_count(value, "the count", 1, 9)
+
+
+ODD_NUMBERS = ["1_000", "\N{ARABIC-INDIC DIGIT THREE}", "1.\N{FULLWIDTH DIGIT FIVE}", "1e1_0"]
+
+
+@pytest.mark.parametrize("text", ODD_NUMBERS)
+def test_a_number_is_the_same_in_every_file_and_option(slider_crank, tmp_path, text):
+    """All of them are numbers to Python, and none to a program that reads tables."""
+    assert float(text) > 0
+    urdf = slider_crank.chains[0].urdf.read_text()
+    (tmp_path / "odd.urdf").write_text(re.sub('mass value="[^"]*"', f'mass value="{text}"', urdf))
+    with pytest.raises(CraneError, match="is not a number, write digits"):
+        crane.load(tmp_path / "odd.urdf")
+    with pytest.raises(InputError, match="says no standard deviation"):
+        ParameterPrior.parse(text)
+    (tmp_path / "odd.csv").write_text(f"time [s],q [m]\n0,1\n1,{text}\n")
+    with pytest.raises(RecordingError, match="line 3, column 'q': .* is not a finite number"):
+        read_csv(tmp_path / "odd.csv")
+    path = slider_crank.path
+    for words in (
+        ["simulate", path, "--step", text],
+        ["study", path, "--vary", "x=1~2", "--draws", text],
+    ):
+        done = typed(*words, "--out", tmp_path / "out")
+        assert done.returncode == 2 and f"Invalid value for '{words[-2]}': {text!r}" in done.stderr
+    done = typed("live", path, "--port", "65536")
+    assert done.returncode == 2 and "65536 is not in the range 0 to 65535." in done.stderr
 
 
 def test_joints_by_name():
@@ -127,7 +159,7 @@ def test_units_are_chosen_by_the_peak():
 
 
 def test_lines_can_be_read():
-    assert format_one_line("a\nb\x1b[31m\udcff") == "a b [31m "
+    assert format_one_line("a\nb\x1b[31m\udcff") == "a b [31m\\udcff"
     assert len(format_one_line("x" * 100_000)) < 1000
     assert len(str(CraneError("x y " * 100_000))) < 4000
     assert format_one_line("short and " + "y" * 900) == "short and " + "y" * 900

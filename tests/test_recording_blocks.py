@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import tracemalloc
 import zipfile
 from functools import partial
 
@@ -220,6 +221,31 @@ def test_where_there_is_no_room_it_is_in_memory(small, monkeypatch):
         and values.flags.f_contiguous
         and len(scratch_arrays._memory_maps) == before
     )
+
+
+@pytest.mark.slow
+def test_a_motion_is_smoothed_in_a_few_columns(mini, monkeypatch):
+    """Whole series are in scratch files, and blocks take as much for any recording."""
+    from crane.identification.mechanics.smoothed_motion import smoothed_motion
+
+    monkeypatch.setattr(scratch_arrays, "_MIN_FILE_ELEMENTS", 1)
+    time = np.arange(0.0, 200.0, 1e-3)
+    rates = 2 * np.pi * np.array([0.31, 0.43, 0.57])
+    middle, reach = 0.5 * (mini.lower + mini.upper), 0.2 * (mini.upper - mini.lower)
+    q = middle + reach * np.sin(np.outer(time, rates))
+    v = reach * rates * np.cos(np.outer(time, rates))
+    tau = 1.0 + q + v
+    q = q + 1e-6 * np.random.default_rng(0).normal(size=q.shape)
+    units = {joint: mini.unit(joint) for joint in mini.active}
+    recording = Recording(time, mini.active, q, v, tau, units)
+    tracemalloc.start()
+    try:
+        found = smoothed_motion(mini, recording)
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert np.abs(found.v - v)[100:-100].max() < 1e-3 * np.abs(v).max()
+    assert most < 25 * time.nbytes, most / time.nbytes
 
 
 def test_a_run_as_npz_is_viewed_and_takes_the_place_of_a_csv(tmp_path):

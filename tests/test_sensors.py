@@ -274,7 +274,7 @@ def test_a_zero_is_named_with_its_value(machine, motion, tmp_path, name, off, wi
     lines = told(machine, written(tmp_path, motion, **moved | {name: lambda y: before(y) + off}))
     assert lines
     for line in lines:
-        assert "a constant offset explains it" in line
+        assert re.search(r"; residual \S+ \S+ with a constant offset \([^()]*\)$", line), line
         assert number(line, f"sensor.{name}.zero") == pytest.approx(off, abs=within), line
     if not name.startswith("X"):
         assert len(lines) == 1 and f"'{name}'" in lines[0]
@@ -286,12 +286,14 @@ def test_how_far_apart_is_told(machine, motion, tmp_path):
     bend = 0.02 * np.sin(7 * columns["time"])
     (line,) = told(machine, written(tmp_path, motion, ["q2"], q2=lambda x: x + 0.04 + bend))
     found = re.search(
-        r"'q2' is (\S+) deg off on average \((\S+) to (\S+) over.*against X_lift:", line
+        r"'q2' deviates from the value computed from X_lift by (\S+) deg on average "
+        r"\((\S+) to (\S+)\);",
+        line,
     )
     wanted = np.rad2deg([0.04 + bend.mean(), 0.04 + bend.min(), 0.04 + bend.max()])
     np.testing.assert_allclose([float(x) for x in found.groups()], wanted, rtol=5e-3)
     assert "residual 0.81 deg with a constant offset (sensor.q2.zero = 0.04" in line
-    assert line.endswith(", and no delay, scale or pin explains the rest")
+    assert line.endswith("; no delay, scale or pin position explains the rest")
 
 
 def test_delays_and_scales_are_told_apart(machine, motion, tmp_path):
@@ -306,7 +308,7 @@ def test_delays_and_scales_are_told_apart(machine, motion, tmp_path):
     assert number(line, "sensor.q2.scale") == pytest.approx(1.1, abs=1e-3)
     assert number(line, "sensor.q2.zero") == pytest.approx(0.02, abs=1e-3)
     (line,) = told(machine, written(tmp_path, motion, ["q2"], q2=lambda x: 0 * x))
-    assert line.endswith("it does not move")
+    assert line.endswith("; its reading does not change")
 
 
 @pytest.mark.parametrize(
@@ -332,7 +334,7 @@ def test_an_absolute_angle_in_the_place_of_a_joint_s_is_suspected(machine, motio
     (line,) = told(machine, written(tmp_path, motion, ["q3"], q3=lambda x: absolute + 0.01))
     suspected = "'q3' follows the inclination of 'tilt_boom' against the horizon within"
     assert suspected in line
-    assert line.endswith("an absolute angle is called 'inclination_tilt_boom'")
+    assert line.endswith("measures an absolute angle, name the column 'inclination_tilt_boom'")
     # and where it is what the posture is taken from, beside the inclinometer itself
     units = motion[1]
     names = ["time", "q2", "q3", "inclination_tilt_boom", "X_lift_force", "X_tilt_force"]
@@ -340,7 +342,7 @@ def test_an_absolute_angle_in_the_place_of_a_joint_s_is_suspected(machine, motio
     table = Table({x: units[x] for x in names}, np.column_stack(values), {})
     timeseries.write_table(tmp_path / "run.csv", table)
     (line,) = told(machine, tmp_path / "run.csv")
-    assert "'inclination_tilt_boom' is" in line and suspected in line
+    assert "'inclination_tilt_boom' deviates" in line and suspected in line
 
 
 def test_numbers_add_to_what_is_known(machine, motion, tmp_path):
@@ -401,7 +403,7 @@ def test_one_sample_is_compared_and_its_rates_are_not(machine, motion, tmp_path)
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
         (line,) = told(machine, tmp_path / "run.csv")
-    assert "'q2' is +5.73 deg off" in line
+    assert "'q2' deviates from the value computed from X_lift by +5.73 deg on average" in line
 
 
 def test_inclinations_that_do_not_tell(machine, motion, tmp_path):
@@ -460,7 +462,11 @@ def test_commands_take_windows(tmp_path, motion, machine):
         "plot", path, "--machine", "patu655", *LOCKS, "--from", "2", "--until", "4", "--out", out
     )
     assert done.returncode == 0 and out.exists()
-    assert done.stderr.count("sensors disagree: 'q2' is +2.86 deg off on average") == 1
+    assert (
+        done.stderr.count("sensors disagree: 'q2' deviates")
+        == done.stderr.count(" by +2.86 deg on average ")
+        == 1
+    )
     for words, said in (
         (("plot", path, "--from", "4", "--until", "2"), "nothing lies from 4 to 2 s"),
         (("view", "patu655", "--from", "1"), "--from is for runs, and 'patu655' is none"),
@@ -534,9 +540,12 @@ def test_a_raw_log_s_disagreement_is_told(machine, tmp_path):
     columns = tmp_path / "columns.txt"
     columns.write_text(COLUMNS)
     lift, tilt = told(machine, LIFTING, columns=columns)
-    assert "'inclination_lift_boom' is -1.37 deg off on average (-2.69 to +0.201" in lift
-    assert "'inclination_tilt_boom' is -4.87 deg off on average" in tilt
-    assert "against X_lift, X_tilt" in tilt
+    assert "'inclination_lift_boom' deviates" in lift
+    assert "by -1.37 deg on average (-2.69 to +0.201)" in lift
+    assert (
+        "'inclination_tilt_boom' deviates from the value computed from X_lift, X_tilt by" in tilt
+    )
+    assert "by -4.87 deg on average" in tilt
     places = [number(line, "lift_boom_rod.x") for line in (lift, tilt)]  # both say the same pin
     np.testing.assert_allclose(places, 0.316, atol=1e-3)
     window = "--from", "2", "--until", "3"

@@ -256,6 +256,17 @@ def test_steps_by_their_error_turn_a_floating_machine_round():
 def test_too_many_steps(mini):
     with pytest.raises(InputError, match="1e[+]15 steps of 0.001 s, at most 4000000"):
         crane.simulate(mini, duration=1e12)
+    with pytest.raises(InputError, match="1 steps of 1e[+]09 s, at most 4000000 and 1e[+]06 s"):
+        crane.simulate(mini, duration=1e9, step=1e9)
+
+
+def test_long_output_steps_are_integrated_in_parts(slider_crank):
+    """References are sampled for some hundred output steps at a time, or for a part of one."""
+    fine = crane.simulate(slider_crank, duration=6.0, step=1e-2)
+    for step in (3.0, 6.0):
+        coarse = crane.simulate(slider_crank, duration=6.0, step=step)
+        every = round(step / 1e-2)
+        np.testing.assert_allclose(coarse.q, fine.q[::every], rtol=0, atol=1e-9)
 
 
 @pytest.mark.filterwarnings("ignore::crane.CraneWarning")

@@ -16,7 +16,7 @@ from crane.common.errors import CraneError, SimulationError
 from crane.recordings.recording_summary import energy_imbalance
 
 SLIDER_CRANK = Path(__file__).parent / "data" / "slider_crank.yaml"
-STOPPED = re.compile(r"at t = (\S+) s: 's' comes to a dead centre, where inverse dynamics has no")
+STOPPED = re.compile(r"at t = (\S+) s: joint 's' at a dead centre, where inverse dynamics is und")
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 
@@ -110,7 +110,7 @@ def test_a_run_that_stops_is_written_and_says_so(stopped):
     assert "Traceback" not in result.stderr
     line = result.stderr.splitlines()[-1]
     assert line.startswith("error: at t = ") and STOPPED.search(line)
-    assert line.endswith("; the run until t = 0.582 s is in run")
+    assert line.endswith("; results until t = 0.582 s are written to run")
     assert sorted(path.name for path in folder.iterdir()) == ["recording.csv", "summary.md"]
     recording = crane.Recording.read(folder / "recording.csv")
     assert recording.time[-1] == pytest.approx(0.582)

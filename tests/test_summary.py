@@ -85,7 +85,8 @@ def test_markdown():
     }
     recording = make([0.0, np.pi / 2], reference_X1=[0.0195, 0.02], **zero, **away)
     assert summarize(recording).to_markdown().splitlines() == [
-        "| joint | range | peak speed | peak force | RMS force | peak error | RMS error |",
+        "| joint | position range | peak speed | peak force | RMS force | peak tracking error "
+        "| RMS tracking error |",
         "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
         "| q1 | 0.00 to 57.30 deg | 57.30 deg/s | 2 N m | 1.414 N m |  |  |",
         "| X1 | 20.00 to 20.00 mm | 0.00 mm/s | 50 N | 50 N | 0.500 mm | 0.354 mm |",
@@ -106,17 +107,17 @@ def energies(time):
 @pytest.mark.parametrize(
     ("off", "expected"),
     [
-        ({}, "off by at most 0 J, of the oil off by at most 0 J"),
+        ({}, "0 J (mechanism), 0 J (oil)"),
         (
             {"kinetic": 0.25},
-            "off by at most 0.25 J, of the oil off by at most 0 J",
+            "0.25 J (mechanism), 0 J (oil)",
         ),
         (
             {"work_wind": -0.5},
-            "off by at most 0.5 J, of the oil off by at most 0 J",
+            "0.5 J (mechanism), 0 J (oil)",
         ),
-        ({"work": 0.5}, "off by at most 0.5 J, of the oil off by at most 0.5 J"),
-        ({"pump_work": 2}, "off by at most 0 J, of the oil off by at most 2 J"),
+        ({"work": 0.5}, "0.5 J (mechanism), 0.5 J (oil)"),
+        ({"pump_work": 2}, "0 J (mechanism), 2 J (oil)"),
     ],
 )
 def test_the_balance_of_energy(off, expected):
@@ -128,7 +129,7 @@ def test_the_balance_of_energy(off, expected):
     recording = replace(make(time, **channels), channel_units=units)
     assert summarize(recording).to_markdown().splitlines()[-2:] == [
         "",
-        f"energy balance: {expected}",
+        f"maximum energy imbalance: {expected}",
     ]
     assert summarize(make(time, **channels)).balance_text == ""  # of no energies
 
@@ -137,7 +138,7 @@ def test_a_balance_that_is_simulated(slider_crank):
     recording = simulate(slider_crank, lambda t, q, v: [2.0 - v[0]], duration=0.2)
     gap = energy_imbalance(recording)
     assert 0 < np.abs(gap).max() < 1e-6 < np.ptp(recording.channels["work"])
-    assert summarize(recording).balance_text == f"off by at most {np.abs(gap).max():.2g} J"
+    assert summarize(recording).balance_text == f"{np.abs(gap).max():.2g} J (mechanism)"
 
 
 def test_potential_energy_counts_weight_from_the_world_s_origin_and_springs_from_their_rest(

@@ -99,7 +99,8 @@ def test_a_combination_of_what_is_determined_is_named_without_a_warning(plain):
     assert "75 base parameters, 1 not determined, " in repr(found)
     # a motion last: excite may have found the best that the limits allow
     assert re.search(
-        ": give a prior, require physically feasible bodies, or record one that ", found.warning
+        ": give a prior, require physically feasible bodies, or record a motion that ",
+        found.warning,
     )
 
 

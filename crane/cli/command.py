@@ -14,6 +14,7 @@ from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin
 import typer
 
 from crane.common.errors import InputError
+from crane.common.number_text import check_digits
 
 # Commands import what they need when they run, so that `crane --help` answers at once.
 
@@ -56,7 +57,9 @@ def command(
                 values[key].check()
             function(**values)
 
-        parameters = [*own, *shared]
+        parameters = [
+            x.replace(annotation=_with_plain_numbers(x.annotation)) for x in (*own, *shared)
+        ]
         run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         run.__annotations__ = {x.name: x.annotation for x in parameters}
         registry.command(name)(run)
@@ -116,6 +119,30 @@ def _in_panel(annotation: Any, panel: str) -> Any:
     kind, option = get_args(annotation)
     option = copy(option)
     option.rich_help_panel = panel
+    return Annotated[kind, option]
+
+
+def _with_plain_numbers(annotation: Any) -> Any:
+    """The annotation of an option, whose number consists of digits as in files."""
+    if get_origin(annotation) is not Annotated:
+        return annotation
+    kind, option = get_args(annotation)
+    number = next((x for x in (int, float) if x in (kind, *get_args(kind))), None)
+    if number is None or option.parser is not None:
+        return annotation
+
+    def parse(text: Any) -> float:
+        try:
+            check_digits(str(text))
+            value: float = number(text)
+        except ValueError:
+            raise typer.BadParameter(f"{text!r} is not a valid {parse.__name__}.") from None
+        if option.min is not None and not option.min <= value <= option.max:
+            raise typer.BadParameter(f"{text} is not in the range {option.min} to {option.max}.")
+        return value
+
+    option, parse.__name__ = copy(option), number.__name__
+    option.parser = parse
     return Annotated[kind, option]
 
 

@@ -10,7 +10,6 @@ from crane.cli.option_units import parameter_units
 from crane.cli.options import (
     Frame,
     MachineName,
-    OutputFolder,
     ParallelOptions,
     ParameterOptions,
     Requirements,
@@ -20,6 +19,7 @@ from crane.cli.options import (
     UserMeasures,
 )
 from crane.cli.parsing import parse_grids, parse_ranges
+from crane.cli.resumable_output import ResumableFolder
 from crane.cli.terminal import progress_bar
 
 
@@ -28,7 +28,7 @@ def study(
     machine: MachineName,
     options: ParameterOptions,
     parallel: ParallelOptions,
-    output: OutputFolder,
+    output: ResumableFolder,
     vary: Annotated[
         list[str],
         typer.Option(
@@ -52,17 +52,18 @@ def study(
     draws: Annotated[int | None, typer.Option(help="Number of random variants.")] = None,
     seed: Seed = 0,
 ) -> None:
-    """Compute measures of variants, on a grid or at random."""
+    """Evaluate measures for parameter values (grid, random)."""
     loaded = options.load(machine)
     units_of = parameter_units(loaded)
     axes = parse_grids(vary, units_of) if draws is None else parse_ranges(vary, units_of)
-    with progress_bar("computing variants") as progress:
-        result = crane.study(
-            loaded, axes, task, measure, require=require or (),
-            user_measures=measures, frame=frame, rule=rule, draws=draws, seed=seed,
-            progress=progress, **parallel.arguments(),
-        )  # fmt: skip
-    output.write(result)
+    with output.checkpoint() as checkpoint:
+        with progress_bar("computing variants") as progress:
+            result = crane.study(
+                loaded, axes, task, measure, require=require or (),
+                user_measures=measures, frame=frame, rule=rule, draws=draws, seed=seed,
+                checkpoint=checkpoint, progress=progress, **parallel.arguments(),
+            )  # fmt: skip
+        output.write(result)
 
 
 @command()
@@ -70,7 +71,7 @@ def design(
     machine: MachineName,
     options: ParameterOptions,
     parallel: ParallelOptions,
-    output: OutputFolder,
+    output: ResumableFolder,
     vary: Annotated[
         list[str],
         typer.Option(metavar="NAME=LOW~HIGH", help="A parameter and its range; may be repeated."),
@@ -96,11 +97,13 @@ def design(
 ) -> None:
     """Optimize parameters for objectives and constraints."""
     loaded = options.load(machine)
-    with progress_bar("searching") as progress:
-        result = crane.design(
-            loaded, parse_ranges(vary, parameter_units(loaded)),
-            minimise=minimise or (), maximise=maximise or (),
-            require=require or (), measures=measures, frame=frame, rule=rule, tasks=task,
-            starts=starts, points=points, seed=seed, progress=progress, **parallel.arguments(),
-        )  # fmt: skip
-    output.write(result)
+    with output.checkpoint() as checkpoint:
+        with progress_bar("searching") as progress:
+            result = crane.design(
+                loaded, parse_ranges(vary, parameter_units(loaded)),
+                minimise=minimise or (), maximise=maximise or (),
+                require=require or (), measures=measures, frame=frame, rule=rule, tasks=task,
+                starts=starts, points=points, seed=seed, checkpoint=checkpoint, progress=progress,
+                **parallel.arguments(),
+            )  # fmt: skip
+        output.write(result)

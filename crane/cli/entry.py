@@ -14,7 +14,7 @@ from typer.core import TyperGroup
 import crane
 from crane.cli.command import app
 from crane.cli.parsing import parse_gravity
-from crane.cli.terminal import INTERRUPTED, activity_line, print_message
+from crane.cli.terminal import INTERRUPTED, activity_line, ending_signals, print_message
 from crane.common.errors import CraneError, CraneWarning, format_one_line
 from crane.common.package_search import use_load_options
 
@@ -29,6 +29,7 @@ GROUPS = {  # modules of this room and their commands, in the order of use
     "show": "view plot sketch live",
     "exchange": "convert import schema",
 }
+_SIGNAL_STATUS = 128  # exit status of a process that a signal has ended, less its number
 _FLAGS = ("--debug", "--strict", "--trust-xacro")  # that all commands take
 _HELP = """\
 Simulate, identify, rate and design machines with closed kinematic chains.
@@ -78,26 +79,32 @@ def main() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")
     warnings.showwarning = _show_warning
     warnings.simplefilter("once", CraneWarning)
-    try:
-        gravity = None if gravity_text is None else parse_gravity(gravity_text)
-        run = program(*arguments[:1])
-        with (
-            activity_line(" ".join(["crane", *arguments[:1]])),
-            use_load_options(strict=strict, trust_xacro=trust, gravity=gravity),
-        ):
-            status = run(args=arguments or ["--help"], standalone_mode=False, prog_name="crane")
-        if status == INTERRUPTED:  # what the parser makes of KeyboardInterrupt
-            raise KeyboardInterrupt
-        if sys.stdout is not None:  # it is where the shell has closed it
-            sys.stdout.flush()
-    except KeyboardInterrupt:
-        print_message("error: interrupted, nothing was written")
-        sys.exit(INTERRUPTED)
-    except Exception as error:
-        if debug:
-            raise
-        print_message(f"error: {_error_text(error)}")
-        sys.exit(2)
+    with ending_signals() as signals:
+        try:
+            gravity = None if gravity_text is None else parse_gravity(gravity_text)
+            run = program(*arguments[:1])
+            with (
+                activity_line(" ".join(["crane", *arguments[:1]])),
+                use_load_options(strict=strict, trust_xacro=trust, gravity=gravity),
+            ):
+                status = run(
+                    args=arguments or ["--help"], standalone_mode=False, prog_name="crane"
+                )
+            if signals or status == INTERRUPTED:  # what the parser makes of KeyboardInterrupt
+                raise KeyboardInterrupt
+            if sys.stdout is not None:  # it is where the shell has closed it
+                sys.stdout.flush()
+        except SystemExit as end:
+            sys.exit(_SIGNAL_STATUS + signals[0] if signals else end.code)
+        except (Exception, KeyboardInterrupt) as error:
+            # libraries may have made another error of an interruption
+            if signals or isinstance(error, KeyboardInterrupt):
+                print_message("error: interrupted, no result was written")
+                sys.exit(_SIGNAL_STATUS + signals[0] if signals else INTERRUPTED)
+            if debug:
+                raise
+            print_message(f"error: {_error_text(error)}")
+            sys.exit(2)
     if not arguments:  # the help was shown, but nothing was done
         sys.exit(2)
     sys.exit(status if isinstance(status, int) else 0)

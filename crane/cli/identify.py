@@ -42,6 +42,7 @@ from crane.cli.parsing import (
     parse_values,
     parse_window,
 )
+from crane.cli.resumable_output import OptionalResumableFolder
 from crane.cli.terminal import progress_bar, status
 from crane.common.errors import CraneWarning, InputError, RecordingError, check_name
 from crane.common.result import Result
@@ -183,8 +184,9 @@ class ModelOptions(OptionBlock):
         list[str] | None,
         typer.Option(
             metavar="[NAME=]STD",
-            help="Prior standard deviation, relative of all parameters, e.g. 0.3; or by name, "
-            "e.g. bodies=10%, q1.viscous=200+-50; none: no prior; may be repeated.",
+            help="Prior standard deviation: one relative value for all parameters, e.g. 0.3, or "
+            "by name, e.g. bodies=10% or q1.viscous=200+-50 (value +- std). none: without the "
+            "prior of the machine file. May be repeated.",
         ),
     ] = None
     feasible: Annotated[
@@ -217,16 +219,16 @@ def identify(
         typer.Option(
             "--try",
             metavar="NAME=VALUES",
-            help="Values from which cross-validation of the training data selects one, e.g. "
-            "bandwidth=5,10 or, for a prior, bodies=1%,10%; may be repeated.",
+            help="Candidate values, e.g. bandwidth=5,10 or, for a prior, bodies=1%,10%; the best "
+            "is selected by cross-validation on the training data. May be repeated.",
         ),
     ] = None,
     trust: Trust = False,
 ) -> None:
     """Estimate inertial parameters and joint friction.
 
-    The recordings contain coordinates and forces. --train or --validation select held-out data,
-    which validate the estimate.
+    The recordings contain coordinates and forces. The estimate is validated
+    with the data that --train leaves out, or with another file (--validation).
     """
     from crane.common.samples import as_number
     from crane.identification.mechanics.cross_validation import format_trials, identify_options
@@ -339,8 +341,7 @@ def payload(
     """Estimate mass and centre of mass of the payload."""
     message = f"--centre is '{centre}', write X,Y,Z in m, as 0.2,0,0"
     com = None if centre is None else parse_numbers(centre.split(","), message, ("m",))
-    loaded = options.load(machine)
-    (carried,) = _read([recording], loaded, reading)
+    (carried,) = _read([recording], loaded := options.load(machine), reading)
     with progress_bar("estimating") as progress:
         estimate = crane.identification.identify_payload(
             loaded, carried, frame, method, trust=trust, progress=progress, com=com
@@ -381,7 +382,7 @@ def circuit(
     ] = None,
     validation: Validation = None,
 ) -> None:
-    """Estimate orifices, valve or friction of a cylinder.
+    """Estimate valve parameters or friction of one cylinder.
 
     The recordings contain valve signals and pressures. The model 'orifices' also
     estimates the bulk modulus.
@@ -425,7 +426,7 @@ def calibrate(
     recording: RecordingFiles,
     options: ParameterOptions,
     reading: RecordingOptions,
-    output: OptionalOutputFolder,
+    output: OptionalResumableFolder,
     fit: Fit,
     train: TrainingWindow = None,
     validation: Validation = None,
@@ -439,10 +440,11 @@ def calibrate(
     paths, held_out = (
         [recording_file(x) for x in given or ()] for given in (recording, validation)
     )
-    with progress_bar("simulating") as progress:
-        result = crane.calibrate(
-            loaded, paths, fits, train=window, validation=held_out,
-            columns=reading.columns, span=reading.span, sensors=parse_names(sensors),
-            progress=progress,
-        )  # fmt: skip
-    output.write(result, f"; see {output.out}/report.html")
+    with output.checkpoint() as checkpoint:
+        with progress_bar("simulating") as progress:
+            result = crane.calibrate(
+                loaded, paths, fits, train=window, validation=held_out,
+                columns=reading.columns, span=reading.span, sensors=parse_names(sensors),
+                checkpoint=checkpoint, progress=progress,
+            )  # fmt: skip
+        output.write(result, f"; see {output.out}/report.html")

@@ -15,7 +15,7 @@ from crane.cli.parsing import parse_arguments, parse_changes, parse_names, parse
 from crane.cli.terminal import status
 from crane.common.atomic_output import check_file_is_writable, check_folder_is_writable
 from crane.common.errors import OutputError
-from crane.common.result import Result
+from crane.common.result import UNFINISHED, Result
 
 # Arguments and options of several commands that are not part of a block.
 MachineName = Annotated[
@@ -124,12 +124,14 @@ TrainingWindow = Annotated[
     typer.Option(
         "--train",
         metavar="FROM:TO",
-        help="Start and end of the training data in s; the rest is used for validation.",
+        help="Start and end of the training data in s; the rest validates the estimate.",
     ),
 ]
 Validation = Annotated[
     list[Path] | None,
-    typer.Option(metavar="FILE", help="A held-out recording for validation; may be repeated."),
+    typer.Option(
+        metavar="FILE", help="Another recording that validates the estimate; may be repeated."
+    ),
 ]
 Trust = Annotated[
     bool,
@@ -208,7 +210,8 @@ class PackageOptions(OptionBlock):
     packages: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="FOLDER", help="A folder of packages to which files refer; may be repeated."
+            metavar="FOLDER",
+            help="A folder with ROS packages (package:// paths); may be repeated.",
         ),
     ] = None
     argument: Annotated[
@@ -240,7 +243,8 @@ class AssemblyOptions(PackageOptions):
     floating: Annotated[
         bool,
         typer.Option(
-            "--floating", help="Give the root a floating base, e.g. of a vehicle or humanoid."
+            "--floating",
+            help="Connect the root to the world by a 6-DOF joint (vehicle, humanoid).",
         ),
     ] = False
 
@@ -385,8 +389,9 @@ class OptionalOutputFolder(OptionBlock):
         if self.out is None:
             print(result_summary(result, **options).rstrip())
             return
+        overwrite = self.force or (self.out / UNFINISHED).is_file()  # which the result replaces
         with status("writing the results"):
-            text = result.write(self.out, self.force, **options)
+            text = result.write(self.out, overwrite, **options)
         print(f"{text.rstrip()}\n\nwritten to {self.out}{note}")
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 import crane
 from crane.cli.option_units import UnitsOf
 from crane.common.errors import InputError, check_name
+from crane.common.number_text import parse_float
 from crane.common.unit_conversions import UnitError, is_quantity, parse_number
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ def parse_changes(
     from crane.common.samples import as_number
 
     def parse(_: str, value: str | None) -> float | str:
-        return str(value) if is_quantity(value or "") else float(value or "")
+        return str(value) if is_quantity(value or "") else parse_float(value or "")
 
     values = _parse_named(option, texts, form, parse)
     return {
@@ -309,7 +310,7 @@ def parse_grids(texts: Sequence[str] | None, units_of: UnitsOf) -> "dict[str, Ar
         if len(words) != 3:
             raise InputError(f"--vary {text}: '{values}' is no grid, give {_GRID_FORM}")
         start, stop = _finite_numbers(text, words[:2], _GRID_FORM, units_of)
-        count = int(words[2]) if words[2].strip().isdecimal() else 0
+        count = int(words[2]) if words[2].strip().isdecimal() and words[2].isascii() else 0
         if not 1 <= count <= _MAX_GRID_VALUES:
             raise InputError(
                 f"--vary {text}: '{words[2]}' is no count of 1 to {_MAX_GRID_VALUES}, "

@@ -32,7 +32,7 @@ from crane.cli.terminal import status
 from crane.common.errors import CraneWarning, InputError
 from crane.common.result import Result
 
-ChartStep = Annotated[float | None, number_option("m", "Distance of grid points in m.", "--step")]
+ChartStep = Annotated[float | None, number_option("m", "Grid spacing in m.", "--step")]
 
 
 @command()
@@ -122,27 +122,28 @@ class RatingOptions(OptionBlock):
     hydraulic: Annotated[
         float | None,
         number_option(
-            "", "Rated fraction of the hydraulic lifting load, instead of that of the rule."
+            "", "Rated fraction of the hydraulic lifting load; overrides that of --rule."
         ),
     ] = None
     tipping: Annotated[
         float | None,
-        number_option("", "Rated fraction of the tipping load, instead of that of the rule."),
+        number_option("", "Rated fraction of the tipping load; overrides that of --rule."),
     ] = None
     raising: Annotated[
         list[str] | None,
         typer.Option(
             metavar="JOINT",
-            help="A drive that raises the load, while the others hold it; derived from the rule "
-            "by default; may be repeated.",
+            help="Joint whose drive raises the load at pump pressure, while all other drives hold "
+            "it behind closed valves; by default all, or the one that --rule selects. May be "
+            "repeated.",
         ),
     ] = None
     slew: Annotated[
         str | None,
         typer.Option(
             metavar="DEG,...",
-            help="Slew angles; by default that of home, and a quarter turn from it if the "
-            "machine tips.",
+            help="Slew angles; by default that of home, and also a quarter turn from home if the "
+            "machine can tip.",
         ),
     ] = None
     slope: Annotated[
@@ -150,9 +151,7 @@ class RatingOptions(OptionBlock):
     ] = 0.0
     friction: Annotated[
         bool,
-        typer.Option(
-            "--friction", help="Include joint friction, which the raising drives overcome."
-        ),
+        typer.Option("--friction", help="Include the joint friction of the raising drives."),
     ] = False
 
     def arguments(self) -> dict[str, Any]:

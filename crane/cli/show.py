@@ -32,7 +32,9 @@ ShownName = Annotated[
 ]
 RunMachine = Annotated[
     str | None,
-    typer.Option(metavar="MACHINE", help="The machine of a run, instead of the recorded one."),
+    typer.Option(
+        metavar="MACHINE", help="Machine to use instead of the one named in the recording."
+    ),
 ]
 
 
@@ -89,8 +91,8 @@ def plot(
 ) -> None:
     """Plot coordinates, velocities and forces of a run.
 
-    The path of the tip is drawn beside them. The suffix of the file chooses the format: png, svg
-    or pdf.
+    The path of the tip is drawn beside them. The suffix of the file
+    determines the format: png, svg or pdf.
     """
     from crane.view.result_files import FIGURE, plot_result
 
@@ -119,7 +121,7 @@ def sketch(
 ) -> None:
     """Draw the mechanism or the hydraulic circuit.
 
-    The suffix of the file chooses the format: png, svg or pdf.
+    The suffix of the file determines the format: png, svg or pdf.
     """
     from crane.formats.assembly_warnings import alternative_configurations
 

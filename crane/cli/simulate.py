@@ -51,8 +51,8 @@ ControllerName = Annotated[
         metavar="NAME",
         help="Controller: pi, computed-torque, valve-pd, valve-feedforward or tip-velocity; by "
         "default the one whose gains the machine file contains, otherwise computed-torque. "
-        "Without task and path, a given controller holds the home configuration; without one, "
-        "drive forces are zero and valves have their neutral signals.",
+        "If neither --task nor --path is given: with --controller the machine holds the home "
+        "configuration; without it, drive forces are zero and valves stay at neutral.",
     ),
 ]
 Duration = Annotated[
@@ -97,7 +97,7 @@ def write_demo(folder: Path, progress: Callable[[float], None]) -> str:
         texts.append(recording.write(folder / task, views=True))
     progress(1.0)
     text = "\n".join(texts)
-    (folder / SUMMARY).write_text(text, encoding="utf-8")
+    (folder / SUMMARY).write_text(text, encoding="utf-8", errors="backslashreplace")
     return text
 
 
@@ -111,8 +111,9 @@ class MotionOptions(OptionBlock):
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="A motion to follow instead of a task: time and the active joints, or x, y, z "
-            "of the tip, and inclination or roll, pitch, yaw of its frame.",
+            help="A motion to follow instead of a task: a CSV file with columns time and the "
+            "driven joints, or time, x, y, z of the tip and optionally inclination, or roll, "
+            "pitch, yaw, of its frame.",
         ),
     ] = None
     controller: ControllerName = None
@@ -120,8 +121,9 @@ class MotionOptions(OptionBlock):
         str | None,
         typer.Option(
             metavar="METHOD",
-            help="Method that suppresses sway after the motion: flat, zv or zvd; 'none' only "
-            "starts with the load at rest. With valves, add --controller valve-feedforward.",
+            help="Method that suppresses sway after the motion: flat (differential flatness), zv "
+            "or zvd (input shapers); none: reference unchanged, free joints start in "
+            "equilibrium. With valves, add --controller valve-feedforward.",
         ),
     ] = None
     duration: Duration = None
@@ -149,15 +151,15 @@ class IntegrationOptions(OptionBlock):
         str | None,
         typer.Option(
             metavar="METHOD",
-            help="Integration method: DOP853 (default without valve control), rosenbrock (default "
-            "with valve control), Radau (for stiff machines), BDF or LSODA (of scipy), all with "
-            "error control, or rk4 with fixed steps of --step.",
+            help="Integration method. With error control: DOP853 (default without valve "
+            "control), rosenbrock (default with valve control), Radau (for stiff machines), BDF "
+            "or LSODA (of scipy). With fixed steps of --step: rk4.",
         ),
     ] = None
     tolerance: Annotated[
         float | None,
         typer.Option(
-            help="Relative error of a step in the error control of the method, e.g. 1e-8."
+            help="Permitted relative error per step, for methods with error control, e.g. 1e-8."
         ),
     ] = None
 
@@ -183,8 +185,8 @@ def simulate(
         typer.Option(
             metavar="FRAME=WRENCH",
             help="An external force: FX,FY,FZ in N, followed by MX,MY,MZ in N m if needed, or a "
-            "CSV file with columns time, force_x ... moment_z; FRAME@frame=... rotates with the "
-            "frame; may be repeated.",
+            "CSV file with columns time, force_x ... moment_z. FRAME=... keeps its direction in "
+            "the world, FRAME@frame=... rotates with the frame. May be repeated.",
         ),
     ] = None,
     step: Step = 1e-3,
@@ -198,7 +200,9 @@ def simulate(
 ) -> None:
     """Simulate a task, a path, or measured valve signals.
 
-    Without these, the motion from home is simulated, with or without a controller.
+    Without --task, --path and --inputs, the machine starts at home and is held
+    there (--controller) or moves freely. --from, --until and --columns apply to
+    --inputs.
     """
     loaded = add_task_loads(options.load(machine), motion.task)
     loaded = loaded.with_external_forces(*map(parse_load, load or ()))
@@ -236,7 +240,7 @@ def _write_stopped_run(output: OutputFolder, npz: bool) -> Iterator[None]:
         if recording is None:
             raise
         recording.write(output.out, output.force, npz=npz)
-        text = f"{stop}; the run until t = {recording.time[-1]:.6g} s is in {output.out}"
+        text = f"{stop}; results until t = {recording.time[-1]:.6g} s are written to {output.out}"
         if isinstance(stop, CraneError):
             raise SimulationError(text) from stop
         print_message(text)

@@ -3,6 +3,8 @@
 They are shown while somebody can see them: nothing is written into pipes and files.
 """
 
+import os
+import signal
 import sys
 import threading
 import time
@@ -14,6 +16,8 @@ from typing import Any, TextIO
 from crane.common.progress import MainThreadMonitor, current_activity
 
 INTERRUPTED = 130  # exit status of an interrupted command
+_ENDING_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")  # Ctrl-C, kill, a closed terminal
+_RETRY_DELAY = 0.05  # [s] until an interruption that Python has ignored is repeated
 _ERASE = "\r\x1b[2K"
 _BAR_DELAY = 0.3  # [s] until a progress bar appears
 
@@ -155,3 +159,46 @@ def status(activity: str) -> Iterator[None]:
 def print_message(text: str) -> None:
     """Print a message to the user on the error output, apart from the results."""
     print(text, file=sys.stderr)
+
+
+@contextmanager
+def ending_signals() -> Iterator[list[int]]:
+    """Let signals that end a process interrupt the block, as Ctrl-C does: it leaves nothing.
+
+    Python ignores an exception where it can be raised nowhere, as when an object is removed: the
+    signal is then repeated. Elsewhere a library may raise another exception in its place.
+
+    Yields:
+        Numbers of the signals that have come, as they come.
+    """
+    received: list[int] = []
+    repetitions: list[threading.Timer] = []
+
+    def interrupt(number: int, _: object) -> None:
+        received.append(number)
+        raise KeyboardInterrupt
+
+    def repeat(unraisable: Any) -> None:
+        if not received or not issubclass(unraisable.exc_type, KeyboardInterrupt):
+            report_unraisable(unraisable)
+            return
+        repetitions.append(threading.Timer(_RETRY_DELAY, os.kill, (os.getpid(), received[-1])))
+        repetitions[-1].start()
+
+    report_unraisable, handlers = sys.unraisablehook, dict[int, Any]()
+    if threading.current_thread() is threading.main_thread():
+        numbers = [getattr(signal, name) for name in _ENDING_SIGNALS if hasattr(signal, name)]
+        handlers = {number: signal.getsignal(number) for number in numbers}
+    # those that are ignored stay so, as behind `nohup`
+    handlers = {number: x for number, x in handlers.items() if x is not signal.SIG_IGN}
+    sys.unraisablehook = repeat
+    try:
+        for number in handlers:
+            signal.signal(number, interrupt)
+        yield received
+    finally:
+        for timer in repetitions:
+            timer.cancel()
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        sys.unraisablehook = report_unraisable

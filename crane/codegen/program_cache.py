@@ -190,12 +190,14 @@ class ProgramRecord:
         text = None if entry_name is None else file_cache.read_entry(entry_name)
         if text is None:
             return None
-        stored = json.loads(text)
-        functions = {
-            name: (count, None if parts is None else Layout(**parts))
-            for name, (count, parts) in stored["functions"].items()
-        }
-        return cls(stored["code"], stored["longest"], functions)
+        with suppress(ValueError, KeyError, TypeError, AttributeError):  # else it is made anew
+            stored = json.loads(text)
+            functions = {
+                name: (count, None if parts is None else Layout(**parts))
+                for name, (count, parts) in stored["functions"].items()
+            }
+            return cls(stored["code"], stored["longest"], functions)
+        return None
 
     def write_to_cache(self, entry_name: str | None) -> None:
         """Write the record, unless the package has changed while the program was built."""
@@ -238,7 +240,7 @@ def cached_result(
     )
     cached = None if entry_name is None else file_cache.read_entry(entry_name)
     if cached is not None:
-        with suppress(ValueError, KeyError):
+        with suppress(Exception):  # whatever is wrong with it, it is made anew
             found: Result = deserialize(cached, classes)
             return found
     result = compute()

@@ -19,13 +19,19 @@ _MAX_WORD_LENGTH, _MAX_LINE_LENGTH = (
 def format_one_line(text: str) -> str:
     """Text as one printable line.
 
-    Characters that cannot be printed become spaces; very long words and lines are shortened in the
-    middle.
+    Characters that cannot be printed become spaces, bytes of paths that are no text are escaped;
+    very long words and lines are shortened in the middle.
     """
+    text = text.encode(errors="backslashreplace").decode()
     text = "".join(c if c.isprintable() else " " for c in text)
     if len(text) > _MAX_WORD_LENGTH:
         text = " ".join(_shorten(word, _MAX_WORD_LENGTH) for word in text.split(" "))
     return _shorten(text, _MAX_LINE_LENGTH)
+
+
+def is_one_line(text: str) -> bool:
+    """Whether a text is one printable line; paths in it may have bytes that are no text."""
+    return text.encode(errors="backslashreplace").decode().isprintable()
 
 
 def prefix_location(location: str, error: Exception) -> str:
@@ -117,6 +123,10 @@ class SimulationError(CraneError):
     """
 
     recording: Any = None
+
+
+class LostWorkError(CraneError):
+    """Processes of a computation ended before their time; what is finished is kept if asked."""
 
 
 class OutputError(CraneError):

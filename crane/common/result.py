@@ -6,6 +6,7 @@ from typing import Any
 
 from crane.common.one_line_repr import OneLineRepr
 
+UNFINISHED = "unfinished.csv"  # checkpoint in the folder of a result that is not complete
 # Writes a result into a folder: `crane.view.result_files.write_result`. The package sets it,
 # because results are defined in rooms that may not import `view` (see CONTRIBUTING.md).
 write_result: Callable[..., str]

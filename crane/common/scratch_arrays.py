@@ -11,7 +11,7 @@ import mmap
 import os
 import tempfile
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -35,6 +35,23 @@ def empty_array(count: int, columns: int) -> Array:
             _memory_maps.add(scratch)
             return np.ndarray(shape, np.float64, scratch, order="F")
     return np.empty(shape, order="F")
+
+
+def stack_columns(columns: Iterable[Array], count: int) -> Array:
+    """An array (N, columns) as of `empty_array` from columns (N,), which may be computed in turn.
+
+    Args:
+        columns: The columns.
+        count: Number of columns.
+    """
+    found: Array | None = None
+    for i, column in enumerate(columns):
+        if found is None:
+            found = empty_array(len(column), count)
+        found[:, i] = column
+        release_pages()
+    assert found is not None
+    return found
 
 
 def _map_temporary_file(size: int) -> mmap.mmap:

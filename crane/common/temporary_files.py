@@ -121,6 +121,22 @@ def _acquire_lock(path: Path, wait: bool = False) -> int | None:
     return lock
 
 
+def try_lock(file: int) -> bool:
+    """Lock an open file as long as it is open; returns whether no other process has locked it.
+
+    File systems without locks do not tell.
+    """
+    if fcntl is None:
+        return True
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
 def _remove(path: Path) -> None:
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)

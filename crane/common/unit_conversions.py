@@ -14,6 +14,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from crane.common.errors import InputError
+from crane.common.number_text import parse_float
 
 KeyPath = tuple[str | int, ...]  # keys and indices down to a number of a machine file
 _TURN = 2 * Fraction(math.pi)  # 180 deg are math.pi to the last bit
@@ -149,13 +150,13 @@ def is_quantity(text: str) -> bool:
 
 
 def parse_number(text: str, units: Sequence[str]) -> float:
-    """A plain number, as Python reads it, or one with a unit.
+    """A plain number, or one with a unit.
 
     Raises:
         UnitError: See `parse_quantity`.
         ValueError: It is neither.
     """
-    return parse_quantity(text, units).value if is_quantity(text) else float(text)
+    return parse_quantity(text, units).value if is_quantity(text) else parse_float(text)
 
 
 def parse_quantity(text: str, units: Sequence[str] = ("",)) -> WrittenNumber:

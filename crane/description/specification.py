@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from crane.common.errors import InputError, suggest_names
+from crane.common.number_text import parse_float
 from crane.common.unit_conversions import KeyPath, WrittenNumber
 from crane.description.external_forces import ExternalForce, Wrench
 from crane.description.force_elements import (
@@ -59,8 +60,8 @@ class ParameterPrior:
         mean, sign, std = text.rpartition("+-")
         try:
             is_relative = std.strip().endswith("%")
-            value = float(std.strip().removesuffix("%")) * (0.01 if is_relative else 1.0)
-            mean_value = float(mean) if sign else None
+            value = parse_float(std.strip().removesuffix("%")) * (0.01 if is_relative else 1.0)
+            mean_value = parse_float(mean) if sign else None
         except ValueError:
             value, is_relative, mean_value = math.nan, False, None
         if not (_MIN_STD <= value < math.inf) or not math.isfinite(mean_value or 0.0):

@@ -13,6 +13,7 @@ import numpy as np
 from lxml import etree
 
 from crane.common.errors import DescriptionError, suggest_names
+from crane.common.number_text import parse_float
 from crane.common.package_search import read_plain_file
 from crane.description.findings import report_error
 from crane.description.kinematic_tree import (
@@ -269,7 +270,7 @@ class XmlFile:
             DescriptionError: The text is something else.
         """
         try:
-            values = tuple(float(word) for word in text.split())
+            values = tuple(parse_float(word) for word in text.split())
         except ValueError:
             hint = "write digits"
             if "," in text:

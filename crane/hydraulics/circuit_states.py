@@ -65,8 +65,8 @@ class CircuitStates:
     heat; the speed of the engine relative to its set speed; then the integrals `BALANCE_UNITS`.
 
     The state of a pressure is p - p_vapour where it is positive. A negative state means that the
-    chamber has a vapour volume of the size of the state times a constant compressibility: the
-    pressure cannot fall below p_vapour, and rises again when the void is filled.
+    chamber has a void of the size of the state times a constant compliance [m3/Pa]: the pressure
+    cannot fall below p_vapour, and rises again when the void is filled.
 
     Args:
         hydraulics: The circuit.

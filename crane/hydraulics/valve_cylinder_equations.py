@@ -277,8 +277,8 @@ class ValveCylinderEquations:
     def circuit_friction(self, tank: Scalar) -> Scalar:
         """Coulomb friction that seals and brake add to that of the joint [N], [N m].
 
-        F_K = mu (max(p_A - p_R, 0) + max(p_B - p_R, 0)) + B (1 - (|u| - d) / e), with mu of the
-        seals, B of the brake, d the dead band, 0 of an underlapped spool, and e the travel that
+        F_K = mu (max(p_A - p_R, 0) + max(p_B - p_R, 0)) + B (1 - (|u| - d) / r), with mu of the
+        seals, B of the brake, d the dead band, 0 of an underlapped spool, and r the travel that
         releases the brake. The last factor is limited to 0 and 1; with two spools, that with the
         larger travel counts.
 

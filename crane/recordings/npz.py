@@ -40,7 +40,7 @@ def write_columns(
         OSError: The file cannot be written.
     """
     with zipfile.ZipFile(path, "w") as archive:
-        archive.comment = comment.encode()[:_MAX_COMMENT_BYTES]
+        archive.comment = comment.encode(errors="surrogateescape")[:_MAX_COMMENT_BYTES]
         for name, column in zip(names, columns, strict=True):
             header = {"descr": "<f8", "fortran_order": False, "shape": column.shape}
             with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
@@ -82,7 +82,7 @@ def read_columns(path: Path) -> tuple[list[str], Array, str]:
         for column, entry in zip(values.T, archive.infolist(), strict=True):
             _read_array(archive, entry, column)
             scratch_arrays.release_pages()
-        return list(types), values, archive.comment.decode(errors="replace")
+        return list(types), values, archive.comment.decode(errors="surrogateescape")
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from crane.common import scratch_arrays
-from crane.common.errors import InputError, RecordingError, check_name, suggest_names
+from crane.common.errors import InputError, RecordingError, check_name, is_one_line, suggest_names
 from crane.common.one_line_repr import format_count
 from crane.common.result import Result
 from crane.common.samples import Array, as_number, as_seed
@@ -152,7 +152,7 @@ class Recording(Result):
             timeseries.check_column_name(name, unit)
         for name in ("machine", "task", "controller", "machine_name", "stopped", "start"):
             text = getattr(self, name)
-            if text != text.strip() or not text.isprintable():
+            if text != text.strip() or not is_one_line(text):
                 raise RecordingError(f"{name} {text!r} is not one line of text, give one")
 
     def _check_values(self) -> None:
@@ -253,7 +253,7 @@ class Recording(Result):
 
     def at(self, mask: np.ndarray) -> "Recording":
         """The samples that a mask (N,) selects."""
-        return replace(
+        return self if mask.all() else replace(
             self, time=self.time[mask], q=self.q[mask], v=self.v[mask], tau=self.tau[mask],
             channels={name: values[mask] for name, values in self.channels.items()},
         )  # fmt: skip

@@ -75,7 +75,15 @@ class RecordingSummary:
     def to_markdown(self) -> str:
         """Table with one row per joint, in degrees and millimetres, and remarks below it."""
         rows: list[tuple[str, ...]] = [
-            ("joint", "range", "peak speed", "peak force", "RMS force", "peak error", "RMS error"),
+            (
+                "joint",
+                "position range",
+                "peak speed",
+                "peak force",
+                "RMS force",
+                "peak tracking error",
+                "RMS tracking error",
+            ),  # fmt: skip
             ("---", *["---:"] * 6),
         ]
         for joint in self.joints:
@@ -100,7 +108,7 @@ class RecordingSummary:
             )
             rows.append(("tip", "", "", "", "", *errors))
         table = "".join(f"| {' | '.join(row)} |\n" for row in rows)
-        balance = f"energy balance: {self.balance_text}" if self.balance_text else ""
+        balance = f"maximum energy imbalance: {self.balance_text}" if self.balance_text else ""
         start = f"starts {self.start}" if self.start else ""
         end = f"**Stopped {self.stopped}**\n\n" if self.stopped else ""
         below = (
@@ -200,7 +208,7 @@ def summarize(recording: Recording) -> RecordingSummary:
             )
         )
     distance = tip_error(recording)
-    gaps = ("", energy_imbalance(recording)), ("of the oil ", oil_energy_imbalance(recording))
+    gaps = ("mechanism", energy_imbalance(recording)), ("oil", oil_energy_imbalance(recording))
     return RecordingSummary(
         duration=float(time[-1] - time[0]),
         joints=tuple(joints),
@@ -208,7 +216,7 @@ def summarize(recording: Recording) -> RecordingSummary:
         tip_rms_error=None if distance is None else rms(time, distance),
         stability_text=_stability_text(recording),
         balance_text=", ".join(
-            f"{what}off by at most {_peak(gap):.2g} J" for what, gap in gaps if gap is not None
+            f"{_peak(gap):.2g} J ({what})" for what, gap in gaps if gap is not None
         ),
         ringing=limit_cycle_message(recording),
         stopped=recording.stopped,

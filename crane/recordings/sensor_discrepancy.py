@@ -167,13 +167,13 @@ class _RedundantSensor:
         if self.is_rate:
             drift_rate = factor * float(self._fit_discrepancy([self.time])[0][0])
             return (
-                f"sensors disagree: '{self.name}' is {drift_rate:+.3g} {unit}/s off on average "
-                f"against {used}: {cause}"
+                f"sensors disagree: '{self.name}' deviates from the rate computed from {used} by "
+                f"{drift_rate:+.3g} {unit}/s on average; {cause}"
             )
         low, high = factor * self.off.min(), factor * self.off.max()
         return (
-            f"sensors disagree: '{self.name}' is {factor * mean:+.3g} {unit} off on average "
-            f"({low:+.3g} to {high:+.3g} over the motion) against {used}: {cause}"
+            f"sensors disagree: '{self.name}' deviates from the value computed from {used} by "
+            f"{factor * mean:+.3g} {unit} on average ({low:+.3g} to {high:+.3g}); {cause}"
         )
 
     def _determining_joints(self) -> list[str]:
@@ -206,9 +206,9 @@ class _RedundantSensor:
                 x.format_parameters(known) for x in zeros if x.residual_rms <= detection_limit
             )
             residual = self._format_residual(zeros[0].residual_rms)
-            return f"a constant offset explains it to {residual}: {named}"
+            return f"residual {residual} with a constant offset ({named})"
         if np.ptp(self.measured) < _STANDSTILL_SHARE * np.ptp(self.expected):
-            return "" if self.is_rate else "it does not move"
+            return "" if self.is_rate else "its reading does not change"
         other_causes = sorted(
             [*self._scale_and_delay_causes(), *self._pin_causes()], key=lambda x: x.residual_rms
         )
@@ -229,7 +229,7 @@ class _RedundantSensor:
             (x for x in other_causes if x.residual_rms <= detection_limit),
             key=lambda x: len(x.sensor_parameters),
         )
-        rest = "" if best else ", and no delay, scale or pin explains the rest"
+        rest = "" if best else "; no delay, scale or pin position explains the rest"
         return self._format_causes([zero, *best[:_MAX_LISTED]], known) + rest
 
     def _format_causes(self, causes: list[_DiscrepancyCause], known: Mapping[str, Sensor]) -> str:
@@ -367,12 +367,15 @@ class _RedundantSensor:
                 )
             ]
         for joint, angle, inclination in pairs:
-            for sign_text, sign in (("", 1.0), (" with its sign turned", -1.0)):
+            for sign_text, sign in (("", 1.0), (" and reverse its sign", -1.0)):
                 residual_std = float(np.std(angle - sign * inclination))
                 if residual_std <= self.limit < best.residual_rms:
                     what = f"'{joint}' follows the inclination of '{link}' against the horizon"
-                    name = f"an absolute angle is called '{INCLINATION_PREFIX}{link}'{sign_text}"
-                    return f"{what} within {self._format_residual(residual_std)}, {name}"
+                    return (
+                        f"{what} within {self._format_residual(residual_std)}: if the sensor "
+                        "measures an absolute angle, name the column "
+                        f"'{INCLINATION_PREFIX}{link}'{sign_text}"
+                    )
         return ""
 
 

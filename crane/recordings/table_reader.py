@@ -18,6 +18,7 @@ import numpy as np
 
 from crane.common import scratch_arrays
 from crane.common.errors import RecordingError
+from crane.common.number_text import parse_float
 from crane.common.samples import Array
 from crane.common.unit_conversions import accepted_units, column_conversion
 from crane.description.sensors import TIME
@@ -33,6 +34,7 @@ from crane.recordings.timeseries import (
     parse_heading,
 )
 
+_PATH_ERRORS = "surrogateescape"  # how Python reads bytes of a path that are no text
 _UTF8_ENCODING = "utf-8-sig"  # with or without a byte order mark
 _BLOCK_BYTES = 1 << 20  # bytes of a block, and largest length of a line
 _MAX_HEADING_LENGTH, _MAX_NAME_LENGTH = 1 << 16, 200  # characters
@@ -248,7 +250,7 @@ def _read_header(path: Path, encoding: str = _UTF8_ENCODING) -> tuple[dict[str, 
     """Read notes, the header row, and its line number."""
     notes: dict[str, str] = {}
     character_count = 0  # characters
-    with path.open(encoding=encoding) as file:
+    with path.open(encoding=encoding, errors=_PATH_ERRORS) as file:
         for line, text in enumerate(file, start=1):
             character_count += len(text)
             text = text.strip()
@@ -261,6 +263,7 @@ def _read_header(path: Path, encoding: str = _UTF8_ENCODING) -> tuple[dict[str, 
                         f"line {line}, the header row, has {len(text)} characters, give at most "
                         f"{_MAX_HEADING_LENGTH}"
                     )
+                text.encode()  # only notes may hold paths that are no text
                 return notes, text, line
             if character_count > _BLOCK_BYTES:
                 raise RecordingError(
@@ -321,7 +324,10 @@ def _read_values(path: Path, header: int, lines: int, units: Mapping[str, str]) 
     values, count = scratch_arrays.empty_array(lines - header, len(units)), 0
     try:
         # numpy warns of blank lines
-        with path.open(encoding="utf-8") as file, warnings.catch_warnings(action="ignore"):
+        with (
+            path.open(encoding="utf-8", errors=_PATH_ERRORS) as file,
+            warnings.catch_warnings(action="ignore"),
+        ):
             for _ in itertools.islice(file, header):
                 pass
             for line in file:
@@ -381,17 +387,18 @@ def _raise_invalid_cell(
 
 def _parse_number(cell: str) -> float | None:
     try:
-        return float(cell) if "_" not in cell else None
+        return parse_float(cell)
     except ValueError:
         return None
 
 
 def _raise_first_fault(path: Path, header: int, units: Mapping[str, str]) -> None:
     names, last = list(units), -np.inf
-    with path.open(encoding=_UTF8_ENCODING) as file:
+    with path.open(encoding=_UTF8_ENCODING, errors=_PATH_ERRORS) as file:
         for line, text in enumerate(file, start=1):
             if line <= header or not text.strip():
                 continue
+            text.encode()  # only notes may hold paths that are no text
             cells = text.rstrip("\n").split(",")
             if len(cells) != len(names):
                 raise RecordingError(

@@ -68,7 +68,7 @@ def located_errors(path: str | Path, wanted: str = "another file") -> Iterator[N
         yield
     except RecordingError as error:
         raise RecordingError(prefix_location(str(path), error)) from None
-    except UnicodeDecodeError:
+    except UnicodeError:
         raise RecordingError(f"{path}: is not text, give a file in UTF-8") from None
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
@@ -121,7 +121,10 @@ def write_columns(
         *_comment_lines({**notes, SAMPLE_COUNT_NOTE: str(len(columns[0]))}),
         ",".join(_column_headings(units)),
     ]
-    with replace_file(path) as part, part.open("w", encoding="utf-8", newline="\n") as file:
+    with (
+        replace_file(path) as part,
+        part.open("w", encoding="utf-8", errors="surrogateescape", newline="\n") as file,
+    ):
         file.write("\n".join(head) + "\n")
         for start in range(0, len(columns[0]), BLOCK_ROWS):
             rows = np.column_stack([x[start : start + BLOCK_ROWS] for x in columns])

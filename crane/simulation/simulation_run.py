@@ -16,6 +16,7 @@ from crane.common.errors import (
     CraneWarning,
     InputError,
     SimulationError,
+    is_one_line,
     suggest_names,
 )
 from crane.common.progress import progress_reporter
@@ -155,7 +156,7 @@ def simulate(
     A reference outside of the limits of a joint gives a warning before the first step.
     """
     progress = progress_reporter(progress)
-    if not (isinstance(label, str) and label.isprintable()):
+    if not (isinstance(label, str) and is_one_line(label)):
         raise InputError(f"label {label!r} is not one line of text")
     if not isinstance(machine, Machine):
         machine = load(machine)

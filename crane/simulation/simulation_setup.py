@@ -27,7 +27,7 @@ from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.machine.machine import Machine
 from crane.motion.limit_violations import limit_violation_message, passive_limit_violation_message
 
-_MAX_STEPS = 4_000_000  # steps of one recording
+_MAX_STEPS, _MAX_DURATION = 4_000_000, 1e6  # steps of one recording, and its duration [s]
 # accelerations at equilibrium [characteristic lengths per characteristic time^2]
 _ACCELERATION_TOLERANCE = 1e-10
 _MAX_FALL_PER_ITERATION = 2e-3  # largest displacement of an iteration [characteristic lengths]
@@ -122,10 +122,11 @@ def count_steps(control: Controller, duration: float | None, step: float) -> int
         duration = duration_source.duration
     duration = as_number(duration, "the duration", "s", greater_than=0)
     step = as_number(step, "the step", "s", greater_than=0)
-    if duration / step > _MAX_STEPS:
+    if duration > min(_MAX_DURATION, _MAX_STEPS * step):
         raise InputError(
-            f"{duration:g} s are {duration / step:.3g} steps of {step:g} s, at most {_MAX_STEPS}: "
-            "simulate less, or go on from the last sample of a first part"
+            f"{duration:g} s are {duration / step:.3g} steps of {step:g} s, at most {_MAX_STEPS} "
+            f"and {_MAX_DURATION:g} s: simulate less, or go on from the last sample of a first "
+            "part"
         )
     steps = int(np.ceil(duration / step - 1e-9)) if levers else round(duration / step)
     if steps < 1 or not levers and abs(steps * step - duration) > 1e-9 * duration:

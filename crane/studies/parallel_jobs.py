@@ -1,24 +1,22 @@
 """Jobs of a study: in this process, in several processes, or on a Dask cluster."""
 
-import multiprocessing
 import os
-import pickle
 import re
-import threading
 import uuid
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import replace
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
-from crane.common.errors import CraneWarning, InputError
+from crane.common.checkpoint import Checkpoint
+from crane.common.errors import CraneWarning, InputError, LostWorkError
 from crane.common.optional_libraries import import_optional_library
 from crane.common.samples import as_count
 from crane.formats.machine_loading import load
 from crane.machine.machine import Machine
+from crane.studies.worker_processes import WorkerPool
 
 _CONNECTION_TIMEOUT = 10.0  # [s] for the scheduler to answer
 
@@ -27,19 +25,21 @@ R = TypeVar("R")
 
 
 def compute_on_cluster(
-    function: Callable[[J], R], jobs: Sequence[J], scheduler: str
-) -> Iterator[tuple[int, Any]]:
+    function: Callable[[J], R], jobs: Mapping[int, J], scheduler: str
+) -> Iterator[tuple[int, R]]:
     """Yield indices and results of jobs on a Dask cluster as they finish.
 
     Jobs of a worker that dies are computed by the other workers.
 
     Args:
         function: Function of a job; workers import it from this package.
-        jobs: Arguments of the function.
+        jobs: Arguments of the function by index.
         scheduler: Address of the scheduler.
 
     Raises:
-        InputError: Dask is not installed, the scheduler does not answer, or workers keep dying.
+        InputError: Dask is not installed, or the scheduler does not answer.
+        LostWorkError: The scheduler ends, or the workers of some jobs died each time; the other
+            jobs are finished then.
     """
     dask = import_optional_library("distributed", "a scheduler")
     if not re.fullmatch(r"(\w+://)?[^\s/]+:\d+/?", scheduler):
@@ -53,6 +53,7 @@ def compute_on_cluster(
             f"no scheduler answers at '{scheduler}' ({error}), start one with 'dask scheduler' "
             "and give the address that it prints"
         ) from None
+    lost: list[int] = []
     with client:
         if not client.scheduler_info()["workers"]:
             warnings.warn(
@@ -62,34 +63,34 @@ def compute_on_cluster(
                 stacklevel=2,
             )
         run = uuid.uuid4().hex
-        futures = client.map(
-            function,
-            jobs,
-            key=[f"crane-study-{run}-{index}" for index in range(len(jobs))],
-            pure=False,
-        )
-        indices = {future.key: index for index, future in enumerate(futures)}
+        indices = {f"crane-study-{run}-{index}": index for index in jobs}
+        futures = client.map(function, list(jobs.values()), key=list(indices), pure=False)
         for future in dask.as_completed(futures, loop=client.loop):
-            yield indices[future.key], _job_result(future, indices[future.key], scheduler)
+            _check_future(future, scheduler)
+            if future.status == "finished":
+                yield indices[future.key], future.result()
+            else:
+                lost.append(indices[future.key])
+    if lost:
+        raise LostWorkError(
+            f"{len(lost)} of {len(jobs)} could not be computed: all workers that began number "
+            f"{lost[0]} died, see their logs: give them more memory or fewer threads"
+        )
 
 
-def _job_result(future: Any, index: int, scheduler: str) -> Any:
+def _check_future(future: Any, scheduler: str) -> None:
+    """Raise the error of a job, unless its workers died."""
     from distributed import KilledWorker
 
-    if future.status == "finished":
-        return future.result()
     failure = future.exception() if future.status == "error" else None
-    if isinstance(failure, KilledWorker):
-        raise InputError(
-            f"variant {index} was begun by several workers and all of them died, see "
-            "their logs: give them more memory or fewer threads"
-        )
+    if future.status == "finished" or isinstance(failure, KilledWorker):
+        return
     if isinstance(failure, ImportError | AttributeError):
         raise InputError(
             f"the workers cannot run this version of crane ({failure}), install it there"
         )
     if failure is None:
-        raise InputError(f"the scheduler at {scheduler} is gone, start it again")
+        raise LostWorkError(f"the scheduler at {scheduler} is gone, start it again")
     raise failure
 
 
@@ -141,12 +142,46 @@ def check_process_count(count: int) -> int:
     )
 
 
+@dataclass(frozen=True)
+class StoredResults(Generic[R]):
+    """Results of jobs as rows of a checkpoint.
+
+    Attributes:
+        checkpoint: The checkpoint.
+        keys: First cells of the row of each job.
+        to_cells: Returns the other cells for a result.
+        from_cells: Returns the result for these cells.
+    """
+
+    checkpoint: Checkpoint
+    keys: Sequence[tuple[str, ...]]
+    to_cells: Callable[[R], Sequence[object]]
+    from_cells: Callable[[list[str]], R]
+
+    def results(self) -> dict[int, R]:
+        """Return the results that are kept, by index of the job."""
+        found = {}
+        for index, key in enumerate(self.keys):
+            with suppress(KeyError, ValueError):  # none, or damaged: it is computed again
+                found[index] = self.from_cells(self.checkpoint.rows[key])
+        return found
+
+    def add(self, index: int, result: R) -> None:
+        """Keep a result.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        self.checkpoint.append(self.keys[index], self.to_cells(result))
+
+
 def compute_jobs(
     function: Callable[[J], R],
     jobs: Sequence[J],
     processes: int,
     scheduler: str | None,
     report: Callable[[int], object],
+    kept: StoredResults[R] | None = None,
 ) -> list[R]:
     """Return the results of jobs.
 
@@ -156,53 +191,28 @@ def compute_jobs(
         processes: Number of processes.
         scheduler: Address of a Dask scheduler whose workers compute instead.
         report: Called with the number of finished jobs after each.
+        kept: Results that need not be computed, to which each new one is added.
     """
-    if scheduler is not None:
-        finished = compute_on_cluster(function, jobs, scheduler)
-    elif processes <= 1 or len(jobs) == 1:
-        finished = ((index, function(job)) for index, job in enumerate(jobs))
-    else:
-        finished = _compute_in_processes(function, jobs, min(processes, len(jobs)))
-    results: dict[int, R] = {}
-    for index, result in finished:
-        results[index] = result
-        report(len(results))
+    results = {} if kept is None else kept.results()
+    missing = {index: job for index, job in enumerate(jobs) if index not in results}
+    with closing(_finished_jobs(function, missing, processes, scheduler)) as finished:
+        for index, result in finished:
+            results[index] = result
+            if kept is not None:
+                kept.add(index, result)
+            report(len(results))
     return [results[index] for index in range(len(jobs))]
 
 
-def _exit_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def wait() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
-
-
-def _compute_in_processes(
-    function: Callable[[J], R], jobs: Sequence[J], processes: int
-) -> Iterator[tuple[int, R]]:
-    # processes, because most of a variant is computed in Python, under the interpreter lock
-    try:
-        pickle.dumps(jobs[0])
-    except (AttributeError, TypeError, pickle.PicklingError) as error:
-        raise InputError(
-            "measures that are lambdas or local functions stay in one process: give a Python "
-            f"file, functions of a module, or processes=1 ({error})"
-        ) from None
-    pool = ProcessPoolExecutor(
-        processes, multiprocessing.get_context("spawn"), initializer=_exit_with_parent
-    )
-    try:
-        futures = {pool.submit(function, job): index for index, job in enumerate(jobs)}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
-    except BrokenProcessPool:
-        raise InputError(
-            "a process ended before its time: guard what your script runs with "
-            "if __name__ == '__main__':, or take one process"
-        ) from None
-    finally:
-        pool.shutdown(cancel_futures=True)
+def _finished_jobs(
+    function: Callable[[J], R], jobs: Mapping[int, J], processes: int, scheduler: str | None
+) -> Generator[tuple[int, R], None, None]:
+    """Yield indices and results of jobs as they finish."""
+    if scheduler is not None and jobs:
+        yield from compute_on_cluster(function, jobs, scheduler)
+    elif processes > 1 and len(jobs) > 1:
+        with closing(WorkerPool(function, jobs, processes)) as pool:
+            yield from pool.results()
+    else:
+        for index, job in jobs.items():
+            yield index, function(job)

@@ -1,7 +1,7 @@
 """Result of a study: a table of measures by variant."""
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -97,12 +97,14 @@ class Study(Result):
         Raises:
             OutputError: The file cannot be written.
         """
-        header = [f"{name} [{self.units[name] or '1'}]" for name in self.columns]
-        with replace_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        with (
+            replace_file(path) as part,
+            part.open("w", newline="", encoding="utf-8", errors="surrogateescape") as file,
+        ):
             file.write(f"# machine: {self.machine_reference}\n")
             file.writelines(f"# note: {note}\n" for note in self.resolution_notes)
             writer = csv.writer(file, lineterminator="\n")
-            writer.writerow([*header, "reason"])
+            writer.writerow(study_headings(self.columns, self.units))
             for row in self.rows:
                 writer.writerow(["" if value != value else value for value in row.values()])
 
@@ -135,3 +137,8 @@ class Study(Result):
         if failed:
             summary += f"; {len(failed)} cannot be measured, the first: {failed[0]}"
         return "\n".join([*(text if ranking else []), summary, *self.resolution_notes])
+
+
+def study_headings(columns: Iterable[str], units: Mapping[str, str]) -> list[str]:
+    """Return the headings of the table of a study."""
+    return [*(f"{name} [{units[name] or '1'}]" for name in columns), "reason"]

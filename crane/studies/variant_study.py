@@ -3,7 +3,8 @@
 import itertools
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crane.common.checkpoint import Checkpoint
 from crane.common.errors import (
     CraneError,
     CraneWarning,
@@ -37,6 +39,7 @@ from crane.studies.optimization.measure_expressions import (
     MeasureExpression,
     MeasureFunction,
     load_user_measures,
+    measure_source,
     parse_requirement,
     transferable_measures,
 )
@@ -47,9 +50,15 @@ from crane.studies.optimization.variant_measures import (
     check_unique_names,
     load_positions,
 )
-from crane.studies.parallel_jobs import check_process_count, compute_jobs, machine_from_files
-from crane.studies.study_table import Study
+from crane.studies.parallel_jobs import (
+    StoredResults,
+    check_process_count,
+    compute_jobs,
+    machine_from_files,
+)
+from crane.studies.study_table import Study, study_headings
 
+_VariantRow = tuple[dict[str, float], str]  # columns, and the reasons for missing ones
 _MAX_VARIANTS = 100_000
 _REQUIREMENT_TOLERANCE = 1e-9  # relative violation of a requirement that is accepted
 # first words of parameters that do not change inverse dynamics
@@ -97,6 +106,7 @@ def study(
     seed: int = 0,
     processes: int = 1,
     scheduler: str | None = None,
+    checkpoint: str | Path | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Study:
     """Measure variants of a machine: a grid of parameter values, or random draws.
@@ -123,11 +133,16 @@ def study(
         processes: Number of processes, at most eight per core. More than one needs a main module
             that can be imported (`if __name__ == "__main__":`).
         scheduler: Address of a Dask scheduler whose workers compute instead.
+        checkpoint: File to which each finished variant is appended, as a row of `Study.to_csv`;
+            those in it are not computed again. It stays until it is removed, as by `Study.write`
+            into its folder, where it is named "unfinished.csv".
         progress: Function that is called with the finished share, 0 to 1.
 
     Raises:
-        InputError: A name is unknown, values are inconsistent, no variant can be measured, or the
-            machine was changed after it was loaded.
+        InputError: A name is unknown, values are inconsistent, no variant can be measured, the
+            machine was changed after it was loaded, or the checkpoint is of another study.
+        LostWorkError: Processes or the scheduler ended before their time.
+        OutputError: The checkpoint cannot be written.
     """
     progress = progress_reporter(progress)
     check_process_count(processes)
@@ -147,32 +162,20 @@ def study(
     selected_measures = _unique_names(
         "measure", available, named_measures or (None if not expressions else ())
     )
-    units = _parameter_units(
-        base_machine, vary, has_lever_tasks or bool(expressions) or bool(require)
-    )
+    with_circuit = bool(has_lever_tasks or expressions or require)
+    units = _parameter_units(base_machine, vary, with_circuit)
     options = MeasureOptions(frame, find_rule(rule), tasks, transferable_measures(user_measures))
     if not set(selected_measures) & set(task_measure_units):
         tasks = ()
-    jobs = [
-        StudyJob(
-            name,
-            {**base_machine.parameter_changes, **dict(zip(vary, row.tolist(), strict=True))},
-            dict(base_machine.locked_joints),
-            tasks,
-            not set(selected_measures) <= set(task_measure_units),
-            expressions,
-            tuple(require),
-            options,
-        )
-        for row in values
-    ]
-    rows = compute_jobs(
-        measure_variant, jobs, processes, scheduler,
-        lambda done: progress and progress(done / len(jobs)),
+    job = StudyJob(
+        name, dict(base_machine.parameter_changes), dict(base_machine.locked_joints), tasks,
+        not set(selected_measures) <= set(task_measure_units), expressions, tuple(require),
+        options,
     )  # fmt: skip
-    reasons = tuple(reason for _, reason in rows)
-    if all(reasons):
-        raise InputError(f"none of {len(jobs)} variants can be measured, the first: {reasons[0]}")
+    jobs = [
+        job._replace(changes=job.changes | dict(zip(vary, row, strict=True)))
+        for row in values.tolist()
+    ]
     measures = tuple(dict.fromkeys((*(measures or ()), *selected_measures)))
     available |= {x: PLAIN_MEASURES.get(x, "") for x in expressions}
     column_measures = {
@@ -182,18 +185,63 @@ def study(
             x, *(f"{x} {task}" for task in tasks if len(tasks) > 1 and x in task_measure_units)
         )
     }  # fmt: skip
+    units |= {column: available[measure] for column, measure in column_measures.items()}
+    with _kept_rows(
+        checkpoint, base_machine, (job, values, measure_source(user_measures)),
+        [*vary, *column_measures], units,
+    ) as kept:  # fmt: skip
+        rows = compute_jobs(
+            measure_variant, jobs, processes, scheduler,
+            lambda done: progress and progress(done / len(jobs)), kept,
+        )  # fmt: skip
+        reasons = tuple(reason for _, reason in rows)
+        if all(reasons):
+            raise InputError(
+                f"none of {len(jobs)} variants can be measured, the first: {reasons[0]}"
+            )
     columns = dict(zip(vary, values.T, strict=True)) | {
         column: np.array([row.get(column, np.nan) for row, _ in rows])
         for column in column_measures
     }
-    units |= {column: available[measure] for column, measure in column_measures.items()}
     return Study(
         name, tuple(vary), measures, tasks,
         units, columns, reasons, grid_shape, resolution_notes(base_machine, measures),
     )  # fmt: skip
 
 
-def measure_variant(study_job: StudyJob) -> tuple[dict[str, float], str]:
+@contextmanager
+def _kept_rows(
+    checkpoint: str | Path | None,
+    machine: Machine,
+    settings: tuple[StudyJob, Array, object],
+    columns: Sequence[str],
+    units: Mapping[str, str],
+) -> "Iterator[StoredResults[_VariantRow] | None]":
+    """Context of the rows of a study in a checkpoint, if there is one; see `Study.to_csv`."""
+    if checkpoint is None:
+        yield None
+        return
+    values = settings[1]
+    count = values.shape[1]
+
+    def to_cells(row: _VariantRow) -> list[object]:
+        return [*(float(row[0][x]) if x in row[0] else "" for x in columns[count:]), row[1]]
+
+    def from_cells(cells: list[str]) -> _VariantRow:
+        named_cells = zip(columns[count:], cells[:-1], strict=True)
+        return {name: float(cell) for name, cell in named_cells if cell}, cells[-1]
+
+    with Checkpoint(
+        checkpoint,
+        {"machine data": MachineVariants(machine).spec, "settings": settings},
+        study_headings(columns, units),
+        count,
+    ) as table:
+        keys = [tuple(map(repr, row)) for row in values.tolist()]
+        yield StoredResults(table, keys, to_cells, from_cells)
+
+
+def measure_variant(study_job: StudyJob) -> _VariantRow:
     """Return the columns of one variant, and the reasons for missing ones."""
     # the machine itself has given its warnings
     with warnings.catch_warnings(action="ignore", category=CraneWarning):
@@ -204,7 +252,7 @@ def measure_variant(study_job: StudyJob) -> tuple[dict[str, float], str]:
         return _measure(machine, study_job)
 
 
-def _measure(machine: Machine, study_job: StudyJob) -> tuple[dict[str, float], str]:
+def _measure(machine: Machine, study_job: StudyJob) -> _VariantRow:
     measures: dict[str, float] = {}
     reasons = []
     if machine.closure.is_compiled:

@@ -123,7 +123,7 @@ def _loop_facts(machine: Machine) -> Iterator[MachineFact]:
             "+".join(machine.joints[closure.passive[i]] for i in columns)
             for _, columns in structure.blocks
         ]
-        yield MachineFact("solved as", ", then ".join(order))
+        yield MachineFact("loop order", f"solved for {', then '.join(order)}")
 
 
 def _drive_facts(machine: Machine) -> Iterator[MachineFact]:
@@ -148,30 +148,35 @@ def _drive_facts(machine: Machine) -> Iterator[MachineFact]:
             if condition_number > 10 and c.condition_number < condition_number / 2
         ]
         hint = f"; better with {better_selections[0]}" if better_selections else ""
-        # of free ones too, which nothing drives
         yield MachineFact(
-            "independent", f"coordinates: condition {condition_number:.3g} at home{hint}"
+            "coordinates",
+            f"condition number of the active ones {condition_number:.3g} at home{hint}",
         )
     if any(inertia.mass for inertia in list(machine.model.inertias)[1:]):
         backend = Dynamics(machine).backend_of("forward")
-        reason = "" if backend == "compiled" else ", too large for machine code"
-        yield MachineFact("computed", f"{backend}{reason}")
+        is_compiled = backend == "compiled"
+        yield MachineFact(
+            "dynamics",
+            "compiled to machine code" if is_compiled else f"{backend}, too large to compile",
+        )
 
 
 def _circuit_fact(machine: Machine) -> Iterator[MachineFact]:
     if machine.hydraulics is None:
         return
     supply, rows = machine.hydraulics.supply, []
-    flow = f", {6e4 * supply.flow:.4g} l/min at most" if supply.flow else ""
+    flow = f", at most {6e4 * supply.flow:.4g} l/min" if supply.flow else ""
     for joint, cylinder in machine.hydraulics.cylinders.items():
         valve = machine.hydraulics.valves[joint]
         kind = "sharing" if valve.sharing else "compensated" if valve.margin else "orifice"
         spool_text = " of two spools" if valve.spool_b else ""
-        unit, size = ("cm2", 1e4) if machine.unit(joint) == "m" else ("cm3/rad", 1e6)
-        areas = f"{size * cylinder.area_a:.4g} and {size * cylinder.area_b:.4g} {unit}"
-        rows.append((joint, f"{kind} valve{spool_text}", areas))
+        is_cylinder = machine.unit(joint) == "m"
+        unit, size = ("cm2", 1e4) if is_cylinder else ("cm3/rad", 1e6)
+        areas = f"A {size * cylinder.area_a:.4g}, B {size * cylinder.area_b:.4g} {unit}"
+        owner = "cylinder areas" if is_cylinder else "motor displacements"
+        rows.append((joint, f"{kind} valve{spool_text}", f"{owner} {areas}"))
     yield MachineFact(
-        "hydraulics", f"{1e-5 * supply.pressure:.4g} bar{flow}", ("", "", ""), tuple(rows)
+        "hydraulics", f"pump {1e-5 * supply.pressure:.4g} bar{flow}", ("", "", ""), tuple(rows)
     )
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from crane.common.atomic_output import check_folder_is_writable, replace_folder
 from crane.common.errors import CraneWarning, InputError
-from crane.common.result import Result
+from crane.common.result import UNFINISHED, Result
 from crane.formats.machine_file.machine_writer import write_machine
 from crane.formats.machine_loading import load_from_expression
 from crane.machine.machine import Machine
@@ -84,7 +84,7 @@ def write_result(
     ) as part:
         text = files.text(result, **options)
         if files.summary:
-            (part / files.summary).write_text(text, encoding="utf-8")
+            (part / files.summary).write_text(text, encoding="utf-8", errors="backslashreplace")
         for name, method in files.tables.items():
             getattr(result, method)(part / name)
         for name, function in files.figures.items():
@@ -191,7 +191,9 @@ def _comparison_text(comparison: Any, **_: object) -> str:
 
 def _write_comparison(comparison: Any, folder: Path, npz: bool = False) -> None:
     if (run := comparison.recording) is not None:
-        (folder / SUMMARY).write_text(_recording_text(run), encoding="utf-8")
+        (folder / SUMMARY).write_text(
+            _recording_text(run), encoding="utf-8", errors="backslashreplace"
+        )
         _write_recording(run, folder, npz)
     if comparison.channels:
         _write_figure(
@@ -314,7 +316,7 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         documents={REPORT: "page.calibration_page.write_calibration_report"},
         more=_write_calibrated_machine,
         more_files=(_MACHINE,),
-        stale=lambda result, folder: _machine_files(result.machine, folder),
+        stale=lambda result, folder: (*_machine_files(result.machine, folder), UNFINISHED),
     ),
     "Capacity": ResultFiles(
         summary="capacity.md",
@@ -352,6 +354,7 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         figures={"design.png": "study_figures.design_figure"},
         more=_write_design,
         more_files=("before.png", "after.png", _MACHINE),
+        stale=lambda *_: (UNFINISHED,),
     ),
     "Excitation": ResultFiles(
         tables={"reference.csv": "to_csv", "coefficients.yaml": "to_yaml"},
@@ -415,7 +418,9 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         figures={"signals.png": "identification_figures.signals_figure"},
     ),
     "Study": ResultFiles(
-        tables={"study.csv": "to_csv"}, figures={"study.png": "study_figures.study_figure"}
+        tables={"study.csv": "to_csv"},
+        figures={"study.png": "study_figures.study_figure"},
+        stale=lambda *_: (UNFINISHED,),
     ),
     "ToolForce": ResultFiles(
         summary="tool_force.md",

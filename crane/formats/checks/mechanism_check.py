@@ -70,18 +70,18 @@ def check_mechanism(spec: MachineSpec, findings: Findings) -> Closure | None:
 def _report_with_gaps(
     spec: MachineSpec, model: pin.Model, initial_guess: Array, error: MechanismError
 ) -> None:
-    gaps = {}
+    text, gaps = str(error), {}
     if isinstance(error, OpenLoopError):
-        gaps, error = (
-            _loop_gaps(spec, model, initial_guess),
-            add_remedy(spec, model, initial_guess, error),
-        )
-    own_gap = gaps.pop(error.subject, "")
-    report_error(
-        MechanismError(f"{error}{f' (it is {own_gap})' if own_gap else ''}", error.subject)
-    )
+        gaps = _loop_gaps(spec, model, initial_guess)
+        text = str(add_remedy(spec, model, initial_guess, error))
+        if own_gap := gaps.pop(error.subject, ""):  # instead of the largest residual
+            residual_text = error.reason.rpartition("' ")[2]
+            text = text.replace(f"it {residual_text}", f"its smallest gap is {own_gap}")
+    report_error(MechanismError(text, error.subject))
     for subject, gap in gaps.items():
-        problem = f"loop '{subject.removeprefix('loop ')}' stays open, too: it is {gap}"
+        problem = (
+            f"loop '{subject.removeprefix('loop ')}' stays open, too: its smallest gap is {gap}"
+        )
         report_error(
             MechanismError(
                 f"{spec.source_locations.get(subject, spec.path.name)}: {problem}", subject
@@ -112,8 +112,8 @@ def _loop_gaps(spec: MachineSpec, model: pin.Model, initial_guess: Array) -> dic
         if max(length, sine) > _OPEN_TOLERANCE:
             metres = length * equations.characteristic_length
             length_text = f"{metres:.3g} m" if metres >= 1 else f"{1e3 * metres:.3g} mm"
-            angle_text = f"{np.degrees(np.arcsin(sine)):.3g} deg askew"
-            gap_texts[f"loop {loop.name}"] = f"{length_text} apart and {angle_text}"
+            angle_text = f"{np.degrees(np.arcsin(sine)):.3g} deg"
+            gap_texts[f"loop {loop.name}"] = f"{length_text} and {angle_text}"
     return gap_texts
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from lxml import etree
 
 from crane.common.errors import CraneWarning
+from crane.common.number_text import parse_float
 from crane.common.plausible_ranges import LONGEST
 from crane.common.samples import Array
 from crane.description.kinematic_tree import inertia_problem
@@ -47,7 +48,7 @@ def read_numbers(element: etree._Element | None, key: str, count: int) -> Array 
     """Return the finite numbers of an attribute, None if it has others."""
     text = None if element is None else element.get(key)
     try:
-        found = np.array([float(word) for word in (text or "").split()])
+        found = np.array([parse_float(word) for word in (text or "").split()])
     except ValueError:
         return None
     return found if found.shape == (count,) and np.isfinite(found).all() else None
@@ -219,7 +220,7 @@ def _size_problems(
             yield (
                 "inertia",
                 f"has a radius of gyration of {gyration_radius:.3g} m, and its joints and its "
-                f"centre of mass are at most {joint_distance:.3g} m away, {hint}",
+                f"centre of mass are at most {joint_distance:.3g} m from its origin, {hint}",
             )
         return
     size = float(np.linalg.norm(bounds[1] - bounds[0]))
@@ -281,8 +282,9 @@ def flow_shortages(spec: MachineSpec) -> list[str]:
         demand = full_opening_flow(spec.hydraulics, name)
         if supply.flow > 0 and demand > _MAX_DEMAND_RATIO * supply.flow:
             messages.append(
-                f"hydraulics: the valves of '{name}' take {demand * _LITRES_PER_MINUTE:.3g} "
-                f"l/min together, it gives {supply.flow * _LITRES_PER_MINUTE:.3g} l/min"
+                f"hydraulics: fully open valves of pump '{name}' need "
+                f"{demand * _LITRES_PER_MINUTE:.3g} l/min together, it delivers at most "
+                f"{supply.flow * _LITRES_PER_MINUTE:.3g} l/min"
             )
     return messages
 

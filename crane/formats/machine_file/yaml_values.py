@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from crane.common.errors import DescriptionError, suggest_names
+from crane.common.number_text import parse_float
 from crane.common.unit_conversions import (
     KeyPath,
     UnitError,
@@ -40,7 +41,7 @@ def as_float(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         return math.nan
     try:
-        return float(value)
+        return parse_float(value) if isinstance(value, str) else float(value)
     except (ValueError, OverflowError):
         return math.nan
 

@@ -12,6 +12,7 @@ import pinocchio as pin
 from lxml import etree
 
 from crane.common.errors import DescriptionError
+from crane.common.number_text import parse_float
 from crane.common.optional_libraries import import_optional_library
 from crane.formats.conversion_notes import ConversionNotes
 from crane.formats.xml_file import XmlFile
@@ -105,7 +106,7 @@ def _check_sizes(xml: XmlFile, element: etree._Element) -> None:
 def _read_numbers(element: etree._Element, key: str) -> list[float]:
     """Return the numbers of an attribute, none if it is malformed, which MuJoCo reports."""
     try:
-        return [float(word) for word in element.get(key, "").split()]
+        return [parse_float(word) for word in element.get(key, "").split()]
     except ValueError:
         return []
 

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -79,10 +80,11 @@ def read_meshes(files: Iterable[Path]) -> dict[Path, tuple[MeshPart, ...] | str]
             continue
         name = _cache_entry_name(file) if size <= _MAX_CACHED_SIZE else None
         cached = None if name is None else file_cache.read_entry(name)
-        if cached is None:
-            entry_names[file] = name
-        else:
-            found[file], _ = _parse_answer(cached)
+        entry_names[file] = name
+        if cached is not None:
+            with suppress(ValueError, KeyError, TypeError):  # else it is read anew
+                found[file], _ = _parse_answer(cached)
+                del entry_names[file]
     for _ in range(_MAX_ATTEMPTS):
         remaining_triangles = mesh_process.MAX_TRIANGLES - sum(
             len(part.faces)

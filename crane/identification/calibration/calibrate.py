@@ -1,12 +1,14 @@
 """Calibration of machines: parameters fitted to recordings through the simulation."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from crane.common.checkpoint import Checkpoint
 from crane.common.errors import CraneError, InputError, RecordingError, check_name, prefix_location
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array
@@ -22,6 +24,7 @@ from crane.description.sensors import (
     sensor_parameters,
     with_sensor_parameters,
 )
+from crane.description.specification import MachineSpec
 from crane.formats.machine_loading import MachineVariants, load
 from crane.identification.calibration.calibration_problem import CalibrationProblem
 from crane.identification.calibration.calibration_result import (
@@ -37,6 +40,7 @@ from crane.identification.calibration.calibration_statistics import (
 )
 from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt, Progress
 from crane.identification.calibration.recording_case import RecordingCase, recording_case
+from crane.identification.calibration.search_log import LOG_COLUMNS, SearchLog
 from crane.identification.calibration.unknowns import Unknown, build_unknowns, candidate_parameters
 from crane.machine.machine import Machine
 from crane.recordings.logs import read_log_columns
@@ -67,6 +71,7 @@ def calibrate(
     columns: str | Path | None = None,
     span: TimeSpan = FULL_TIME_SPAN,
     sensors: Sequence[str] | None = None,
+    checkpoint: str | Path | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
     """Calibrate parameters of a machine to recordings with measured valve signals.
@@ -98,6 +103,9 @@ def calibrate(
         span: Start and end [s], by the clocks of the files, of the samples that are read from
             `recordings`.
         sensors: Columns to compare; default all that can be simulated.
+        checkpoint: File to which the state of the search is appended after each iteration; it goes
+            on from there, to the same result. It stays until it is removed, as by
+            `Calibration.write` into its folder, where it is named "unfinished.csv".
         progress: Called with the finished share, 0 to 1.
 
     Returns:
@@ -105,7 +113,9 @@ def calibrate(
         score tests of other parameters.
 
     Raises:
-        InputError: Names, bounds or spans are not valid.
+        InputError: Names, bounds or spans are not valid, or the checkpoint is of another
+            calibration.
+        OutputError: The checkpoint cannot be written.
         RecordingError: A recording is malformed, or has no valve signals.
         SimulationError: The simulation of a recording fails with the initial parameters.
     """
@@ -147,16 +157,19 @@ def calibrate(
         for x in unknowns_for({x.name: (x.start, x.low, x.high) for x in proposed.values()})
         if not used_names & {x.name, *dict(x.members)}
     ]
-    problem = CalibrationProblem(machine, unknowns, cases)
+    problem, excluded = CalibrationProblem(machine, unknowns, cases), list[str]()
     initial_residuals = [
         problem.residuals(case, np.zeros(problem.unknown_count)) for case in problem.cases
     ]
-    search, excluded = LevenbergMarquardt(problem, progress), list[str]()
-    if automatic:
-        problem, search, excluded = select_parameters(
-            CalibrationProblem(machine, [*unknowns, *extras], cases), progress
-        )
-    estimate = estimate_with_profiles(search, len(problem.unknowns))
+    with _search_log(
+        checkpoint, machine, variants.spec, (unknowns, extras, automatic), cases
+    ) as log:
+        search = LevenbergMarquardt(problem, progress, log)
+        if automatic:
+            problem, search, excluded = select_parameters(
+                CalibrationProblem(machine, [*unknowns, *extras], cases), progress, log
+            )
+        estimate = estimate_with_profiles(search, len(problem.unknowns))
     tests = []
     if not automatic:
         applicable_extras = [x for x in extras if dict(x.members).get(x.name, x.start) == x.start]
@@ -171,6 +184,28 @@ def calibrate(
         score_tests=tuple(tests),
         unobserved_parameters=tuple(excluded),
     )
+
+
+@contextmanager
+def _search_log(
+    checkpoint: str | Path | None,
+    machine: Machine,
+    spec: MachineSpec,
+    settings: tuple[object, ...],
+    cases: Sequence[RecordingCase],
+) -> Iterator[SearchLog]:
+    """Context of the states of the searches, in a checkpoint if there is one."""
+    if checkpoint is None:
+        yield SearchLog(None)
+        return
+    data = [
+        (x.table.units, x.table.values, x.sensors, x.train_mask, x.known_sensors) for x in cases
+    ]
+    dependencies = {
+        "machine data": (spec, machine.locked_joints), "recordings": data, "settings": settings
+    }  # fmt: skip
+    with Checkpoint(checkpoint, dependencies, LOG_COLUMNS, 1) as table:
+        yield SearchLog(table)
 
 
 def _read_cases(

@@ -22,6 +22,7 @@ from crane.common.errors import CraneError, InputError
 from crane.common.samples import Array
 from crane.identification.calibration.calibration_problem import CalibrationProblem
 from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt, Progress
+from crane.identification.calibration.search_log import SearchLog
 from crane.identification.calibration.unknowns import Unknown
 
 _LOWER_MINIMUM_SHARE = 5e-2  # relative difference of the cost of a lower minimum
@@ -285,7 +286,7 @@ def score_tests(
 
 
 def select_parameters(
-    problem: CalibrationProblem, progress: Progress | None
+    problem: CalibrationProblem, progress: Progress | None, log: SearchLog
 ) -> tuple[CalibrationProblem, LevenbergMarquardt, list[str]]:
     """Fit all parameters with their priors, and remove those without an effect.
 
@@ -295,6 +296,7 @@ def select_parameters(
     Args:
         problem: Problem of all candidates; parameters without a prior are always kept.
         progress: See `calibrate`.
+        log: States of the searches.
 
     Returns:
         Problem of the kept parameters, a search that continues from the fit, and names of the
@@ -303,7 +305,7 @@ def select_parameters(
     Raises:
         InputError: No parameter is kept.
     """
-    search = LevenbergMarquardt(problem, progress)
+    search = LevenbergMarquardt(problem, progress, log)
     z, unknowns = search.smoothed_minimum(), problem.unknowns
     excluded = set()
     for i, unknown in enumerate(unknowns):

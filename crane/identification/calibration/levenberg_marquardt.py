@@ -13,6 +13,7 @@ from crane.identification.calibration.calibration_problem import (
     CalibrationProblem,
 )
 from crane.identification.calibration.recording_case import RecordingCase, noise_std
+from crane.identification.calibration.search_log import SearchLog, SearchState
 
 Progress = Callable[[float], None]
 
@@ -51,9 +52,13 @@ class LevenbergMarquardt:
     """
 
     def __init__(
-        self, problem: CalibrationProblem, progress: Progress | None, iteration_count: int = 0
+        self,
+        problem: CalibrationProblem,
+        progress: Progress | None,
+        log: SearchLog,
+        iteration_count: int = 0,
     ):
-        self.problem, self._progress = problem, progress
+        self.problem, self._progress, self._log = problem, progress, log
         unknowns = problem.unknowns
         start_count = problem.unknown_count - len(unknowns)
         self.low = np.array(
@@ -73,7 +78,7 @@ class LevenbergMarquardt:
 
     def restricted_search(self, problem: CalibrationProblem, z: Array) -> "LevenbergMarquardt":
         """Method for fewer unknowns, with these channel scales and an initial guess."""
-        search = LevenbergMarquardt(problem, self._progress, self._iteration_count)
+        search = LevenbergMarquardt(problem, self._progress, self._log, self._iteration_count)
         search.channel_scales, search._initial_guess = self.channel_scales, z
         return search
 
@@ -149,7 +154,9 @@ class LevenbergMarquardt:
             part_problem = CalibrationProblem(problem.machine, problem.unknowns, parts)
             part_problem.smooth = problem.smooth
             part_problem.derivative_tolerance = problem.derivative_tolerance
-            search = LevenbergMarquardt(part_problem, self._progress, self._iteration_count)
+            search = LevenbergMarquardt(
+                part_problem, self._progress, self._log, self._iteration_count
+            )
             search.channel_scales = self.channel_scales
             part_minimum = search._minimize(
                 np.zeros(part_problem.unknown_count), _INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING
@@ -235,30 +242,42 @@ class LevenbergMarquardt:
         self, z: Array, cost_tolerance: float = _COST_TOLERANCE, damping: float = _INITIAL_DAMPING
     ) -> Array:
         """Nearest minimum for the present channel scales."""
-        cost = self._cost(z)
-        if not np.isfinite(cost):  # raises the error
+        state = self._log.begin()
+        if state is None:
+            state = SearchState(z, self._cost(z), damping)
+        else:
+            self._iteration_count = state.total_iterations
+            self.problem.simulation_count = state.simulations
+        if not np.isfinite(state.cost):  # raises the error
             for case in self.training_cases:
                 self.problem.residuals(case, z)
-        for _ in range(_MAX_ITERATIONS):
-            self._linearize(z)
-            hessian = self.jacobian.T @ self.jacobian + np.diag(self.prior**2)
-            gradient = self.jacobian.T @ self.residual + self.prior**2 * z
-            before = cost
-            while True:
-                trial = self._step(z, hessian, gradient, damping)
-                trial_cost = self._cost(trial)
-                self._iteration_count += 1
-                if self._progress is not None:
-                    self._progress(1.0 - 0.97**self._iteration_count)
-                if trial_cost < cost:
-                    z, cost, damping = trial, trial_cost, max(damping * _DAMPING_DECREASE, 1e-9)
-                    break
-                damping *= _DAMPING_INCREASE
-                if damping > _MAX_DAMPING:
-                    return z
-            if before - cost < cost_tolerance * before:
+        while not state.has_ended:
+            state = self._iterate(state, cost_tolerance)
+            self._log.add(state)
+        return state.z
+
+    def _iterate(self, state: SearchState, cost_tolerance: float) -> SearchState:
+        """State after an iteration: a step that reduces the cost, if there is one."""
+        z, cost, damping = state.z, state.cost, state.damping
+        self._linearize(z)
+        hessian = self.jacobian.T @ self.jacobian + np.diag(self.prior**2)
+        gradient = self.jacobian.T @ self.residual + self.prior**2 * z
+        while damping <= _MAX_DAMPING:
+            trial = self._step(z, hessian, gradient, damping)
+            trial_cost = self._cost(trial)
+            self._iteration_count += 1
+            if self._progress is not None:
+                self._progress(1.0 - 0.97**self._iteration_count)
+            if trial_cost < cost:
+                z, cost, damping = trial, trial_cost, max(damping * _DAMPING_DECREASE, 1e-9)
                 break
-        return z
+            damping *= _DAMPING_INCREASE
+        iteration, reduction = state.iteration + 1, state.cost - cost
+        has_ended = reduction < cost_tolerance * state.cost or not reduction
+        return SearchState(
+            z, cost, damping, iteration, has_ended or iteration >= _MAX_ITERATIONS,
+            self._iteration_count, self.problem.simulation_count,
+        )  # fmt: skip
 
     def _step(self, z: Array, hessian: Array, gradient: Array, damping: float) -> Array:
         """Damped step within the bounds, by an active set."""

@@ -124,7 +124,7 @@ def identify_options(settings: Mapping[str, object], options: Mapping[str, Any])
 
 def format_trials(trials: Sequence[CrossValidationTrial]) -> str:
     """Table of settings and errors."""
-    rows = [["settings", "error", "of the held-out folds"]]
+    rows = [["settings", "held-out error", "of each fold [%]"]]
     for trial in trials:
         words = ", ".join(f"{name}={value}" for name, value in trial.settings.items())
         each = " ".join("-" if np.isnan(x) else f"{100 * x:.2f}" for x in trial.errors)

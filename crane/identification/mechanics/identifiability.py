@@ -108,13 +108,13 @@ def motion_advice(machine: Machine, motions: Sequence[Motion]) -> str:
     moved = np.concatenate([[motion.q.min(axis=0), motion.q.max(axis=0)] for motion in motions])
     shares = np.ptp(moved, axis=0) / np.where(np.isfinite(span), span, np.inf)
     short_strokes = [
-        f"{joint} ({100 * share:.0f} % of its stroke so far)"
+        f"{joint} (so far {100 * share:.0f} % of its stroke)"
         for joint, share, size in zip(machine.active, shares.tolist(), span.tolist(), strict=True)
         if np.isfinite(size) and share < _MIN_STROKE_SHARE
     ]
     if short_strokes:
-        return f"record one that moves {', '.join(short_strokes)} further"
-    return "record one that excites it (crane excite)"
+        return f"record a motion that moves these joints further: {', '.join(short_strokes)}"
+    return "record a motion that determines them (crane excite)"
 
 
 def read_priors(given: float | Mapping[str, object]) -> dict[str, ParameterPrior]:

@@ -191,24 +191,21 @@ class Identification(EstimatedValues, Result):
         for title, fit in (("training", self.training), ("validation", self.validation)):
             if fit is None:
                 continue
-            rows = [["force", "RMS error", "", "relative", "PE (9)"]]
+            rows = [["force", "RMS error", "", "relative error"]]
             for i, joint in enumerate(fit.joints):
                 unit = "N" if self.described_machine.unit(joint) == "m" else "N m"
-                shares = [
-                    f"{100 * fit.relative_error[i]:.2f} %",
-                    f"{fit.percentage_error[i]:.3f} %",
-                ]
+                share = f"{100 * fit.relative_error[i]:.2f} %"
                 if joint in self.described_machine.free:
-                    shares = ["free", ""]
-                row = [joint, f"{fit.rmse[i]:.4g}", unit, *shares]
-                rows.append(row if fit.is_moving[:, i].any() else [joint, "-", "", "-", "-"])
+                    share = "free"
+                row = [joint, f"{fit.rmse[i]:.4g}", unit, share]
+                rows.append(row if fit.is_moving[:, i].any() else [joint, "-", "", "-"])
             if not np.isnan(fit.overall_relative_error):
                 mean = f"{100 * np.nanmean(fit.relative_error):.2f} %"
-                rows.append(["mean of the joints", "", "", mean, ""])
-                rows.append(
-                    ["all, stacked", "", "", f"{100 * fit.overall_relative_error:.2f} %", ""]
-                )
-            lines += [f"{title}, moving rows", *format_table(rows, (0, 2)), ""]
+                overall = f"{100 * fit.overall_relative_error:.2f} %"
+                rows.append(["mean of the joints", "", "", mean])
+                rows.append(["all joints together", "", "", overall])
+            heading = f"{title}, samples near standstill excluded"
+            lines += [heading, *format_table(rows, (0, 2)), ""]
         rows = [["parameter", "value", "std", "rel. std", "description", ""]]
         for name, value, std, before, mark in zip(
             self.names, self.values, self.std, self.nominal, self.marks, strict=True
@@ -219,7 +216,7 @@ class Identification(EstimatedValues, Result):
         if self.undetermined_directions:
             lines += [
                 "",
-                "not determined by this motion (std in multiples of the plausible magnitude):",
+                "not determined by this motion (std in multiples of the plausible size):",
             ]
             lines += [
                 f"  +- {std:.2g}  {words}"

@@ -8,6 +8,7 @@ import numpy as np
 
 from crane.common.errors import CraneWarning, RecordingError, check_name, suggest_names
 from crane.common.samples import Array
+from crane.common.scratch_arrays import BLOCK_SIZE, release_pages, stack_columns
 from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.dynamics.dynamics import Dynamics
 from crane.identification.mechanics.recording_rejection import reject_delay, reject_unless_trusted
@@ -81,10 +82,11 @@ def smoothed_motion(
         reject_unless_trusted(f"{text}, do not lock it, or lock it where it is", trust)
     time, n = recording.time, len(machine.active)
     names = [x + suffix for suffix in ("", FORCE_SUFFIX) for x in machine.active]
-    columns = remove_outliers(time, names, np.hstack([recording.q, recording.tau]), trust)
+    columns = stack_columns([*recording.q.T, *recording.tau.T], 2 * n)
+    columns = remove_outliers(time, names, columns, trust)
     recorded = None
     if np.any(recording.v):  # for comparison only, without outliers
-        recorded = np.column_stack([replace_outliers(x, outlier_mask(x)) for x in recording.v.T])
+        recorded = stack_columns((replace_outliers(x, outlier_mask(x)) for x in recording.v.T), n)
         is_derived = [
             np.array_equal(v, time_derivative(q, time))
             for q, v in zip(recording.q.T, recording.v.T, strict=True)
@@ -108,13 +110,18 @@ def smoothed_motion(
     lowest = _HUM_FACTOR * spectral_edge_frequency(columns[:, :n], step)
     warn_hum(time, dict(zip(names, columns.T, strict=True)), lowest)
     found = differentiate(time, columns[:, :n], derivatives, cutoff, progress)
+    del recorded
+    v, a = found.v, found.a
     is_moving = np.ones(n, dtype=bool)  # by more than the uncertainty of the velocity
     if found.std_v is not None:
-        is_moving = found.v.std(axis=0) > _MOTION_FACTOR * np.sqrt(np.mean(found.std_v**2, axis=0))
-    v, a = np.where(is_moving, (found.v, found.a), 0.0)
+        deviations = np.array([np.sqrt(np.mean(x**2)) for x in found.std_v.T])
+        is_moving = np.array([x.std() for x in v.T]) > _MOTION_FACTOR * deviations
+    is_noisy = ~is_moving & v.any(axis=0)
+    v[:, ~is_moving] = a[:, ~is_moving] = 0.0
+    release_pages()
     _check_speeds(machine, v, trust)
     # static friction makes any force
-    for i in np.flatnonzero(~v.any(axis=0) & found.v.any(axis=0)).tolist():
+    for i in np.flatnonzero(is_noisy).tolist():
         joint, place = machine.active[i], float(found.q[:, i].mean())
         text = (
             f"'{joint}' stands still but for noise: its forces are not informative, move it, or "
@@ -159,26 +166,23 @@ def _select_active_joints(
             raise RecordingError(
                 f"'{joint}' is recorded in {units[joint]}, give {machine.unit(joint)}"
             )
-    zeros = np.zeros_like(recording.time)
-    q = np.column_stack([recorded_columns[joint] for joint in machine.active])
-    tau = np.column_stack(
-        [recorded_columns.get(joint + FORCE_SUFFIX, zeros) for joint in machine.active]
-    )
-    rates = [
-        recorded_columns.get(
-            x + VELOCITY_SUFFIX, time_derivative(recorded_columns[x], recording.time)
-        )
-        for x in machine.active
-    ]
-    joint_units = {joint: machine.unit(joint) for joint in machine.active}
+    zeros, count = np.zeros_like(recording.time), len(machine.active)
+
+    def rate(joint: str) -> Array:
+        known = recorded_columns.get(joint + VELOCITY_SUFFIX)
+        return time_derivative(recorded_columns[joint], recording.time) if known is None else known
+
     return Recording(
         recording.time,
         machine.active,
-        q,
-        np.column_stack(rates),
-        tau,
-        joint_units,
+        stack_columns((recorded_columns[joint] for joint in machine.active), count),
+        stack_columns(map(rate, machine.active), count),
+        stack_columns(
+            (recorded_columns.get(x + FORCE_SUFFIX, zeros) for x in machine.active), count
+        ),
+        {joint: machine.unit(joint) for joint in machine.active},
         free=machine.free,
+        copy=False,
     )
 
 
@@ -210,7 +214,7 @@ def recorded_load_forces(machine: Machine, recording: Recording, q_a: Array, tru
         trust: See `smoothed_motion`.
 
     Returns:
-        (N, n) [N], [N m].
+        (N, n) [N], [N m]; (1, n) zeros without loads.
 
     Raises:
         RecordingError: A load acts on an unknown link, or a load of the machine is not recorded.
@@ -239,6 +243,8 @@ def recorded_load_forces(machine: Machine, recording: Recording, q_a: Array, tru
                 f"{_LOAD_PREFIX}{name}_force_x and so on, or take a machine without it",
                 trust,
             )
+    if not wrenches:
+        return np.zeros((1, q_a.shape[1]))
     dynamics, total = Dynamics(machine), np.zeros_like(q_a)
     for name, rows in wrenches.items():
         total += dynamics.project_wrenches(q_a, {frames.get(name, name): rows})
@@ -250,12 +256,10 @@ def signal_delay(time: Array, one: Array, other: Array) -> float:
 
     It is the maximum of the correlation of the overlapping parts, refined by a parabola.
     """
-    from scipy.signal import correlate
-
     step = sampling_step(time)
     one, other = one - one.mean(), other - other.mean()
     shifts = np.arange(-(reach := min(round(_MAX_DELAY / step), len(time) // 4)), reach + 1)
-    products = correlate(other, one, method="fft")[shifts + len(time) - 1]
+    products = _products(one, other, reach)
     first, second = (np.append(0, np.cumsum(x**2)) for x in (one, other))
     low, high = np.maximum(shifts, 0), len(time) + np.minimum(shifts, 0)
     energy = (first[high - shifts] - first[low - shifts]) * (second[high] - second[low])
@@ -271,6 +275,18 @@ def signal_delay(time: Array, one: Array, other: Array) -> float:
     curvature = before - 2 * here + after
     shift = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
     return float((at - reach + shift) * step)
+
+
+def _products(one: Array, other: Array, reach: int) -> Array:
+    """Sums of one_k other_k+s for the shifts s from -reach to reach, in blocks of samples."""
+    from scipy.signal import correlate
+
+    total, padded = np.zeros(2 * reach + 1), np.pad(other, reach)
+    for start in range(0, len(one), BLOCK_SIZE):
+        part = one[start : start + BLOCK_SIZE]
+        window = padded[start : start + len(part) + 2 * reach]
+        total += correlate(window, part, mode="valid", method="fft")
+    return total
 
 
 def remove_outliers(

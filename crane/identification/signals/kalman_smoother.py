@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from crane.common.samples import Array, solve_linear
+from crane.common.scratch_arrays import empty_array, release_pages
 
 _SEARCH_BOUNDS = (8.0, 10.0)  # of h N and of h in the search for the noise ratio
 _BLOCK_SAMPLES = 1 << 16  # samples per block of complex modes
@@ -77,7 +78,8 @@ def kalman_smooth(y: Array, step: float) -> tuple[Array, Array, float, float]:
     interior = solve_discrete_lyapunov(C, end - C @ P @ C.T)
     reach = _decay_length(np.linalg.eigvals(C), len(y))
     powers = _matrix_powers(C, reach)
-    covariance = np.repeat(np.diag(interior)[None, :3], len(y), axis=0)
+    covariance = empty_array(len(y), 3)
+    covariance[:] = np.diag(interior)[:3]
     at_end = np.einsum("kij,jl,kil->ki", powers, end - interior, powers)[:, :3]
     covariance[len(y) - reach :] += at_end[::-1]
     forced = update @ _matrix_powers(F @ update, reach)
@@ -163,7 +165,7 @@ def _linear_recursion(A: Array, B: Array, u: Array, start: Array) -> Array:
 
     values, V = np.linalg.eig(A)
     inverse_modes = np.linalg.inv(V)
-    out = np.empty((len(u) + 1, len(A)))
+    out = empty_array(len(u) + 1, len(A))
     out[0], state = start, inverse_modes @ start.astype(complex)
     for at in range(0, len(u), _BLOCK_SAMPLES):
         modes = (inverse_modes @ B) @ u[at : at + _BLOCK_SAMPLES].T.astype(complex)
@@ -171,6 +173,7 @@ def _linear_recursion(A: Array, B: Array, u: Array, start: Array) -> Array:
             mode[:] = lfilter([1.0], [1.0, -value], mode, zi=[value * state[i]])[0]
         out[at + 1 : at + 1 + modes.shape[1]] = np.real(V @ modes).T
         state = modes[:, -1]
+        release_pages()
     return out
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from crane.common.errors import InputError, RecordingError, check_name
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, as_number
+from crane.common.scratch_arrays import empty_array, release_pages
 from crane.identification.signals.kalman_smoother import kalman_smooth
 
 Progress = Callable[[float], None]
@@ -103,12 +104,14 @@ def differentiate(
         v = np.gradient(filtered, step, axis=0, edge_order=2)
         a = np.gradient(v, step, axis=0, edge_order=2)
         return Derivatives(filtered, v, a, passband=np.full(q.shape[1], float(cutoff)))
-    position, v, a, std_v, std_a = (np.empty(q.shape) for _ in range(5))
+    position, v, a, std_v, std_a = (empty_array(*q.shape) for _ in range(5))
     noise, half = np.empty((2, q.shape[1]))
     for i, column in enumerate(q.T):
         states, std, noise[i], half[i] = kalman_smooth(column, step)
         position[:, i], v[:, i], a[:, i] = states.T
         std_v[:, i], std_a[:, i] = std.T[1:]
+        del states, std
+        release_pages()
         if progress is not None:
             progress((i + 1) / q.shape[1])
     return Derivatives(position, v, a, std_v, std_a, noise, half)

@@ -7,6 +7,7 @@ import numpy as np
 
 from crane.common.errors import InputError, RecordingError
 from crane.common.samples import Array, as_number
+from crane.common.scratch_arrays import BLOCK_SIZE
 from crane.identification.signals.signal_processing import low_pass, sampling_step
 
 _SEGMENT_COUNT = 8
@@ -19,6 +20,7 @@ _MAX_RUN = 4  # samples from the first to the last outlier of a group
 _NOISE_FACTOR = 8.0  # robust standard deviations between an outlier and its neighbours
 _STEP_FACTOR = 4.0  # times the largest step between the neighbours, likewise
 _NEIGHBOUR_COUNT = 3  # neighbours on either side
+_RUN_REACH = _NEIGHBOUR_COUNT + _MAX_RUN  # samples from one that is tested to those it needs
 # standard deviation over median absolute deviation of normal noise
 _MAD_TO_STD = 1.482602218505602
 _MAX_CHANGE = 0.02  # largest change relative to the range of a signal
@@ -34,14 +36,18 @@ def spectral_edge_frequency(x: Array, step: float, share: float = 0.995) -> floa
         step: Step between samples [s].
         share: Share of the power below it, 0 to 1.
     """
-    from scipy.signal import periodogram
-
     edges = []
-    for column in x.T[np.ptp(x, axis=0) > 0]:
-        frequency, power = periodogram(column / max(column.std(), 1e-300), 1 / step, window="hann")
+    for column in filter(np.ptp, x.T):
+        windowed = column - column.mean()
+        windowed /= max(column.std(), 1e-300)
+        phase = np.linspace(0.0, 2 * np.pi, len(column), endpoint=False)
+        windowed *= 1.0 - np.cos(phase, out=phase)  # window of Hann
+        power = np.abs(np.fft.rfft(windowed))
+        power *= power
+        power[1 : (len(column) + 1) // 2] *= 2.0  # those of negative frequencies
         whole = np.cumsum(power, out=power)
-        edges.append(float(frequency[max(1, np.searchsorted(whole, share * whole[-1]))]))
-    return max(edges, default=1 / (len(x) * step))
+        edges.append(max(1, np.searchsorted(whole, share * whole[-1])) / (len(column) * step))
+    return float(max(edges, default=1 / (len(x) * step)))
 
 
 def strongest_spectral_line(
@@ -109,8 +115,11 @@ def outlier_mask(x: Array) -> np.ndarray:
         noise = max(noise, float(np.median(steps[steps > 0])))
     while True:  # outliers masked by others appear after these are replaced
         bridged, before = replace_outliers(x, found), found.sum()
-        for length in range(1, _MAX_RUN + 1):
-            found |= _outlier_runs(bridged, length, noise)
+        for start in range(0, len(x), BLOCK_SIZE):
+            first, end = max(0, start - _RUN_REACH), start + BLOCK_SIZE
+            for length in range(1, _MAX_RUN + 1):
+                runs = _outlier_runs(bridged[first : end + _RUN_REACH], length, noise)
+                found[start:end] |= runs[start - first : end - first]
         if found.sum() == before:
             return found
 
@@ -127,7 +136,8 @@ def replace_outliers(x: Array, mask: np.ndarray) -> Array:
 
 def _outlier_runs(x: Array, length: int, noise: float) -> np.ndarray:
     """Mask of outliers in runs of a length whose both ends are outliers."""
-    count = len(x) - length - 2 * _NEIGHBOUR_COUNT + 1  # runs start at _NEIGHBOUR_COUNT + i
+    # runs start at _NEIGHBOUR_COUNT + i
+    count = max(0, len(x) - length - 2 * _NEIGHBOUR_COUNT + 1)
     steps = np.abs(np.diff(x))
     before, after = x[_NEIGHBOUR_COUNT - 1 :][:count], x[_NEIGHBOUR_COUNT + length :][:count]
     largest = np.abs(after - before)

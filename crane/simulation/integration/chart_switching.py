@@ -148,8 +148,8 @@ class ChartSwitchingIntegrator:
                 raise IntegrationHaltError(
                     time,
                     at.q[chart.user_columns],
-                    f": {names} {'come' if len(left) > 1 else 'comes'} to a dead centre, where "
-                    "inverse dynamics has no answer",
+                    f": {'joints' if len(left) > 1 else 'joint'} {names} at a dead centre, where "
+                    "inverse dynamics is undefined",
                     ": keep the reference away from there, or drive other joints",
                 )
             return False

@@ -154,7 +154,8 @@ class ErrorControlledStepper(MachineCodeStepper):
         out = np.empty((min(max_rows, len(rows)), rows.shape[1]))
         while done < len(rows) or offset < 0:
             count = min(max_rows, len(rows) - done)
-            now, segment_start, segment_end = first + step * done, offset, count * step
+            now, segment_start = first + step * done, offset
+            segment_end = min(count * step, segment_start + _MAX_REFERENCE_PAIRS * pair)
             next_time = now + segment_start + _TIME_TOLERANCE * step
             time_to_break = self._break_times[np.searchsorted(self._break_times, next_time)] - now
             if isinstance(self._control, ValveDrive) and self._control.period:

@@ -237,7 +237,7 @@ def sensitivities(
 
     Raises:
         InputError: Unknown names, a machine that floats, or one without formulas.
-        SimulationError: The motion comes to a dead centre; else as `simulate`.
+        SimulationError: The motion reaches a dead centre; else as `simulate`.
     """
     if not parameters:
         raise InputError("no number is named, give `by` such as ['payload.mass']")

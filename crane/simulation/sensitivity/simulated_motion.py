@@ -127,7 +127,7 @@ class SimulatedMotion:
 
     Raises:
         InputError: The machine has no formulas or a floating base.
-        SimulationError: The motion comes to a dead centre; else as `simulate`.
+        SimulationError: The motion reaches a dead centre; else as `simulate`.
     """
 
     def __init__(

@@ -22,12 +22,15 @@ from crane.studies.optimization.design_problem import (
     DesignJob,
     DesignProblem,
     DesignSolution,
+    kept_solutions,
+    solution_columns,
     solve_design_job,
 )
 from crane.studies.optimization.measure_expressions import (
     MeasureExpression,
     MeasureFunction,
     load_user_measures,
+    measure_source,
     parse_requirement,
     transferable_measures,
 )
@@ -37,7 +40,12 @@ from crane.studies.optimization.variant_measures import (
     check_unique_names,
     load_positions,
 )
-from crane.studies.parallel_jobs import check_process_count, compute_jobs, machine_from_files
+from crane.studies.parallel_jobs import (
+    StoredResults,
+    check_process_count,
+    compute_jobs,
+    machine_from_files,
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -136,9 +144,10 @@ class Design(Result):
         Raises:
             OutputError: The file cannot be written.
         """
-        units = {name: "1" for name in self.parameter_names}
-        units |= {f"goal_{i}": "1" for i in range(len(self.objectives))}
-        units |= {f"slack_{i}": "1" for i in range(len(self.requirements))} | {"fits": "1"}
+        columns = solution_columns(
+            self.parameter_names, len(self.objectives), len(self.requirements)
+        )
+        units = dict.fromkeys(columns, "1")
         rows = [
             [*x.values, *x.objectives, *x.slacks, float(x.is_feasible)] for x in self.solutions
         ]
@@ -164,6 +173,7 @@ def design(
     seed: int = 0,
     processes: int = 1,
     scheduler: str | None = None,
+    checkpoint: str | Path | None = None,
     progress: Any = None,
 ) -> Design:
     """Find the parameters of a machine that are best for measures of it.
@@ -193,11 +203,15 @@ def design(
         seed: Seed of the starts.
         processes: Number of processes.
         scheduler: Address of a Dask scheduler whose workers compute instead.
+        checkpoint: File to which the solution of each search is appended, with the objectives as
+            they are minimized; those in it are not searched again, as in `crane.study`.
         progress: Function that is called with the finished share, 0 to 1.
 
     Raises:
-        InputError: A name is unknown, there is no objective, a range is empty, or no solution
-            satisfies the requirements.
+        InputError: A name is unknown, there is no objective, a range is empty, no solution
+            satisfies the requirements, or the checkpoint is of another optimization.
+        LostWorkError: Processes or the scheduler ended before their time.
+        OutputError: The checkpoint cannot be written.
     """
     progress = progress_reporter(progress)
     base_machine, name = machine_from_files(machine)
@@ -219,28 +233,30 @@ def design(
     is_multi_objective = len(objectives) > 1
     total = starts * len(objectives) + (points if is_multi_objective else 0)
 
-    def solve_jobs(jobs: Sequence[DesignJob], finished: int) -> list[DesignSolution]:
+    def solve_jobs(
+        jobs: Sequence[DesignJob], finished: int, kept: StoredResults[DesignSolution] | None
+    ) -> list[DesignSolution]:
         return compute_jobs(
             solve_design_job, jobs, processes, scheduler,
             lambda done: progress and progress((finished + done) / total),
+            kept and replace(kept, keys=[(str(finished + i),) for i in range(len(jobs))]),
         )  # fmt: skip
 
-    solutions = solve_jobs(
-        [
-            base_job._replace(initial_values=start, objectives=(text,))
-            for text in base_job.objectives
-            for start in initial_points[:starts]
-        ],
-        0,
-    )
-    if is_multi_objective:
-        points = as_count(points, "the number of points", 2, 1000)
-        front_jobs = _pareto_front_jobs(base_job, solutions, points)
-        problem, finished = DesignProblem(base_job), len(solutions)
-        solutions = [
-            problem.with_all_objectives(x) for x in (*solutions, *solve_jobs(front_jobs, finished))
-        ]
-    _check_feasible(solutions, require)
+    single_jobs = [
+        base_job._replace(initial_values=start, objectives=(text,))
+        for text in base_job.objectives
+        for start in initial_points[:starts]
+    ]
+    settings = base_job, initial_points, points, measure_source(measures)
+    with kept_solutions(checkpoint, base_machine, base_job, settings) as kept:
+        solutions = solve_jobs(single_jobs, 0, kept)
+        if is_multi_objective:
+            points = as_count(points, "the number of points", 2, 1000)
+            front_jobs = _pareto_front_jobs(base_job, solutions, points)
+            problem, finished = DesignProblem(base_job), len(solutions)
+            front = solve_jobs(front_jobs, finished, kept)
+            solutions = [problem.with_all_objectives(x) for x in (*solutions, *front)]
+        _check_feasible(solutions, require)
     if is_multi_objective:
         solutions = _nondominated([x for x in solutions if x.is_feasible])
     else:

@@ -1,18 +1,22 @@
 """One search of a design optimization: its problem and its solution by SLSQP."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
 from scipy.optimize import minimize
 
+from crane.common.checkpoint import Checkpoint
 from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.formats.machine_loading import MachineVariants, load
+from crane.machine.machine import Machine
 from crane.studies.optimization.measure_expressions import (
     DualNumber,
     MeasureExpression,
@@ -23,6 +27,7 @@ from crane.studies.optimization.variant_measures import (
     VariantEvaluation,
     load_positions,
 )
+from crane.studies.parallel_jobs import StoredResults
 
 _OBJECTIVE_TOLERANCE = 1e-10  # of an objective, as a share of its scale
 _MAX_ITERATIONS = 200
@@ -171,6 +176,58 @@ class DesignProblem:
             max(abs(x.value), float(np.abs(x.derivatives * ranges).max(initial=0.0)), smallest)
             for x in duals
         ]
+
+
+def solution_columns(
+    parameter_names: Sequence[str], objective_count: int, requirement_count: int
+) -> list[str]:
+    """Return the columns of solutions in a table."""
+    goals = (f"goal_{i}" for i in range(objective_count))
+    return [*parameter_names, *goals, *(f"slack_{i}" for i in range(requirement_count)), "fits"]
+
+
+@contextmanager
+def kept_solutions(
+    checkpoint: str | Path | None, machine: Machine, job: DesignJob, settings: tuple[object, ...]
+) -> Iterator[StoredResults[DesignSolution] | None]:
+    """Context of the solutions in a checkpoint, if there is one, without the keys of jobs.
+
+    Args:
+        checkpoint: The checkpoint.
+        machine: The machine.
+        job: Job with all objectives; jobs with one objective leave cells empty.
+        settings: All that the solutions depend on besides the machine.
+    """
+    if checkpoint is None:
+        yield None
+        return
+    sizes = len(job.lower), len(job.objectives), len(job.requirements), 1, len(job.lower), 1
+    ends = np.cumsum(sizes).tolist()
+
+    def to_cells(x: DesignSolution) -> list[object]:
+        unknown = [""] * (len(job.objectives) - len(x.objectives))
+        numbers = (x.values, x.objectives, unknown, x.slacks, [x.is_feasible], x.initial_values)
+        return [*(y if y == "" else repr(float(y)) for part in numbers for y in part), x.message]
+
+    def from_cells(cells: list[str]) -> DesignSolution:
+        parts = [cells[end - size : end] for size, end in zip(sizes, ends, strict=True)]
+        values, objectives, slacks, (is_feasible,), initial_values = (
+            np.array([float(x) for x in part if x]) for part in parts[:-1]
+        )
+        (message,) = parts[-1]
+        return DesignSolution(
+            initial_values, values, objectives, slacks, bool(is_feasible), message
+        )
+
+    starts = [f"start {name}" for name in job.parameter_names]
+    columns = solution_columns(job.parameter_names, len(job.objectives), len(job.requirements))
+    with Checkpoint(
+        checkpoint,
+        {"machine data": MachineVariants(machine).spec, "settings": settings},
+        ["search", *columns, *starts, "termination"],
+        1,
+    ) as table:
+        yield StoredResults(table, (), to_cells, from_cells)
 
 
 def solve_design_job(job: DesignJob) -> DesignSolution:

@@ -302,6 +302,15 @@ def transferable_measures(
     return source if source is None or isinstance(source, Mapping) else str(Path(source).resolve())
 
 
+def measure_source(
+    source: str | Path | Mapping[str, MeasureFunction] | None,
+) -> str | Mapping[str, MeasureFunction]:
+    """Return what determines measures: their functions, or the text of the file."""
+    if isinstance(source, Mapping):
+        return source
+    return "" if source is None else Path(source).read_text(encoding="utf-8", errors="replace")
+
+
 def evaluate_user_measure(name: str, function: MeasureFunction, machine: Machine) -> float:
     """Return the value of a user's function for a machine.
 

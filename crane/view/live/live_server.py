@@ -1,8 +1,11 @@
 """Server of a live view, and the guard of its requests."""
 
+import asyncio
 import hmac
 import io
 import ipaddress
+import logging
+import os
 import secrets
 import signal
 import socket
@@ -57,10 +60,14 @@ class AccessGuard:
         """
         if len(hosts) != 1 or not self._is_known_host(hosts[0]):
             return None
-        if any(urlsplit(origin).netloc.lower() != hosts[0].lower() for origin in origins):
+        try:
+            if any(urlsplit(origin).netloc.lower() != hosts[0].lower() for origin in origins):
+                return None
+        except ValueError:  # no address
             return None
         path_token, slash, inner_path = path.partition("?")[0].removeprefix("/").partition("/")
-        if not hmac.compare_digest(path_token.encode(), self.token.encode()):
+        # a path may hold any bytes
+        if not hmac.compare_digest(os.fsencode(path_token), self.token.encode()):
             return None
         return "/" + inner_path
 
@@ -76,7 +83,10 @@ class AccessGuard:
 
     @contextmanager
     def guard_servers(self) -> Iterator[None]:
-        """Guard HTTP and websocket requests of servers that viser starts in this context."""
+        """Guard HTTP and websocket requests of servers that viser starts in this context.
+
+        What cannot be read, of anybody, is dropped without a word.
+        """
         from websockets.asyncio import server
 
         serve: Any = server.serve
@@ -92,6 +102,8 @@ class AccessGuard:
                 request.path = path
                 return process_request(connection, request)
 
+            asyncio.get_running_loop().set_exception_handler(lambda *_: None)
+            options["logger"] = logging.Logger("crane.live", logging.CRITICAL + 1)
             return serve(*arguments, process_request=check_request, **options)
 
         server.serve = guarded_serve  # type: ignore[assignment, misc]

@@ -78,7 +78,7 @@ def write_page(path: str | Path, text: str) -> Path:
         OutputError: The file cannot be written.
     """
     with replace_file(path) as part:
-        part.write_text(text, encoding="utf-8")
+        part.write_text(text, encoding="utf-8", errors="backslashreplace")
     return Path(path)
 
 

@@ -279,7 +279,7 @@ def summarize_run(machine: Machine, recording: Recording | None) -> dict[str, An
         if _format_number(change) != "0":
             facts.append((text, _format_quantity(change, "J")))
     if count > 1 and summary.balance_text:
-        facts.append(("energy balance", summary.balance_text.replace("-", "\u2212")))
+        facts.append(("maximum energy imbalance", summary.balance_text.replace("-", "\u2212")))
     if summary.tip_rms_error is not None and summary.tip_peak_error is not None:
         peak, rms = 1e3 * summary.tip_peak_error, 1e3 * summary.tip_rms_error
         facts.append(("tip to reference", f"{rms:.3g} mm RMS, {peak:.3g} mm peak"))
