@@ -90,7 +90,7 @@ def test_load_sensing_without_damping_rings_and_is_told(tmp_path):
     peak = np.fft.rfftfreq(16 * len(left), 1e-3)[lines.argmax()]
     assert largest.frequency == pytest.approx(peak, rel=0.06) and 10 < peak < 15
     assert largest.amplitude == pytest.approx(np.ptp(left) / 2, rel=0.25) and np.ptp(left) > 3e6
-    assert "pressures ring" in summarize(run).to_markdown()
+    assert "sustained pressure oscillation (limit cycle)" in summarize(run).to_markdown()
     report = crane.check(machine.path)
     (told,) = [one.message for one in report.findings if "'sensing'" in one.message]
     assert "0 to 39 Hz" in told and "0.08 or more" in told and report.status == 1

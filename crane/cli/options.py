@@ -56,7 +56,11 @@ Frame = Annotated[
 ]
 Bandwidth = Annotated[
     float | None,
-    number_option("Hz", "Passband of the filter; derived from the motion by default."),
+    number_option(
+        "Hz",
+        "Cutoff of the low-pass on both sides of the equations; derived from the motion by "
+        "default.",
+    ),
 ]
 CentreOfMass = Annotated[
     str | None,
@@ -308,7 +312,7 @@ class ShiftedRecordingOptions(RecordingOptions):
         list[str] | None,
         typer.Option(
             metavar="COLUMN=SECONDS",
-            help="Delay of a column that is taken out, negative if it is ahead of the others, "
+            help="Delay of a column, which is corrected; negative if it is ahead of the others, "
             "e.g. *_force=0.03; may be repeated.",
         ),
     ] = None

@@ -12,7 +12,7 @@ from crane.description.sensors import VELOCITY_SUFFIX
 from crane.recordings.recording import REFERENCE_PREFIX, Recording
 
 _MIN_PERIODS = 8  # least number of periods
-_MIN_DECAY_RATIO = 0.85  # of swings eight periods apart: a damping ratio below 0.003
+_MIN_DECAY_RATIO = 0.85  # of swings eight periods apart: a damping ratio below 0.0032
 _MIN_TIME_SHARE = 0.5  # of the time without a change of command, least duration
 _MAX_WIDTH = 2.5  # periods, width of moving means
 _ORDERS = (1, 2, 3)  # periods after which a cycle repeats: some double or triple their period
@@ -151,7 +151,7 @@ def limit_cycle_message(recording: Recording) -> str:
     ]
     more = f" and {len(cycles) - _MAX_LISTED} more" if len(cycles) > _MAX_LISTED else ""
     return (
-        f"pressures ring without decaying, a limit cycle that the peak forces contain: "
+        "sustained pressure oscillation (limit cycle), included in the peak forces: "
         f"{', '.join(words)}{more}"
     )
 
