@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import crane
 from crane import CraneWarning
+from crane.identification.mechanics.smoothed_motion import smoothed_motion
 
 ROD = """<robot name="r"><link name="ground"/>
 <link name="arm"><inertial><origin xyz="0.5 0 0"/><mass value="4"/>
@@ -412,3 +413,17 @@ def test_recordings_have_quaternions_or_rotation_vectors(tmp_path):
     (tmp_path / "short.csv").write_text("\n".join(short) + "\n")
     with pytest.raises(crane.CraneError, match="'b_qw' to 'b_qz' have the length .* at sample 1"):
         crane.recordings.read_measured(machine, tmp_path / "short.csv")
+
+
+@pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+def test_a_rod_on_a_ball_is_identified_from_rotations(tmp_path):
+    """Angular accelerations from recorded rotations explain the forces of the falling rod."""
+    machine = load(tmp_path, ROD)
+    run = crane.simulate(machine, None, ([0.0, 1.0, 2.0, 0.3], [0.0, 1.0, -2.0, 5.0]), 3.0, 1e-3)
+    assert np.linalg.norm(run.q[:, 1:], axis=1).max() > 0.98 * np.pi
+    motion = smoothed_motion(machine, run, derivatives="lowpass", cutoff=60.0, trust=True)
+    middle = slice(300, -300)
+    np.testing.assert_allclose(motion.v[middle], run.v[middle], atol=2e-3 * np.abs(run.v).max())
+    forces = crane.Dynamics(machine).inverse(run.q[middle], motion.v[middle], motion.a[middle])
+    weight = np.abs(crane.Dynamics(machine).gravity(run.q)).max()
+    assert np.abs(forces).max() < 0.02 * weight  # nothing drives it

@@ -340,8 +340,7 @@ def payload(
     """Estimate mass and centre of mass of the payload."""
     message = f"--centre is '{centre}', write X,Y,Z in m, as 0.2,0,0"
     com = None if centre is None else parse_numbers(centre.split(","), message, ("m",))
-    loaded = options.load(machine)
-    (carried,) = _read([recording], loaded, reading)
+    (carried,) = _read([recording], loaded := options.load(machine), reading)
     with progress_bar("estimating") as progress:
         estimate = crane.identification.identify_payload(
             loaded, carried, frame, method, trust=trust, progress=progress, com=com

@@ -45,7 +45,8 @@ def unwrap_angles(machine: Machine, time: Array, columns: Mapping[str, Array]) -
     """
     coordinates = machine.coordinates
     is_endless = np.isinf(coordinates.lower) & np.isinf(coordinates.upper)
-    endless = np.array(coordinates.names)[is_endless & ~coordinates.is_translation].tolist()
+    is_angle = ~coordinates.is_translation & ~coordinates.is_rotation_vector
+    endless = np.array(coordinates.names)[is_endless & is_angle].tolist()
     found, messages = {}, []
     for joint in endless:
         for name in (joint, REFERENCE_PREFIX + joint):

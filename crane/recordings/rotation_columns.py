@@ -1,6 +1,7 @@
 """Rotations of ball joints and floating bases in recordings: quaternions, body rates, angles."""
 
 import numpy as np
+import pinocchio as pin
 
 from crane.common.errors import RecordingError
 from crane.common.samples import Array
@@ -70,3 +71,34 @@ def body_rates(vectors: Array, time: Array) -> Array:
     back = (rotations[before].inv() * rotations).as_rotvec()
     forward = (rotations.inv() * rotations[after]).as_rotvec()
     return np.asarray((back + forward) / (time[after] - time[before])[:, None])
+
+
+def continuous_rotations(vectors: Array) -> Array:
+    """Return rotation vectors (N, 3) [rad] of the same rotations that change continuously.
+
+    They may be longer than pi.
+    """
+    out, turn = vectors.copy(), 2 * np.pi
+    for i in range(1, len(out)):
+        length = float(np.linalg.norm(out[i]))
+        axis = out[i] / length if length else out[i - 1] / max(np.linalg.norm(out[i - 1]), 1e-300)
+        out[i] += axis * turn * np.round((axis @ out[i - 1] - length) / turn)
+    return out
+
+
+def body_motion(vectors: Array, rates: Array, accelerations: Array) -> tuple[Array, Array]:
+    """Return angular velocities and accelerations (N, 3) about the axes of the child.
+
+    w = J(r) r', w' = J(r) r'' + (dJ/dt) r' with the right Jacobian J of the exponential map.
+
+    Args:
+        vectors: (N, 3) rotation vectors r [rad], continuous.
+        rates: (N, 3) their derivatives r' [rad/s].
+        accelerations: (N, 3) r'' [rad/s2].
+    """
+    velocity, acceleration, step = np.empty_like(rates), np.empty_like(rates), 1e-5
+    for i, (r, rate, second) in enumerate(zip(vectors, rates, accelerations, strict=True)):
+        jacobian = pin.Jexp3(r)
+        change = (pin.Jexp3(r + step * rate) - pin.Jexp3(r - step * rate)) / (2 * step)
+        velocity[i], acceleration[i] = jacobian @ rate, jacobian @ second + change @ rate
+    return velocity, acceleration

@@ -31,6 +31,7 @@ from crane.machine.machine import Machine
 from crane.recordings.angle_unwrapping import unwrap_angles
 from crane.recordings.measured_recordings import locked_joint_conflicts
 from crane.recordings.recording import FORCE_SUFFIX, VELOCITY_SUFFIX, VELOCITY_UNITS, Recording
+from crane.recordings.rotation_columns import body_motion, continuous_rotations
 from crane.recordings.timeseries import time_derivative
 
 _MOTION_FACTOR = 3.0  # standard deviations of a velocity, above which a joint moves
@@ -83,6 +84,9 @@ def smoothed_motion(
     time, n = recording.time, len(machine.active)
     names = [x + suffix for suffix in ("", FORCE_SUFFIX) for x in machine.active]
     columns = stack_columns([*recording.q.T, *recording.tau.T], 2 * n)
+    rotations = _active_rotations(machine)
+    for part in rotations:
+        columns[:, part] = continuous_rotations(columns[:, part])
     columns = remove_outliers(time, names, columns, trust)
     recorded = None
     if np.any(recording.v):  # for comparison only, without outliers
@@ -92,6 +96,8 @@ def smoothed_motion(
             for q, v in zip(recording.q.T, recording.v.T, strict=True)
         ]
         recorded[:, is_derived] = np.nan  # no column of the file
+        for part in rotations:  # angular velocities are no derivatives of coordinates
+            recorded[:, part] = np.nan
     limits = np.column_stack([machine.lower, machine.upper])
     check_recording(
         time,
@@ -118,6 +124,8 @@ def smoothed_motion(
         is_moving = np.array([x.std() for x in v.T]) > _MOTION_FACTOR * deviations
     is_noisy = ~is_moving & v.any(axis=0)
     v[:, ~is_moving] = a[:, ~is_moving] = 0.0
+    for part in rotations:
+        v[:, part], a[:, part] = body_motion(found.q[:, part], v[:, part], a[:, part])
     release_pages()
     _check_speeds(machine, v, trust)
     # static friction makes any force
@@ -149,8 +157,8 @@ def _select_active_joints(
     for joint in unwrapped.keys() & set(machine.active):
         name, jumps = joint + VELOCITY_SUFFIX, recorded_columns[joint] - unwrapped[joint]
         near = np.convolve(np.abs(np.diff(jumps, prepend=jumps[0])) > 1, np.ones(5), "same") > 0
-        rate = time_derivative(unwrapped[joint], recording.time)
-        recorded_columns[name] = np.where(near, rate, recorded_columns.get(name, rate))
+        derivative = time_derivative(unwrapped[joint], recording.time)
+        recorded_columns[name] = np.where(near, derivative, recorded_columns.get(name, derivative))
     recorded_columns |= unwrapped
     available = {*recording.joints, *(x for x in machine.free if x in recorded_columns)}
     missing = [joint for joint in machine.active if joint not in available]
@@ -184,6 +192,26 @@ def _select_active_joints(
         free=machine.free,
         copy=False,
     )
+
+
+def _active_rotations(machine: Machine) -> list[slice]:
+    """Places of the rotation vectors among the active joints.
+
+    Raises:
+        RecordingError: A rotation vector is active in part, whose rates are no derivatives.
+    """
+    found = []
+    for column in machine.coordinates.rotation_columns:
+        places = np.flatnonzero(np.isin(machine.closure.active, range(column, column + 3)))
+        if len(places) in (1, 2):
+            joint = machine.active[int(places[0])]
+            raise RecordingError(
+                f"'{joint}' is a part of a rotation vector, whose angular velocity recordings do "
+                "not determine alone: lock it, or choose active joints without it"
+            )
+        if len(places):
+            found.append(slice(int(places[0]), int(places[0]) + 3))
+    return found
 
 
 def _check_speeds(machine: Machine, v: Array, trust: bool) -> None:
