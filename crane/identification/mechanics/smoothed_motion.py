@@ -149,8 +149,8 @@ def _select_active_joints(
     for joint in unwrapped.keys() & set(machine.active):
         name, jumps = joint + VELOCITY_SUFFIX, recorded_columns[joint] - unwrapped[joint]
         near = np.convolve(np.abs(np.diff(jumps, prepend=jumps[0])) > 1, np.ones(5), "same") > 0
-        rate = time_derivative(unwrapped[joint], recording.time)
-        recorded_columns[name] = np.where(near, rate, recorded_columns.get(name, rate))
+        derivative = time_derivative(unwrapped[joint], recording.time)
+        recorded_columns[name] = np.where(near, derivative, recorded_columns.get(name, derivative))
     recorded_columns |= unwrapped
     available = {*recording.joints, *(x for x in machine.free if x in recorded_columns)}
     missing = [joint for joint in machine.active if joint not in available]
