@@ -82,10 +82,7 @@ Rule = Annotated[
 ]
 Outputs = Annotated[
     str | None,
-    typer.Option(
-        metavar="NAMES",
-        help="Outputs, e.g. X_lift,tip_z,pressure_X_lift_a; joints and pressures by default.",
-    ),
+    typer.Option(metavar="NAMES", help="Outputs, e.g. X_lift,tip_z; default: joints, pressures."),
 ]
 ComparedColumns = Annotated[
     str | None,

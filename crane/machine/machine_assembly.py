@@ -277,6 +277,8 @@ def _add_composite_joint(
     placement = parent_frame.placement * se3_from_xyz_rpy(joints[0].xyz, joints[0].rpy)
     kind = pin.JointModelFreeFlyer if len(series) > ROTATION_COUNT else pin.JointModelSpherical
     index = model.addJoint(parent_frame.parentJoint, kind(), placement, name)
+    for limits in (model.effortLimit, model.velocityLimit):
+        limits[model.joints[index].idx_v :] = np.inf  # Pinocchio's default is the largest number
     model.addJointFrame(index, frames[joints[0].parent])
     last = joints[-1].child
     model.appendBodyToJoint(
