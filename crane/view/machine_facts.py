@@ -173,7 +173,7 @@ def _circuit_fact(machine: Machine) -> Iterator[MachineFact]:
         is_cylinder = machine.unit(joint) == "m"
         unit, size = ("cm2", 1e4) if is_cylinder else ("cm3/rad", 1e6)
         areas = f"A {size * cylinder.area_a:.4g}, B {size * cylinder.area_b:.4g} {unit}"
-        owner = "cylinder areas" if is_cylinder else "motor displacements"
+        owner = "cylinder areas" if is_cylinder else "displacements"
         rows.append((joint, f"{kind} valve{spool_text}", f"{owner} {areas}"))
     yield MachineFact(
         "hydraulics", f"pump {1e-5 * supply.pressure:.4g} bar{flow}", ("", "", ""), tuple(rows)
