@@ -504,10 +504,10 @@ MECHANISM = [
         [
             "mini_forwarder.yaml:{line of - {name: A1}: error: loop 'A1_eye' cannot be "
             "closed from the home "
-            "guess (q1 = 0, X1 = 0.0221, X2 = 0.0108): its smallest gap is 100 mm and 0 deg, "
+            "guess (q1 = 0, X1 = 0.0221, X2 = 0.0108): its smallest gap is 100 mm, "
             "correct the frames or the guess",
             "mini_forwarder.yaml:{line of - {name: K}: error: loop 'K' stays open,"
-            " too: its smallest gap is 50 mm and 0 deg",
+            " too: its smallest gap is 50 mm",
         ],
         swap('<origin xyz="0.0825 0 0"/>', '<origin xyz="0.0825 0 0.1"/>', CHAIN_B1),
         swap('<origin xyz="0.0431 0 0"/>', '<origin xyz="0.0431 0 0.05"/>', CHAIN_B2),

@@ -46,7 +46,7 @@ def test_what_neither_prior_nor_motion_tells_is_named(four_bar, one_way):
         identify(four_bar, one_way, prior=(IdentificationModel(four_bar).nominal, bodies))
     assert str(caught.value) == (
         "there is no finite prior of crank.coulomb, crank.coulomb_offset, crank.viscous, "
-        "crank.viscous_offset, and this turning does not determine them separately: move the "
+        "crank.viscous_offset, and this motion does not determine them separately: move the "
         "joints both ways and at several speeds, give prior=(means, deviations) with finite "
         "ones for them, or omit the prior to estimate base parameters"
     )

@@ -113,7 +113,9 @@ def _loop_gaps(spec: MachineSpec, model: pin.Model, initial_guess: Array) -> dic
             metres = length * equations.characteristic_length
             length_text = f"{metres:.3g} m" if metres >= 1 else f"{1e3 * metres:.3g} mm"
             angle_text = f"{np.degrees(np.arcsin(sine)):.3g} deg"
-            gap_texts[f"loop {loop.name}"] = f"{length_text} and {angle_text}"
+            parts = ((length, length_text), (sine, angle_text))
+            open_parts = [text for gap, text in parts if gap > _OPEN_TOLERANCE]
+            gap_texts[f"loop {loop.name}"] = " and ".join(open_parts)
     return gap_texts
 
 
