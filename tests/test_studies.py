@@ -18,6 +18,7 @@ from crane.studies.measures import measure_strokes
 from crane.view.result_files import plot_result
 
 pytestmark = [pytest.mark.filterwarnings("ignore::crane.CraneWarning"), pytest.mark.slow]
+UNITS = lambda name: ("m",)  # noqa: E731 - of any parameter
 PIN = {"link3_G.x": np.linspace(0.08, 0.11, 4), "link3_G.y": [-0.01, 0.0]}
 
 
@@ -204,15 +205,15 @@ def test_hydraulics_change_no_forces_of_a_given_motion(name):
 )
 def test_what_cannot_be_varied(text, draws, message):
     with pytest.raises(InputError) as caught:
-        parse_grids([text]) if draws is None else parse_ranges([text])
+        parse_grids([text], UNITS) if draws is None else parse_ranges([text], UNITS)
     assert message in str(caught.value)
 
 
 def test_ranges():
-    assert parse_grids(["a.x=0:1:3"])["a.x"] == pytest.approx([0, 0.5, 1])
-    assert parse_ranges(["a=-1~2e-1"])["a"] == pytest.approx([-1, 0.2])
+    assert parse_grids(["a.x=0:1:3"], UNITS)["a.x"] == pytest.approx([0, 0.5, 1])
+    assert parse_ranges(["a=-1~2e-1"], UNITS)["a"] == pytest.approx([-1, 0.2])
     with pytest.raises(InputError, match="--vary names 'a' twice, give it once"):
-        parse_grids(["a=0:1:3", "a=0:1:3"])
+        parse_grids(["a=0:1:3", "a=0:1:3"], UNITS)
 
 
 def test_a_cluster_needs_dask_and_a_scheduler(monkeypatch):

@@ -226,6 +226,8 @@ def parse_fits(texts: Sequence[str], units_of: UnitsOf) -> dict[str, object]:
             return None
         start, comma, bounds = text.partition(",")
         words = [start, *(bounds.split("~") if comma else ())]
+        if "~" in start:
+            raise ValueError
         numbers = [_named_number(name, word, units_of) for word in words]
         if len(numbers) == 2:
             raise ValueError

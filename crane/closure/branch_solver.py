@@ -224,7 +224,9 @@ class BranchSolver:
         """Continue from a configuration with machine code for the signs of its determinants."""
         beyond, code = self._beyond.value, self.compiled_closure
         changes = np.sign(self.continuation.determinants(solution))
-        beyond.configuration, beyond.cursor = solution, None
+        # on the branch of home solutions must not depend on earlier ones
+        is_beyond = (changes <= 0).any() or bool(solution.neighbours)
+        beyond.configuration, beyond.cursor = solution if is_beyond else None, None
         if not (changes < 0).any() or not changes.all():
             return
         key = changes.tobytes()

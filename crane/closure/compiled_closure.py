@@ -332,8 +332,10 @@ class CompiledClosure:
             loops.largest_residual(redundant=True) - self._structure.redundancy.tolerance,
         )
         shares = [
-            float(sign) * determinant
-            for sign, determinant in zip(signs, loops.gamma_and_determinants[1], strict=True)
+            float(sign) * self._scale_determinant(block, determinant, kinematics)
+            for block, (sign, determinant) in enumerate(
+                zip(signs, loops.gamma_and_determinants[1], strict=True)
+            )
         ]
         least_determinant = minimum(*shares) if shares else 1.0
         worst = maximum(worst, _MIN_DETERMINANT - least_determinant)
@@ -358,6 +360,22 @@ class CompiledClosure:
                 "gamma": rows,
             },
         )
+
+    def _scale_determinant(
+        self, block: int, determinant: Scalar, kinematics: PositionKinematics
+    ) -> Scalar:
+        """Determinant of a block in characteristic lengths."""
+        rows, columns = self._structure.blocks[block]
+        turns = [self.geometry.is_revolute[i + 1] for i in self._passive_columns[columns]]
+        is_length = self._equations.is_translation[self._structure.independent_rows[rows]]
+        power = int(is_length.sum()) - turns.count(False)
+        inverse_length = kinematics.inverse_characteristic_length
+        for _ in range(abs(power)):
+            if power > 0:
+                determinant = determinant * inverse_length
+            else:
+                determinant = determinant / inverse_length
+        return determinant
 
     def _largest_gamma_entry(self, rows: Sequence[Scalar], inverse_length: Scalar) -> Scalar:
         turns = self.geometry.is_revolute
