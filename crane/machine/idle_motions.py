@@ -51,7 +51,9 @@ def judge_massless_motions(
     at_home = massless_motions_at(model, closure, closure.home).shape[1]
     if at_home > len(held):
         _warn_about_home(spec, model, closure)
-    columns = [closure.equations.coordinates.column(joint.name) for joint in candidates]
+    names = closure.equations.coordinates.names
+    candidates = candidates or [spec.tree.joints[name] for name in names]
+    columns = [names.index(joint.name) for joint in candidates]
     idle: list[tuple[Joint, Link]] = []
     # one held coordinate moves in each
     q, basis = motions[-1] if held else IdleMotion(closure.home, np.eye(0))
