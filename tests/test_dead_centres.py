@@ -121,7 +121,9 @@ def test_parallelograms_stay_such_in_line(tmp_path, count, active):
     angle = singular_linkages.postures(machine, found)[:, machine.column("r0")]
     inertia, lever = (count + 1) / 3 + count, (count + 1) / 2 + count
     wanted = swung(-np.pi / 2, 1.0, 10.0, lambda _: inertia, lever, found.time)
-    np.testing.assert_allclose(angle, wanted, rtol=0, atol=1e-7)
+    # rounding grows at each passage with the number of loops: with 40 the error is 1e-8 to 4e-7
+    # in turn for steps of 0.5 to 2 ms, without an order of convergence
+    np.testing.assert_allclose(angle, wanted, rtol=0, atol=max(1e-7, 1e-8 * count))
     assert np.ptp(angle) > 9 * np.pi
     assert singular_linkages.imbalance(found) < 1e-9
 
