@@ -17,7 +17,7 @@ def shift_columns(recording: Recording, delays: Mapping[str, float]) -> Recordin
 
     Args:
         recording: The recording.
-        delays: Delays [s] by column or pattern, such as {"*_force": 0.03}; negative for columns
+        delays: Delays [s] by column or pattern, such as `{"*_force": 0.03}`; negative for columns
             that are ahead of the others. A rate or force that was computed from another column
             is shifted by its own name.
 
