@@ -21,7 +21,7 @@ from test_studies import workers
 import crane
 from crane.common import checkpoint
 from crane.common.checkpoint import Checkpoint
-from crane.common.errors import CraneWarning, InputError, LostWorkError, OutputError
+from crane.common.errors import CraneWarning, InputError, OutputError, TerminatedWorkerError
 from crane.studies import worker_processes
 from crane.studies.worker_processes import WorkerPool
 
@@ -62,7 +62,7 @@ def test_without_a_row_nothing_is_left(tmp_path):
 
 @pytest.mark.parametrize(
     ("error", "stays"),
-    [(KeyboardInterrupt(), True), (LostWorkError("x"), True), (OutputError("x"), True),
+    [(KeyboardInterrupt(), True), (TerminatedWorkerError("x"), True), (OutputError("x"), True),
      (InputError("x"), False), (RuntimeError(), True)],
 )  # fmt: skip
 def test_what_is_of_no_use_is_removed(tmp_path, error, stays):
@@ -343,7 +343,7 @@ def test_what_ends_a_process_is_told_and_its_job_computed_again(tmp_path):
     jobs = {0: (path, signal.SIGKILL), **dict.fromkeys(range(1, 9), (None, None))}
     pool, found = WorkerPool(dies, jobs, 2), {}
     message = "1 of 9 could not be computed, number 0 first: 3 processes were begun with it"
-    with pytest.raises(LostWorkError, match=message), quiet():
+    with pytest.raises(TerminatedWorkerError, match=message), quiet():
         for index, result in pool.results():
             found[index] = result
     pool.close()
@@ -385,7 +385,10 @@ def test_a_scheduler_that_ends_leaves_what_is_finished(tmp_path):
                     scheduler.kill()
 
             try:
-                with pytest.raises(LostWorkError, match="the scheduler at .* is gone"), quiet():
+                with (
+                    pytest.raises(TerminatedWorkerError, match="the scheduler at .* is gone"),
+                    quiet(),
+                ):
                     crane.study(FOUR_BAR, MASSES, measures=["mass"], scheduler=address,
                                 checkpoint=file, progress=end)  # fmt: skip
             finally:

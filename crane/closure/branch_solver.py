@@ -11,7 +11,7 @@ import numpy as np
 from crane.closure.active_joint_selection import null_space_basis
 from crane.closure.compiled_closure import CompiledClosure, ContinuationCursor
 from crane.closure.constraint_structure import ConstraintStructure
-from crane.closure.continuation_errors import ClosedConfiguration
+from crane.closure.continuation_diagnosis import ClosedConfiguration
 from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
 from crane.closure.newton_continuation import NewtonContinuation
@@ -37,7 +37,7 @@ _MAX_EXTRAPOLATION_ERROR = 0.5
 _MIN_SAMPLES_TO_SORT, _FAR_SAMPLE_DISTANCE = 100, 0.1
 
 
-class _DistantBranchPart:
+class _ChangePointBranch:
     """A branch beyond change points: the last configuration there, and machine code to go on.
 
     Args:
@@ -130,8 +130,8 @@ class BranchSolver:
         return ThreadLocal(self.compiled_closure.new_cursor)
 
     @cached_property
-    def _beyond(self) -> ThreadLocal["_DistantBranchPart"]:
-        return ThreadLocal(lambda: _DistantBranchPart(self.home))
+    def _beyond(self) -> ThreadLocal["_ChangePointBranch"]:
+        return ThreadLocal(lambda: _ChangePointBranch(self.home))
 
     @cached_property
     def _codes_beyond(self) -> dict[bytes, CompiledClosure]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from crane.closure.closure_routines import add_closure_routines
 from crane.closure.constraint_structure import ConstraintStructure
-from crane.closure.continuation_errors import ClosedConfiguration
+from crane.closure.continuation_diagnosis import ClosedConfiguration
 from crane.closure.coordinates import Indices
 from crane.closure.kinematics_formulas import (
     FormulaConstants,

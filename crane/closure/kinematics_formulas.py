@@ -122,6 +122,23 @@ def rotation_vector_derivative(
     )
 
 
+def coordinate_rates(
+    geometry: "TreeGeometry", q: Sequence[Scalar], joint_velocities: Sequence[Scalar]
+) -> list[Scalar]:
+    """Derivatives (nb,) of coordinates (nb,) along joint velocities (nb,).
+
+    They differ for ball joints and floating bases, see `crane.description.rotation_vectors`.
+    """
+    out = list(joint_velocities)
+    for i in geometry.floating_bases:
+        rotation = rotation_matrix(q[i + 2 : i + 5])
+        out[i - 1 : i + 2] = matvec(rotation, out[i - 1 : i + 2])
+    for i in geometry.rotation_bodies:
+        part = slice(i - 1, i + 2)
+        out[part] = rotation_vector_derivative(q[part], out[part])
+    return out
+
+
 def wrap_rotation_vector(vector: Sequence[Scalar]) -> list[Scalar]:
     """The same rotation with a vector of length pi or less, from one shorter than 2 pi."""
     length = _regularized_norm(vector)

@@ -13,8 +13,8 @@ from crane.closure.kinematics_formulas import (
     PositionKinematics,
     SpatialVector,
     Vector,
+    coordinate_rates,
     largest_scaled_value,
-    rotation_vector_derivative,
     spatial_dot,
     subtract_spatial,
 )
@@ -268,12 +268,9 @@ class LoopFormulas:
 
     def coordinate_steps(self, motion: dict[int, Scalar]) -> dict[int, Scalar]:
         """Steps of the coordinates along a small motion of the joints, by joint."""
-        steps = dict(motion)
-        for body in self._kinematics.geometry.rotation_bodies:
-            joints, q = range(body, body + 3), self._kinematics.q[body - 1 : body + 2]
-            turned = rotation_vector_derivative(q, [motion[joint] for joint in joints])
-            steps |= dict(zip(joints, turned, strict=True))
-        return steps
+        geometry, q = self._kinematics.geometry, self._kinematics.q
+        rates = coordinate_rates(geometry, q, [motion[i] for i in range(1, len(q) + 1)])
+        return dict(enumerate(rates, start=1))
 
     def motions_of_coordinates(
         self, joints: Sequence[int], steps: Sequence[Scalar]

@@ -11,11 +11,11 @@ from crane.closure.change_points import (
     is_smooth_passage,
 )
 from crane.closure.constraint_structure import ConstraintStructure
-from crane.closure.continuation_errors import (
+from crane.closure.continuation_diagnosis import (
     CLOSED_TOLERANCE,
     SINGULAR_TOLERANCE,
     ClosedConfiguration,
-    ContinuationErrors,
+    ContinuationDiagnosis,
 )
 from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
@@ -37,7 +37,7 @@ _MIN_PASSAGE = 1e-4  # scaled distance of the two sides of a change point
 _INTERPOLATION_STEP = 1e-2  # scaled distance of the neighbours of a change point
 
 
-class NewtonContinuation(ContinuationErrors):
+class NewtonContinuation(ContinuationDiagnosis):
     """The configurations that are reached from home without passing a singular one.
 
     Args:

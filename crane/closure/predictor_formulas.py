@@ -7,8 +7,8 @@ from crane.closure.coordinates import Indices
 from crane.closure.kinematics_formulas import (
     FormulaConstants,
     TreeGeometry,
+    coordinate_rates,
     largest_scaled_value,
-    rotation_vector_derivative,
     wrap_rotation_vector,
 )
 from crane.codegen import Program, Scalar, Tape
@@ -74,13 +74,12 @@ class PredictorFormulas:
             column = int(self._passive_columns[row])
             gamma.setdefault(column, {})[k] = tape.load(1, self._nq + i)
         change = self._active_motion(q, gamma, change)
-        motion: dict[int, Scalar] = {}
-        for column in range(self._nq):
-            motion[column] = 0.0
-            for k, entry in gamma.get(column, {}).items():
+        motion: list[Scalar] = [0.0] * self._nq
+        for column, entries in gamma.items():
+            for k, entry in entries.items():
                 motion[column] = motion[column] + entry * change[k]
-        moves = [motion[int(column)] for column in self._passive_columns]
-        q = add_vectors(q, self._coordinate_steps(q, motion))
+        moves = [motion[column] for column in self._passive_columns]
+        q = add_vectors(q, coordinate_rates(self._geometry, q, motion))
         for column, value in zip(self._active_columns, target, strict=True):
             q[column] = value
         move = largest_scaled_value(
@@ -107,14 +106,6 @@ class PredictorFormulas:
                     q[part] = wrap_rotation_vector(q[part])
             program.add_formula("wrap", 1, q)
 
-    def _coordinate_steps(self, q: Sequence[Scalar], motion: Mapping[int, Scalar]) -> list[Scalar]:
-        """Steps of the coordinates along a small motion of the joints, by column."""
-        steps = [motion.get(column, 0.0) for column in range(self._nq)]
-        for columns, _ in self._active_rotations:
-            part = slice(columns.start, columns.stop)
-            steps[part] = rotation_vector_derivative(q[part], steps[part])
-        return steps
-
     def _active_motion(
         self,
         q: Sequence[Scalar],
@@ -138,10 +129,10 @@ class PredictorFormulas:
         ]
         if not turning:
             return list(change)
-        rates = [
-            self._coordinate_steps(q, {column: row.get(k, 0.0) for column, row in gamma.items()})
-            for k in range(self._n)
-        ]
+        rates = []
+        for k in range(self._n):
+            column_of_gamma = [gamma.get(i, {}).get(k, 0.0) for i in range(self._nq)]
+            rates.append(coordinate_rates(self._geometry, q, column_of_gamma))
         columns = self._active_columns.tolist()
         right = []
         for j in turning:

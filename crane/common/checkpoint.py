@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 
 import crane
-from crane.common.errors import CraneError, InputError, LostWorkError, OutputError
+from crane.common.errors import CraneError, InputError, OutputError, TerminatedWorkerError
 from crane.common.temporary_files import try_lock
 
-_PASSING_ERRORS = LostWorkError, OutputError  # of this run, not of what is computed
+_PASSING_ERRORS = TerminatedWorkerError, OutputError  # of this run, not of what is computed
 
 
 class Checkpoint:

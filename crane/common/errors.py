@@ -125,8 +125,8 @@ class SimulationError(CraneError):
     recording: Any = None
 
 
-class LostWorkError(CraneError):
-    """Processes of a computation ended before their time; what is finished is kept if asked."""
+class TerminatedWorkerError(CraneError):
+    """Worker processes ended before their time; a checkpoint has what is finished."""
 
 
 class OutputError(CraneError):

@@ -6,8 +6,7 @@ from functools import cached_property
 from crane.closure.kinematics_formulas import (
     SpatialVector,
     Vector,
-    rotation_matrix,
-    rotation_vector_derivative,
+    coordinate_rates,
 )
 from crane.codegen.symbolic import (
     LdltFactorization,
@@ -196,15 +195,7 @@ class InertialForceFormulas(JointForceFormulas):
 
     def coordinate_rates(self, joint_velocities: Sequence[Scalar]) -> Vector:
         """Derivatives of the coordinates (nb,) along joint velocities (nb + 1,)."""
-        out = list(joint_velocities[1:])
-        geometry = self.kinematics.geometry
-        for i in geometry.floating_bases:
-            rotation = rotation_matrix(self.q[i + 2 : i + 5])
-            out[i - 1 : i + 2] = matvec(rotation, out[i - 1 : i + 2])
-        for i in geometry.rotation_bodies:
-            rotation_vector = self.q[i - 1 : i + 2]
-            out[i - 1 : i + 2] = rotation_vector_derivative(rotation_vector, out[i - 1 : i + 2])
-        return out
+        return coordinate_rates(self.kinematics.geometry, self.q, joint_velocities[1:])
 
     @property
     def rate_jacobian(self) -> list[Vector]:

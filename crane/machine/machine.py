@@ -20,7 +20,7 @@ from crane.common.errors import InputError, LimitError, suggest_names
 from crane.common.one_line_repr import OneLineRepr, format_count
 from crane.common.package_search import LoadOptions
 from crane.common.samples import Array, as_samples, read_only_copy
-from crane.common.unit_conversions import KeyPath, WrittenNumber
+from crane.common.unit_conversions import KeyPath, NumberWithUnit
 from crane.description.external_forces import ExternalForce, PhasedWrench
 from crane.description.force_elements import (
     AnyForceElement,
@@ -42,14 +42,14 @@ from crane.description.sensors import Sensor
 from crane.description.specification import Chain, Drive, EstimationSettings, PIGains, Task
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.machine.machine_checks import check_force_elements, check_limited
-from crane.machine.massless_motions import MassProperties
+from crane.machine.massless_motions import IdleMotionProperties
 from crane.machine.payload import Payload
 
 _LIMIT_TOLERANCE = 1e-9  # scaled distance beyond a limit that counts as on it
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Machine(MassProperties, OneLineRepr):
+class Machine(IdleMotionProperties, OneLineRepr):
     """A machine with closed kinematic chains, assembled and closed.
 
     Attributes:
@@ -123,7 +123,7 @@ class Machine(MassProperties, OneLineRepr):
     packages: tuple[str, ...]
     arguments: Mapping[str, str]
     trusts_xacro: bool = False
-    written_numbers: Mapping[KeyPath, WrittenNumber] = field(default_factory=dict)
+    written_numbers: Mapping[KeyPath, NumberWithUnit] = field(default_factory=dict)
 
     def _one_line(self) -> str:
         words = [

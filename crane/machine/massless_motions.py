@@ -209,7 +209,7 @@ def hold_coordinates(mass: Array, held: tuple[int, ...]) -> Array:
     return out
 
 
-class MassProperties:
+class IdleMotionProperties:
     """What the masses of a machine say of its coordinates; base class of `Machine`.
 
     Attributes:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from crane.common.checkpoint import Checkpoint
-from crane.common.errors import CraneWarning, InputError, LostWorkError
+from crane.common.errors import CraneWarning, InputError, TerminatedWorkerError
 from crane.common.optional_libraries import import_optional_library
 from crane.common.samples import as_count
 from crane.formats.machine_loading import load
@@ -38,8 +38,8 @@ def compute_on_cluster(
 
     Raises:
         InputError: Dask is not installed, or the scheduler does not answer.
-        LostWorkError: The scheduler ends, or the workers of some jobs died each time; the other
-            jobs are finished then.
+        TerminatedWorkerError: The scheduler ends, or the workers of some jobs died repeatedly;
+            the other jobs are finished then.
     """
     dask = import_optional_library("distributed", "a scheduler")
     if not re.fullmatch(r"(\w+://)?[^\s/]+:\d+/?", scheduler):
@@ -72,7 +72,7 @@ def compute_on_cluster(
             else:
                 lost.append(indices[future.key])
     if lost:
-        raise LostWorkError(
+        raise TerminatedWorkerError(
             f"{len(lost)} of {len(jobs)} could not be computed: all workers that began number "
             f"{lost[0]} died, see their logs: give them more memory or fewer threads"
         )
@@ -90,7 +90,7 @@ def _check_future(future: Any, scheduler: str) -> None:
             f"the workers cannot run this version of crane ({failure}), install it there"
         )
     if failure is None:
-        raise LostWorkError(f"the scheduler at {scheduler} is gone, start it again")
+        raise TerminatedWorkerError(f"the scheduler at {scheduler} is gone, start it again")
     raise failure
 
 

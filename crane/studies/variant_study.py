@@ -141,7 +141,7 @@ def study(
     Raises:
         InputError: A name is unknown, values are inconsistent, no variant can be measured, the
             machine was changed after it was loaded, or the checkpoint is of another study.
-        LostWorkError: Processes or the scheduler ended before their time.
+        TerminatedWorkerError: Processes or the scheduler ended before their time.
         OutputError: The checkpoint cannot be written.
     """
     progress = progress_reporter(progress)

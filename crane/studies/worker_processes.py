@@ -14,7 +14,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, TypeVar
 
-from crane.common.errors import CraneWarning, InputError, LostWorkError
+from crane.common.errors import CraneWarning, InputError, TerminatedWorkerError
 
 MAX_TRIES = 3  # of a job whose process dies
 _MAX_DEATHS = 10  # of processes in succession while no job is finished
@@ -52,14 +52,15 @@ class WorkerPool(Generic[J, R]):
 
         Raises:
             InputError: The main module cannot be imported.
-            LostWorkError: All processes die, or those of some jobs; the others are finished then.
+            TerminatedWorkerError: All processes die, or those of some jobs; the others are
+                finished then.
         """
         while self._waiting or any(worker.job is not None for worker in self._workers):
             ready = wait([worker.connection for worker in self._workers])
             for worker in [x for x in self._workers if x.connection in ready]:
                 yield from self._take_answer(worker)
         for index, cause in self._lost.items():
-            raise LostWorkError(
+            raise TerminatedWorkerError(
                 f"{len(self._lost)} of {len(self._jobs)} could not be computed, number {index} "
                 f"first: {MAX_TRIES} processes were begun with it, the last was {cause}; take "
                 "fewer processes"
@@ -94,7 +95,7 @@ class WorkerPool(Generic[J, R]):
             )
         cause, self._deaths = _cause_of_death(status), self._deaths + 1
         if self._deaths >= _MAX_DEATHS:
-            raise LostWorkError(
+            raise TerminatedWorkerError(
                 f"{_MAX_DEATHS} processes died in succession, the last was {cause}"
             )
         warnings.warn(

@@ -210,7 +210,7 @@ def design(
     Raises:
         InputError: A name is unknown, there is no objective, a range is empty, no solution
             satisfies the requirements, or the checkpoint is of another optimization.
-        LostWorkError: Processes or the scheduler ended before their time.
+        TerminatedWorkerError: Processes or the scheduler ended before their time.
         OutputError: The checkpoint cannot be written.
     """
     progress = progress_reporter(progress)

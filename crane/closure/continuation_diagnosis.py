@@ -35,8 +35,8 @@ class ClosedConfiguration:
     neighbours: "tuple[ClosedConfiguration, ...]" = ()
 
 
-class ContinuationErrors:
-    """Errors of a continuation, with the loops and active coordinates; its base class."""
+class ContinuationDiagnosis:
+    """Why a continuation cannot go on, as errors; base class of `NewtonContinuation`."""
 
     _equations: LoopEquations
     _structure: ConstraintStructure
