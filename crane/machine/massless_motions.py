@@ -32,17 +32,23 @@ _JOINT_SHARE, _BODY_SHARE = 0.1, 1e-6  # velocities that count, of the largest
 _SAMPLES, _SAMPLE_RANGE = 4, 0.3  # configurations about home, in coordinate units
 
 
+def _tree_mass_matrix(model: pin.Model, closure: Closure, q: Array) -> Array:
+    """M (nv, nv) of the tree."""
+    equations = closure.equations  # creating data is expensive
+    configuration = equations.coordinates.configuration(q)
+    upper = np.triu(pin.crba(model, equations.data, configuration))
+    return np.asarray(upper + np.triu(upper, 1).T)
+
+
 def project_mass_matrix(model: pin.Model, closure: Closure, q: Array, gamma: Array) -> Array:
     """M_A = gamma^T M gamma (n, n) at a closed configuration (nq,)."""
-    configuration = closure.equations.coordinates.configuration(q)
-    upper = np.triu(pin.crba(model, model.createData(), configuration))
-    return np.asarray(gamma.T @ (upper + np.triu(upper, 1).T) @ gamma)
+    return np.asarray(gamma.T @ _tree_mass_matrix(model, closure, q) @ gamma)
 
 
 def extent_inertias(model: pin.Model, closure: Closure, q: Array, gamma: Array) -> Array:
     """S_ii (n,) of the columns of gamma (nv, n) at a closed configuration (nq,)."""
-    extended = _with_masses_at_their_extent(model, closure)
-    return np.diag(project_mass_matrix(extended, closure, q, gamma)).copy()
+    mass = _tree_mass_matrix(_with_masses_at_their_extent(model, closure), closure, q)
+    return np.einsum("ij,ij->j", gamma, mass @ gamma)
 
 
 def _with_masses_at_their_extent(model: pin.Model, closure: Closure) -> pin.Model:
@@ -56,7 +62,7 @@ def _with_masses_at_their_extent(model: pin.Model, closure: Closure) -> pin.Mode
 
 def _moves_no_body(model: pin.Model, closure: Closure, motion: "IdleMotion") -> bool:
     """Whether motions move no inertia of any single body, however large the others are."""
-    extended, data = _with_masses_at_their_extent(model, closure), model.createData()
+    extended, data = _with_masses_at_their_extent(model, closure), closure.equations.data
     pin.computeJointJacobians(model, data, closure.equations.coordinates.configuration(motion.q))
     rates = closure.continuation.gamma(motion.q) @ motion.basis
     twists = [
@@ -80,16 +86,18 @@ def least_inertias(model: pin.Model, closure: Closure) -> Array:
     S_ii is that of the closed chain for active joints, and that of the tree for others, at home
     and a little off it, where loops need not be closed for an order of magnitude.
     """
+    extended = _with_masses_at_their_extent(model, closure)
     home, found = closure.home, []
     step = closure.continuation.gamma(home) @ (_SAMPLE_RANGE * closure.units[closure.active])
     for q in (home, home + step, home - 0.7 * step):
         try:
-            columns = np.hstack([np.eye(model.nv), closure.continuation.gamma(q)])
+            gamma = closure.continuation.gamma(q)
         except ClosureError:
             continue
-        tree, active = np.split(extent_inertias(model, closure, q, columns), [model.nv])
-        tree[closure.active] = active
-        found.append(tree)
+        mass = _tree_mass_matrix(extended, closure, q)
+        inertias = np.diag(mass).copy()
+        inertias[closure.active] = np.einsum("ij,ij->j", gamma, mass @ gamma)
+        found.append(inertias)
     return np.asarray(MIN_INERTIA_SHARE * np.max(found, axis=0))
 
 
