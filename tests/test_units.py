@@ -19,8 +19,8 @@ from crane.common import unit_conversions
 from crane.common.errors import CraneError
 from crane.common.unit_conversions import (
     COMMON_UNITS,
-    NumberWithUnit,
     UnitError,
+    WrittenNumber,
     column_conversion,
     parse_quantity,
     unit_size,
@@ -196,7 +196,7 @@ def test_units_stay_with_their_elements_where_others_are_locked(file, tmp_path):
 @example(5e-324, "bar")
 def test_any_number_is_written_so_that_it_is_read_again(value, unit):
     si_unit = COMMON_UNITS.get(unit, ({"N/mm": "N/m", "in": "m"}.get(unit, "m3/(s Pa^0.5)"), 0))[0]
-    text = NumberWithUnit(1.0, unit, unit_size(unit, si_unit)).write(value)
+    text = WrittenNumber(1.0, unit, unit_size(unit, si_unit)).write(value)
     assert parse_quantity(text, (si_unit,)).value == value
 
 

@@ -105,8 +105,8 @@ class UnitError(InputError):
     """A text is no number in a wanted unit; the message says what to give."""
 
 
-class NumberWithUnit(NamedTuple):
-    """A number as it was written.
+class WrittenNumber(NamedTuple):
+    """A number with the unit in which it is written.
 
     Attributes:
         value: The number in the SI unit.
@@ -159,7 +159,7 @@ def parse_number(text: str, units: Sequence[str]) -> float:
     return parse_quantity(text, units).value if is_quantity(text) else parse_float(text)
 
 
-def parse_quantity(text: str, units: Sequence[str] = ("",)) -> NumberWithUnit:
+def parse_quantity(text: str, units: Sequence[str] = ("",)) -> WrittenNumber:
     """A number with a unit or without, in which case it is in the SI unit.
 
     Args:
@@ -176,7 +176,7 @@ def parse_quantity(text: str, units: Sequence[str] = ("",)) -> NumberWithUnit:
     for si_unit in units:
         size = Fraction(1) if not unit else unit_size(unit, si_unit)
         if size is not None:
-            return NumberWithUnit(_as_float(number * size), unit, size)
+            return WrittenNumber(_as_float(number * size), unit, size)
     is_known = re.fullmatch(_RATIO_PATTERN, unit) or unit == "%" or _dimension(unit)
     problem = f"'{unit}' is {'a unit of something else' if is_known else 'no known unit'}"
     names = *COMMON_UNITS, *(si_unit for si_unit, _ in COMMON_UNITS.values()), *unit_names()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from crane.common.errors import InputError, suggest_names
 from crane.common.number_text import parse_float
-from crane.common.unit_conversions import KeyPath, NumberWithUnit
+from crane.common.unit_conversions import KeyPath, WrittenNumber
 from crane.description.external_forces import ExternalForce, Wrench
 from crane.description.force_elements import (
     AnyForceElement,
@@ -437,7 +437,7 @@ class MachineSpec:
     )  # by joint or loop, most force [N]
     gravity: tuple[float, ...] = STANDARD_GRAVITY  # (3,) [m/s2]
     # numbers as they are written, by the keys and names that lead to them in the machine file
-    written_numbers: Mapping[KeyPath, NumberWithUnit] = field(default_factory=dict)
+    written_numbers: Mapping[KeyPath, WrittenNumber] = field(default_factory=dict)
 
     @property
     def force_elements(self) -> tuple[AnyForceElement, ...]:

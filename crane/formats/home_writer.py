@@ -15,7 +15,7 @@ import yaml
 from crane.common.atomic_output import check_file_is_writable, replace_file
 from crane.common.errors import CraneError, CraneWarning, OutputError
 from crane.common.package_search import NEAREST_ASSEMBLY
-from crane.common.unit_conversions import NumberWithUnit
+from crane.common.unit_conversions import WrittenNumber
 from crane.description.machine_lookup import bundled_machines, example_robots
 from crane.formats.machine_loading import load
 from crane.formats.robot_files import is_sdf_file, is_simulator_file
@@ -72,7 +72,7 @@ def write_home(
             text = path.read_bytes().decode("utf-8")
         except UnicodeDecodeError:
             raise OutputError(f"{path}: is not UTF-8, save it so first") from None
-        written, plain = machine.written_numbers, NumberWithUnit(0.0)
+        written, plain = machine.written_numbers, WrittenNumber(0.0)
         home = {
             joint: written.get(("home", joint), plain).write(value)
             for joint, value in zip(machine.joints, machine.home.tolist(), strict=True)

@@ -20,7 +20,7 @@ from crane.common.errors import InputError, LimitError, suggest_names
 from crane.common.one_line_repr import OneLineRepr, format_count
 from crane.common.package_search import LoadOptions
 from crane.common.samples import Array, as_samples, read_only_copy
-from crane.common.unit_conversions import KeyPath, NumberWithUnit
+from crane.common.unit_conversions import KeyPath, WrittenNumber
 from crane.description.external_forces import ExternalForce, PhasedWrench
 from crane.description.force_elements import (
     AnyForceElement,
@@ -123,7 +123,7 @@ class Machine(IdleMotionProperties, OneLineRepr):
     packages: tuple[str, ...]
     arguments: Mapping[str, str]
     trusts_xacro: bool = False
-    written_numbers: Mapping[KeyPath, NumberWithUnit] = field(default_factory=dict)
+    written_numbers: Mapping[KeyPath, WrittenNumber] = field(default_factory=dict)
 
     def _one_line(self) -> str:
         words = [

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from crane.common.errors import InputError
-from crane.common.unit_conversions import KeyPath, NumberWithUnit, shortest_number
+from crane.common.unit_conversions import KeyPath, WrittenNumber, shortest_number
 from crane.description.circuit_schema import (
     AREA_KEYS,
     BORE_KEYS,
@@ -44,7 +44,7 @@ def replace_data_sheet_keys(data: dict[str, Any], key: str, component: object) -
 
 
 def circuit_data(
-    circuit: Hydraulics, written_numbers: Mapping[KeyPath, NumberWithUnit]
+    circuit: Hydraulics, written_numbers: Mapping[KeyPath, WrittenNumber]
 ) -> dict[str, Any]:
     """The section of a circuit in a machine file, in SI units.
 
@@ -94,7 +94,7 @@ def _write_displacement(
     pump: dict[str, Any],
     circuit: Hydraulics,
     path: KeyPath,
-    written_numbers: Mapping[KeyPath, NumberWithUnit],
+    written_numbers: Mapping[KeyPath, WrittenNumber],
 ) -> None:
     """Write the displacement of a pump in place of its flow, where its file has it."""
     if (*path, "displacement") not in written_numbers or not pump.get("flow"):

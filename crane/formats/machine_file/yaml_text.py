@@ -11,7 +11,7 @@ import yaml
 
 from crane.common.errors import DescriptionError, format_one_line
 from crane.common.package_search import read_plain_file
-from crane.common.unit_conversions import NUMBER_PATTERN, KeyPath, NumberWithUnit, is_quantity
+from crane.common.unit_conversions import NUMBER_PATTERN, KeyPath, WrittenNumber, is_quantity
 from crane.description.findings import report_error
 
 MAX_FILE_SIZE = 2_000_000  # bytes of a file; parsing ten million takes a minute
@@ -35,7 +35,7 @@ _MachineFileDumper.add_representer(_BlockMapping, _represent_block_mapping)
 def format_yaml(
     data: Mapping[str, Any],
     notes: Mapping[KeyPath, str],
-    written_numbers: Mapping[KeyPath, NumberWithUnit],
+    written_numbers: Mapping[KeyPath, WrittenNumber],
 ) -> str:
     """The text of a machine file.
 
@@ -96,7 +96,7 @@ class LocatedMapping(dict[str, Any]):
         super().__init__()
         self.file, self.line = file, line
         self.locations: dict[str, tuple[Path, int]] = {}
-        self.written_numbers: dict[KeyPath, NumberWithUnit] = {}
+        self.written_numbers: dict[KeyPath, WrittenNumber] = {}
 
     def copy_key(self, source: "LocatedMapping", key: str) -> None:
         """Take over the value of a key, and where it stands."""
@@ -118,7 +118,7 @@ class LocatedMapping(dict[str, Any]):
 
 def written_numbers_by_path(
     data: LocatedMapping, path: KeyPath = ()
-) -> dict[KeyPath, NumberWithUnit]:
+) -> dict[KeyPath, WrittenNumber]:
     """The numbers that were read of a machine file, as written, by the ways to them."""
     found = {(*path, *place): quantity for place, quantity in data.written_numbers.items()}
     for key, value in data.items():
@@ -133,7 +133,7 @@ def written_numbers_by_path(
 
 
 def with_written_units(
-    data: Any, written_numbers: Mapping[KeyPath, NumberWithUnit], path: KeyPath = ()
+    data: Any, written_numbers: Mapping[KeyPath, WrittenNumber], path: KeyPath = ()
 ) -> Any:
     """The same with numbers in the units in which a machine file had them, to the last bit.
 

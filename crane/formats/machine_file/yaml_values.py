@@ -10,8 +10,8 @@ from crane.common.errors import DescriptionError, suggest_names
 from crane.common.number_text import parse_float
 from crane.common.unit_conversions import (
     KeyPath,
-    NumberWithUnit,
     UnitError,
+    WrittenNumber,
     parse_quantity,
 )
 from crane.description.findings import UnknownNames, error_recovery, report_error
@@ -113,7 +113,7 @@ class YamlValues:
                 self._data[near[0]] = self._data[key]
                 self._data.locations[near[0]] = self._data.locations[key]
 
-    def written_numbers(self) -> dict[KeyPath, NumberWithUnit]:
+    def written_numbers(self) -> dict[KeyPath, WrittenNumber]:
         """The numbers that were read of the section, as written, by the ways to them."""
         return written_numbers_by_path(self._data)
 
@@ -245,7 +245,7 @@ class YamlValues:
         return spec.si_units(turns, position)
 
     def _read_number(self, key: str, value: Any, *position: int) -> float:
-        written = NumberWithUnit(as_float(value))
+        written = WrittenNumber(as_float(value))
         if isinstance(value, str) and "," in value:
             raise self._value_error(key, format_value(value), "give a number with a decimal point")
         if isinstance(value, str):
