@@ -23,6 +23,7 @@ from crane.common import checkpoint
 from crane.common.checkpoint import Checkpoint
 from crane.common.errors import CraneWarning, InputError, OutputError, TerminatedWorkerError
 from crane.studies import worker_processes
+from crane.studies.parallel_jobs import compute_on_cluster
 from crane.studies.worker_processes import WorkerPool
 
 FOUR_BAR = Path(__file__).parent / "data" / "four_bar.yaml"
@@ -399,6 +400,23 @@ def test_a_scheduler_that_ends_leaves_what_is_finished(tmp_path):
     found = crane.study(FOUR_BAR, MASSES, measures=["mass"], checkpoint=file)
     whole = crane.study(FOUR_BAR, MASSES, measures=["mass"])
     assert as_text(found, tmp_path) == as_text(whole, tmp_path)
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_ends_while_it_hands_over_a_result_is_told(monkeypatch):
+    """The connection breaks after the job is reported as finished, before its result is here."""
+    distributed = pytest.importorskip("distributed")
+
+    def broken(self, timeout=None):
+        raise distributed.comm.CommClosedError("in <TCP (closed) ConnectionPool.gather>")
+
+    options = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": None,
+               "protocol": "tcp"}  # fmt: skip
+    with distributed.LocalCluster(processes=False, **options) as cluster:
+        monkeypatch.setattr(distributed.Future, "result", broken)
+        results = compute_on_cluster(abs, {0: -1}, cluster.scheduler_address)
+        with pytest.raises(TerminatedWorkerError, match="the scheduler at .* is gone"):
+            list(results)
 
 
 def wait_for(address):

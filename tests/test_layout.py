@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import re
 from functools import cache
 from pathlib import Path
 
@@ -100,3 +101,9 @@ def test_no_module_hides_a_name_of_its_folder():
                     f"{path.parent.name}: {n.name}" for n in node.names if n.name in modules
                 ]
     assert not hidden
+
+
+def test_files_that_ci_names_exist():
+    root = PACKAGE.parent
+    named = re.findall(r"\btests/\w+\.py\b", (root / ".ci" / "run").read_text())
+    assert named and all((root / path).is_file() for path in named), named

@@ -66,9 +66,13 @@ def compute_on_cluster(
         indices = {f"crane-study-{run}-{index}": index for index in jobs}
         futures = client.map(function, list(jobs.values()), key=list(indices), pure=False)
         for future in dask.as_completed(futures, loop=client.loop):
-            _check_future(future, scheduler)
+            try:
+                _check_future(future, scheduler)
+                result: Any = future.result() if future.status == "finished" else None
+            except dask.comm.CommClosedError:  # the scheduler ends while it hands over a result
+                raise _scheduler_error(scheduler) from None
             if future.status == "finished":
-                yield indices[future.key], future.result()
+                yield indices[future.key], result
             else:
                 lost.append(indices[future.key])
     if lost:
@@ -90,8 +94,12 @@ def _check_future(future: Any, scheduler: str) -> None:
             f"the workers cannot run this version of crane ({failure}), install it there"
         )
     if failure is None:
-        raise TerminatedWorkerError(f"the scheduler at {scheduler} is gone, start it again")
+        raise _scheduler_error(scheduler)
     raise failure
+
+
+def _scheduler_error(scheduler: str) -> TerminatedWorkerError:
+    return TerminatedWorkerError(f"the scheduler at {scheduler} is gone, start it again")
 
 
 _PROCESSES_PER_CORE = 8  # more would wait for each other, and each keeps the machine in memory
