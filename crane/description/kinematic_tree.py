@@ -170,9 +170,9 @@ class Tree:
 
     @property
     def root_link(self) -> str:
-        """The link without parent."""
+        """The link without parent, "" if there are no links."""
         parent_joints = self.parent_joints
-        return next(link for link in self.links if link not in parent_joints)
+        return next((link for link in self.links if link not in parent_joints), "")
 
     @property
     def total_mass(self) -> float:

@@ -19,7 +19,7 @@ from crane.formats.machine_file.structure_sections import TreeBuilder, read_home
 from crane.formats.machine_file.yaml_section import YamlSection
 from crane.formats.machine_file.yaml_text import MAX_FILE_SIZE, format_value
 from crane.formats.urdf.link_joint_elements import MOVABLE_TYPES
-from crane.formats.urdf.urdf_reader import UrdfModel, read_urdf
+from crane.formats.urdf.urdf_reader import read_urdf
 from crane.formats.xml_file import XmlFile
 
 URDF_FILE = "robot.urdf"
@@ -81,12 +81,10 @@ def read_parallel_robot(path: Path) -> MachineSpec:
             f"{urdf.loops[0].source_location}: the loops stand in {path.name}, keep <loop> or "
             "closed_loop"
         )
-    chain = Chain(urdf.name, file, None, path.name, urdf.moving_joints)
-    tree = TreeBuilder()
-    tree.add_chain(chain, urdf)
+    tree = TreeBuilder(urdf.tree, urdf.is_complete)
     if not tree.joints:
         raise DescriptionError(f"{file.name}: no joint moves in this file, add one")
-    loops = _read_loops(top, urdf, tree)
+    loops = _read_loops(top, tree)
     motors = top.names("name_mot")
     for joint in motors:
         if joint not in tree.joints and joint in replaced_types:
@@ -100,19 +98,16 @@ def read_parallel_robot(path: Path) -> MachineSpec:
     locations["active"] = top.source_location("name_mot")
     if "home" in top:
         locations["home"] = top.source_location("home")
-    return MachineSpec(
-        name=urdf.name,
+    return dataclasses.replace(
+        urdf,
         source=path.name,
         path=path,
-        chains=(chain,),
-        tree=tree.tree,
+        chains=(Chain(urdf.name, file, None, path.name, tuple(tree.joints)),),
         loops=loops,
         active=motors,
         home=home,
         drives=tuple(Drive(joint, {joint: 1.0}) for joint in motors),
-        friction=urdf.friction,
         tip=tree.single_leaf_link(),
-        couplings=urdf.couplings,
         source_locations=locations,
     )
 
@@ -157,7 +152,7 @@ def _replace_joint_types(xml: XmlFile, replaced_types: dict[str, str], top: Yaml
         joint.attrib.pop("independent", None)
 
 
-def _split_universal_joint(urdf: UrdfModel, name: str, axes: tuple[str, str]) -> UrdfModel:
+def _split_universal_joint(urdf: MachineSpec, name: str, axes: tuple[str, str]) -> MachineSpec:
     """Return the URDF with a universal joint as two joints, the first at the parent."""
     parts: list[Link | Joint] = []
     for part in urdf.tree:
@@ -177,7 +172,7 @@ def _split_universal_joint(urdf: UrdfModel, name: str, axes: tuple[str, str]) ->
     return dataclasses.replace(urdf, tree=Tree({}, {}).with_parts(*parts))
 
 
-def _read_loops(top: YamlSection, urdf: UrdfModel, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
+def _read_loops(top: YamlSection, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
     """Return the loops between the frames of `closed_loop`: spherical or fixed."""
     pairs: list[list[str]] = []
     if "closed_loop" in top:
@@ -197,7 +192,7 @@ def _read_loops(top: YamlSection, urdf: UrdfModel, tree: TreeBuilder) -> tuple[L
         raise top.error_at(
             "type", f"{len(kinds)} types for {len(pairs)} closed loops, give each one"
         )
-    child_links = {joint.name: joint.child for joint in urdf.tree.joints.values()}
+    child_links = {joint.name: joint.child for joint in tree.tree.joints.values()}
     loops: dict[str, LoopSpec] = {}
     for pair, kind in zip(pairs, kinds, strict=True):
         if kind.lower() not in _LOOP_TYPES:

@@ -28,7 +28,6 @@ from crane.description.sensors import (
 )
 from crane.description.specification import (
     ATTITUDE_COORDINATES,
-    STANDARD_GRAVITY,
     TIP_COORDINATES,
     Chain,
     EstimationSettings,
@@ -95,36 +94,17 @@ def _read_by_format(path: Path) -> MachineSpec:
 
 
 def _read_robot(path: Path) -> MachineSpec:
-    urdf = read_urdf(path)
-    chain = Chain(path.stem, path, None, path.name, urdf.moving_joints)
-    tree = TreeBuilder()
-    tree.add_chain(chain, urdf)
+    spec = read_urdf(path)
+    tree = TreeBuilder(spec.tree, spec.is_complete)
     if not tree.joints and not load_options().floating_root:
         report_error(DescriptionError(f"{path.name}: no joint moves in this file, add one"))
-    for loop in urdf.loops:
+    for loop in spec.loops:
         with error_recovery():
             tree.check_loop(loop)
-    locations = source_locations(urdf.loops, urdf.couplings)
-    locations |= {f"home {joint}": place for joint, place in urdf.home_locations.items()}
-    active = urdf.independent_joints
-    if urdf.loops and not active:
-        active, locations["active"] = (), urdf.loops[0].source_location
-    return MachineSpec(
-        name=urdf.name,
-        source=path.name,
-        path=path,
-        chains=(chain,),
-        tree=tree.tree,
-        loops=urdf.loops,
-        active=active,
-        home=urdf.home,
-        friction=urdf.friction,
-        forces=urdf.springs,
-        tip=tree.single_leaf_link() if urdf.tip is None else urdf.tip,
-        couplings=urdf.couplings,
-        source_locations=locations,
-        gravity=urdf.gravity or STANDARD_GRAVITY,
-    )
+    if spec.loops and not spec.active:
+        locations = {**spec.source_locations, "active": spec.loops[0].source_location}
+        spec = dataclasses.replace(spec, active=(), source_locations=locations)
+    return dataclasses.replace(spec, tip=tree.single_leaf_link()) if spec.tip is None else spec
 
 
 def read_plain_data(path: Path) -> dict[str, Any]:
@@ -302,10 +282,10 @@ def _read_payload(top: YamlSection, tree: TreeBuilder, tip: str | None) -> Paylo
         )
     if not urdf.tree.total_mass:
         raise section.error_at(
-            "urdf", f"no link of {urdf.file.name} has a mass, give one an <inertial>"
+            "urdf", f"no link of {urdf.path.name} has a mass, give one an <inertial>"
         )
-    chain = Chain("payload", urdf.file, tip, section.source_location("urdf"), ())
-    attachment = chain.attachment_joint(urdf.root_link)
+    chain = Chain("payload", urdf.path, tip, section.source_location("urdf"), ())
+    attachment = chain.attachment_joint(urdf.tree.root_link)
     for _ in tree.filter_new_names([attachment, *urdf.tree]):
         pass  # notes names that are taken
     return PayloadSpec(chain, urdf.tree.with_parts(attachment))

@@ -30,7 +30,7 @@ from crane.description.specification import (
     unit_vector,
 )
 from crane.formats.machine_file.yaml_section import YamlSection
-from crane.formats.urdf.urdf_reader import UrdfModel, read_urdf
+from crane.formats.urdf.urdf_reader import read_urdf
 
 _LOOP_END_PATTERN = re.compile(
     r"((?:closing_|closed?_?loop|loop_?clos).*?)_?([12AB])", re.IGNORECASE
@@ -42,33 +42,31 @@ _MAX_SHOWN = 4  # pairs in a line
 class TreeBuilder:
     """The chains hung onto each other.
 
+    Args:
+        tree: What is there already.
+        is_complete: See below.
+
     Attributes:
-        links: By name.
+        tree: All links and joints.
         joints: Those that move, by name.
         is_complete: Whether every name is here; where findings are collected, a chain or a name
             may have been refused.
     """
 
-    def __init__(self) -> None:
-        self.links: dict[str, Link] = {}
-        self.joints: dict[str, Joint] = {}
-        self.is_complete = True
-        self._all_joints: dict[str, Joint] = {}
-        self._parent_joints: dict[str, Joint] = {}
-        self._root = ""
+    def __init__(self, tree: Tree, is_complete: bool = True):
+        self.is_complete = is_complete
+        self._set_tree(tree)
 
-    @property
-    def tree(self) -> Tree:
-        """All that has been added."""
-        return Tree(dict(self.links), dict(self._all_joints))
+    def _set_tree(self, tree: Tree) -> None:
+        self.tree, self.links, self._parent_joints = tree, tree.links, tree.parent_joints
+        self.joints = {joint.name: joint for joint in tree.moving_joints}
 
-    def add_chain(self, chain: Chain, urdf: UrdfModel) -> None:
+    def add_chain(self, chain: Chain, urdf: MachineSpec) -> None:
         """Hang a chain from its parent frame, the first from the world.
 
         Raises:
             DescriptionError: The frame is unknown, or a name is taken by an earlier chain.
         """
-        self._root = self._root or urdf.root_link
         with error_recovery():
             if chain.parent is not None and chain.parent not in self.links:
                 raise self.unknown_name_error(
@@ -76,31 +74,26 @@ class TreeBuilder:
                     f"no frame of an earlier chain, {suggest_names(self.links, chain.parent)}",
                     chain.parent,
                 )
-            attachments = [chain.attachment_joint(urdf.root_link)] * (chain.parent is not None)
-            for joint in self.filter_new_names(attachments):
-                self._add_part(joint)
+            attachments = [chain.attachment_joint(urdf.tree.root_link)] * (
+                chain.parent is not None
+            )
+            self._set_tree(self.tree.with_parts(*self.filter_new_names(attachments)))
         parts = list(urdf.tree)
         free = list(self.filter_new_names(parts))
         # what is not there goes by another name
         self.is_complete &= urdf.is_complete and len(free) == len(parts)
-        for part in free:
-            self._add_part(part)
+        self._set_tree(self.tree.with_parts(*free))
 
     def add_floating_base(self, freedoms: Sequence[str]) -> None:
         """Let the root of the first chain float instead of standing on the world."""
-        if not freedoms or not self.links:
-            return
-        floating_tree = add_base_joints(self.tree, freedoms)
-        self.links, self._all_joints, self.joints = {}, {}, {}
-        self._root = floating_tree.root_link
-        for part in floating_tree:
-            self._add_part(part)
+        if freedoms and self.links:
+            self._set_tree(add_base_joints(self.tree, freedoms))
 
     def filter_new_names(self, parts: Iterable[Link | Joint]) -> Iterator[Link | Joint]:
         """Those whose names are not taken; the others are noted."""
         for part in parts:
             is_link = isinstance(part, Link)
-            earlier = (self.links if is_link else self._all_joints).get(part.name)
+            earlier = (self.links if is_link else self.tree.joints).get(part.name)
             if earlier is None:
                 yield part
                 continue
@@ -113,14 +106,6 @@ class TreeBuilder:
             if earlier.source_location == part.source_location:
                 return  # one file twice: the rest of it is there, too
 
-    def _add_part(self, part: Link | Joint) -> None:
-        if isinstance(part, Link):
-            self.links[part.name] = part
-            return
-        self._all_joints[part.name] = self._parent_joints[part.child] = part
-        if part.is_movable:
-            self.joints[part.name] = part
-
     def unknown_name_error(self, message: str, name: str = "?") -> CraneError:
         """The error about a name, unless a chain is not there or the name has been refused."""
         is_follow_up = not self.is_complete or not name
@@ -130,7 +115,7 @@ class TreeBuilder:
         """Raise for a joint that does not exist or does not move."""
         if joint in self.joints:
             return
-        if joint in self._all_joints:
+        if joint in self.tree.joints:
             problem = f"{source_location}: joint '{joint}' is fixed, name a moving one"
             raise DescriptionError(problem) if self.joints else FollowUpError(problem)
         raise self.unknown_name_error(
@@ -181,7 +166,9 @@ class TreeBuilder:
 
     def is_movable(self, link: str) -> bool:
         """Whether a link is not fixed to the world."""
-        return not self.is_complete or body_of(self._parent_joints, link) != self._root
+        is_forest = any(joint.is_cut for joint in self.tree.joints.values())
+        is_known = self.is_complete and not is_forest
+        return not is_known or body_of(self._parent_joints, link) != self.tree.root_link
 
     def missing_limit_text(self, joint: str) -> str:
         """How a joint lacks a finite range, in words; empty if it has one, or is unknown."""
@@ -195,7 +182,7 @@ class TreeBuilder:
 
     def single_leaf_link(self) -> str | None:
         """The last link of an unbranched chain."""
-        parents = {joint.parent for joint in self._all_joints.values()}
+        parents = {joint.parent for joint in self.tree.joints.values()}
         leaves = [name for name in self.links if name not in parents]
         return leaves[0] if len(leaves) == 1 else None
 
@@ -208,7 +195,7 @@ def read_chains(
 ]:  # fmt: skip
     """The sub-chains, their tree, the friction, couplings and springs of their URDFs, gravity."""
     chains: list[Chain] = []
-    tree = TreeBuilder()
+    tree = TreeBuilder(Tree({}, {}))
     friction: dict[str, Friction] = {}
     couplings: tuple[Coupling, ...] = ()
     springs: tuple[ForceElement, ...] = ()
@@ -224,8 +211,8 @@ def read_chains(
             chains.append(chain)
             friction |= urdf.friction
             couplings += urdf.couplings
-            springs += urdf.springs
-            if urdf.gravity is not None:
+            springs += urdf.forces
+            if "gravity" in urdf.source_locations:
                 gravities.setdefault(urdf.gravity, chain.name)
     tree.is_complete &= top.is_complete
     if not chains and tree.is_complete:
@@ -257,7 +244,7 @@ def _read_gravity(
 
 def _read_chain(
     item: YamlSection, earlier_chains: list[Chain], are_all_read: bool, path: Path
-) -> tuple[Chain, UrdfModel]:
+) -> tuple[Chain, MachineSpec]:
     """A chain and its file.
 
     Args:
@@ -285,7 +272,8 @@ def _read_chain(
     for loop in urdf.loops[:1]:
         problem = f"a sub-chain has no <loop>, write it under 'loops' of {path.name}"
         report_error(DescriptionError(f"{loop.source_location}: {problem}"))
-    return Chain(name, file, parent, item.source_location("parent"), urdf.moving_joints), urdf
+    location, joints = item.source_location("parent"), urdf.chains[0].joints
+    return Chain(name, file, parent, location, joints), urdf
 
 
 def read_loops(top: YamlSection, tree: TreeBuilder) -> tuple[LoopSpec, ...]:

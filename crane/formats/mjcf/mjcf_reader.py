@@ -31,7 +31,6 @@ from crane.formats.mjcf.model_features import (
 )
 from crane.formats.mjcf.mujoco_file import MujocoFile, pose
 from crane.formats.mjcf.unsupported_features import note_unsupported_features
-from crane.formats.urdf.urdf_reader import UrdfModel
 
 
 def read_mjcf(path: Path) -> MachineSpec:
@@ -90,19 +89,9 @@ class _MjcfReader:
         effects = read_joint_effects(mjcf, self.series_joints, frames.link_of_site, cylinders)
         drives = read_drives(mjcf, self.series_joints, cylinders)
         note_unsupported_features(mjcf, cylinders)
-        urdf = UrdfModel(
-            mjcf.file,
-            mjcf.file.stem,
-            with_rotor_inertias(Tree(self.links, self.joints), effects.rotor_inertias),
-            self.body_links[0],
-            loops,
-            None,
-            effects.friction,
-            couplings,
+        tree = TreeBuilder(
+            with_rotor_inertias(Tree(self.links, self.joints), effects.rotor_inertias)
         )
-        chain = Chain(mjcf.file.stem, mjcf.file, None, mjcf.file.name, urdf.moving_joints)
-        tree = TreeBuilder()
-        tree.add_chain(chain, urdf)
         for loop in loops:
             tree.check_loop(loop)
         active = self._listed_joints("active")
@@ -117,7 +106,7 @@ class _MjcfReader:
             name=self.texts.get("name") or mjcf.file.stem,
             source=self.texts.get("source") or mjcf.file.name,
             path=mjcf.file,
-            chains=(chain,),
+            chains=(Chain(mjcf.file.stem, mjcf.file, None, mjcf.file.name, tuple(tree.joints)),),
             tree=tree.tree,
             loops=loops,
             active=tuple(active) if active or loops or couplings else None,

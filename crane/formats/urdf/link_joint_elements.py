@@ -207,7 +207,7 @@ _MAX_LISTED = 8  # joints of a cycle in an error
 
 def read_graph(
     xml: XmlFile, links: Mapping[str, etree._Element], joints: Mapping[str, etree._Element]
-) -> tuple[EndLinks, str, set[str]]:
+) -> tuple[EndLinks, set[str]]:
     """Read the graph of links and joints.
 
     Joints with both ends form a forest, whatever the file contains. A joint that joins a link to
@@ -220,7 +220,7 @@ def read_graph(
         joints: The `<joint>` elements by name.
 
     Returns:
-        Parent and child link by joint, the root link, and the joints that are cut.
+        Parent and child link by joint, and the joints that are cut.
 
     Raises:
         DescriptionError: An end is missing or unknown, or the joints do not form one tree.
@@ -256,7 +256,7 @@ def read_graph(
         )
     for name in cut_joints:
         end_links[name] = _NO_ENDS
-    return end_links, roots[0] if roots else next(iter(links)), cut_joints
+    return end_links, cut_joints
 
 
 def _read_end_links(

@@ -3,7 +3,6 @@
 import dataclasses
 import warnings
 from collections.abc import Callable, Collection, Container, Mapping, Sequence, Set
-from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -15,9 +14,15 @@ from crane.description.findings import (
     error_recovery,
     record_parsed_file,
 )
-from crane.description.force_elements import ForceElement, Friction
+from crane.description.force_elements import Friction
 from crane.description.kinematic_tree import MULTI_FREEDOM_TYPES, Joint, Link, Tree
-from crane.description.specification import Coupling, LoopSpec
+from crane.description.specification import (
+    STANDARD_GRAVITY,
+    Chain,
+    Coupling,
+    MachineSpec,
+    source_locations,
+)
 from crane.formats.robot_files import open_robot
 from crane.formats.urdf.link_joint_elements import (
     MOVABLE_TYPES,
@@ -100,55 +105,15 @@ _MIN_SIMILARITY = 0.6  # of a suggested name
 _OBSOLETE_ELEMENTS = {"loop_constraint": "loop", "joint_constraint": "coupling"}
 
 
-@dataclass(frozen=True)
-class UrdfModel:
-    """A checked URDF.
-
-    Attributes:
-        file: The file.
-        name: Name of the robot.
-        tree: Links and joints.
-        root_link: Name of the root link.
-        loops: Loops of `<loop>` elements.
-        independent_joints: Joints marked `independent="true"`; None where no joint has the
-            attribute.
-        friction: Friction of `<dynamics>` elements by joint.
-        couplings: Couplings of `<mimic>` and `<coupling>` elements.
-        home: Coordinates of the group state "home" by joint.
-        home_locations: File and line of each coordinate of home.
-        tip: Link of the end effector "tip".
-        is_complete: Whether all elements have unique names, so that none is missing here.
-        springs: Springs, if the file is in a format that has some.
-        gravity: (3,) acceleration of gravity [m/s2], `<robot gravity="...">`; None without it.
-    """
-
-    file: Path
-    name: str
-    tree: Tree
-    root_link: str
-    loops: tuple[LoopSpec, ...]
-    independent_joints: tuple[str, ...] | None
-    friction: Mapping[str, Friction]
-    couplings: tuple[Coupling, ...]
-    home: Mapping[str, float] = field(default_factory=dict)
-    home_locations: Mapping[str, str] = field(default_factory=dict)
-    tip: str | None = None
-    is_complete: bool = True
-    springs: tuple[ForceElement, ...] = ()
-    gravity: tuple[float, ...] | None = None
-
-    @property
-    def moving_joints(self) -> tuple[str, ...]:
-        """Names of the moving joints."""
-        return tuple(joint.name for joint in self.tree.moving_joints)
-
-
-def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> UrdfModel:
+def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> MachineSpec:
     """Read and check a URDF, or a file that is converted to one by `crane.formats.robot_files`.
 
     Args:
         file: The file.
         edit: Function that changes the elements before they are read.
+
+    Returns:
+        The machine of one chain; `source_locations` has "gravity" if the file states it.
 
     Raises:
         DescriptionError: The file is wrong; the message has file and line.
@@ -160,7 +125,7 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
     _warn_about_unknown_elements(xml, joints)
     if not links:
         raise xml.error_at(xml.root, "no <link> in this file, add one")
-    end_links, root, cut = read_graph(xml, links, joints)
+    end_links, cut = read_graph(xml, links, joints)
     moved_links = {
         end_links[name][1] for name, joint in joints.items() if joint.get("type") != "fixed"
     }
@@ -193,24 +158,26 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
         with error_recovery():
             couplings += (read_coupling(xml, name, element, joints, end_links, links),)
     tree = Tree({}, {}).with_parts(*parts)
-    home, home_lines = _read_home(xml, {joint.name for joint in tree.moving_joints})
-    return UrdfModel(
-        file,
-        xml.root.get("name") or file.stem,
-        tree,
-        root,
-        loops,
-        independent_names,
-        {name: found for name, found in friction.items() if found is not None},
-        couplings,
-        home,
-        home_lines,
-        _read_tip(xml, links),
+    moving_joints = tuple(joint.name for joint in tree.moving_joints)
+    home, locations = _read_home(xml, moving_joints)
+    if "gravity" in xml.root.attrib:
+        locations["gravity"] = xml.source_location(xml.root)
+    return MachineSpec(
+        name=xml.root.get("name") or file.stem,
+        source=file.name,
+        path=file,
+        chains=(Chain(file.stem, file, None, file.name, moving_joints),),
+        tree=tree,
+        loops=loops,
+        active=independent_names,
+        home=home,
+        friction={name: found for name, found in friction.items() if found is not None},
+        forces=springs,
+        tip=_read_tip(xml, links),
+        couplings=couplings,
+        source_locations=source_locations(loops, couplings) | locations,
+        gravity=xml.vector(xml.root, "gravity", "the robot", 3, STANDARD_GRAVITY),
         is_complete=not xml.unnamed_kinds,
-        springs=springs,
-        gravity=xml.vector(xml.root, "gravity", "the robot", 3)
-        if "gravity" in xml.root.attrib
-        else None,
     )
 
 
@@ -319,10 +286,10 @@ def _read_home(xml: XmlFile, joints: Collection[str]) -> tuple[dict[str, float],
     """Read `<group_state name="home">`, an element of SRDF.
 
     Returns:
-        Coordinates, and their files and lines, by joint.
+        Coordinates by joint, and the file and line of each as "home JOINT".
     """
     home: dict[str, float] = {}
-    source_locations: dict[str, str] = {}
+    locations: dict[str, str] = {}
     joint_elements = [
         joint
         for state in xml.root.iterfind("group_state")
@@ -332,8 +299,8 @@ def _read_home(xml: XmlFile, joints: Collection[str]) -> tuple[dict[str, float],
     for joint in joint_elements:
         with error_recovery():
             name, value = _read_coordinate(xml, joint, joints, home)
-            home[name], source_locations[name] = value, xml.source_location(joint)
-    return home, source_locations
+            home[name], locations[f"home {name}"] = value, xml.source_location(joint)
+    return home, locations
 
 
 def _read_tip(xml: XmlFile, links: Mapping[str, etree._Element]) -> str | None:
