@@ -12,6 +12,7 @@ It imports nothing of the package, which would take longer than reading most mes
 import contextlib
 import json
 import os
+import resource
 import sys
 import warnings
 from typing import Any
@@ -57,11 +58,7 @@ def main() -> None:
 
 
 def limit_resources() -> None:
-    """Limit time for one more file, and memory, if the system supports it."""
-    try:
-        import resource
-    except ImportError:
-        return
+    """Limit time for one more file, and memory."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     time_limit = int(used.ru_utime + used.ru_stime) + MAX_SECONDS
     for kind, limit in ((resource.RLIMIT_CPU, time_limit), (resource.RLIMIT_AS, MAX_MEMORY)):

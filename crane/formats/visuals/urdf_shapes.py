@@ -139,7 +139,7 @@ def _run_mesh_process(files: list[Path], max_triangles: int) -> list[bytes]:
         position = end
     if len(answers) < len(files):
         reason = "damaged"
-        if status in (-signal.SIGTERM, -getattr(signal, "SIGXCPU", 0)):
+        if status in (-signal.SIGTERM, -signal.SIGXCPU):
             reason = f"reading it takes more than {mesh_process.MAX_SECONDS} s"
         answers.append(json.dumps({"wrong": reason}).encode() + b"\n")
     return answers
