@@ -6,7 +6,7 @@ is assembled, see `crane.description.rotation_vectors`.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -215,6 +215,22 @@ def body_of(parent_joints: Mapping[str, Joint], link: str) -> str:
     return link
 
 
+def path_to_root(parent_joints: Mapping[str, Joint], link: str) -> list[Joint]:
+    """Return the joints from a link to the root, see `Tree.parent_joints`."""
+    path: list[Joint] = []
+    while link in parent_joints:
+        path.append(parent_joints[link])
+        link = path[-1].parent
+    return path
+
+
+def unique_name(name: str, used_names: Container[str]) -> str:
+    """Return a name that is not used, with underscores appended if necessary."""
+    while name in used_names:
+        name += "_"
+    return name
+
+
 def with_rotor_inertias(tree: Tree, rotor_inertias: Mapping[str, float]) -> Tree:
     """Return the tree with rotor inertias [kg m2], [kg] by joint."""
     return tree.with_parts(
@@ -281,7 +297,7 @@ def joint_series(
 _ROUNDING_TOLERANCE = 1e-4
 _NEGATIVE_MOMENT_TOLERANCE = 0.05  # of a negative moment, as by rounding to two digits
 _MIN_GYRATION_RADIUS = 1e-10  # [m] of a body with inertia
-_TENSOR_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+TENSOR_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")  # of URDF and SDF
 
 
 @dataclass(frozen=True)
@@ -363,4 +379,4 @@ def format_inertia(tensor: Array) -> str:
     """Return a tensor as attributes of a URDF, in five digits."""
     rounding = float(np.abs(tensor).max()) * 1e-9
     values = [x if abs(x) > rounding else 0.0 for x in tensor[np.triu_indices(3)].tolist()]
-    return " ".join(f'{key}="{x:.5g}"' for key, x in zip(_TENSOR_ATTRIBUTES, values, strict=True))
+    return " ".join(f'{key}="{x:.5g}"' for key, x in zip(TENSOR_ATTRIBUTES, values, strict=True))

@@ -18,6 +18,7 @@ from crane.common.package_search import read_plain_file
 from crane.description.findings import report_error
 from crane.description.kinematic_tree import (
     NO_LIMIT,
+    TENSOR_ATTRIBUTES,
     Inertial,
     Joint,
     Limits,
@@ -27,7 +28,6 @@ from crane.description.kinematic_tree import (
 )
 from crane.description.specification import AXISLESS_TYPES, unit_vector
 
-TENSOR_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 MAX_FILE_SIZE = 50_000_000  # bytes
 _X = (1.0, 0.0, 0.0)
 _ROOT_ELEMENTS = {  # by suffix, if not a <robot>

@@ -83,23 +83,22 @@ class DistanceCurve:
         start_index = int(
             min(np.flatnonzero(is_drivable), key=lambda k: abs(int(k) - self.home_index))
         )
-        lever_arms = self.lever_arms
-        is_driven = fits & (lever_arms * lever_arms[start_index] > 0)
+
+        start = self.configurations[start_index]
+        start_lever_arm = lever_arm(self.machine, self.points, start, self.joint)
 
         def is_driven_at(q: Array) -> bool:
             length = float(np.linalg.norm(vector_between(self.machine, self.points, q)))
             if not min_length - tolerance <= length <= max_length + tolerance:
                 return False
-            return (
-                lever_arm(self.machine, self.points, q, self.joint) * lever_arms[start_index] > 0
-            )
+            return lever_arm(self.machine, self.points, q, self.joint) * start_lever_arm > 0
 
         resolution = _ROUNDING_TOLERANCE * max(abs(self.values[0]), abs(self.values[-1]))
         samples = list(zip(self.values, self.configurations, strict=True))
         before, after = [samples[start_index]], [samples[start_index]]
         for half, step in ((before, -1), (after, 1)):
             k = start_index + step
-            while 0 <= k < len(samples) and is_driven[k]:
+            while 0 <= k < len(samples) and is_driven_at(samples[k][1]):
                 half.append(samples[k])
                 k += step
             if 0 <= k < len(samples):
@@ -174,17 +173,9 @@ def distance_curve(machine: Machine, points: Sequence[AttachmentPoint]) -> Dista
             f"no active joint changes the distance between '{points[0]}' and '{points[1]}' "
             f"(between them: {', '.join(joints_in_path)}), choose other points"
         )
-    preferred = {
-        joint
-        for joint in scaled_lever_arms
-        if joint in joints_in_path or machine.unit(joint) == "rad"
-    }
-    candidates = {
-        joint: value
-        for joint, value in scaled_lever_arms.items()
-        if joint in preferred or not preferred
-    }
-    best = max(candidates, key=lambda joint: candidates[joint])
+    preferred = [x for x in scaled_lever_arms if x in joints_in_path or machine.unit(x) == "rad"]
+    candidates = preferred or [*scaled_lever_arms]
+    best = max(candidates, key=lambda joint: scaled_lever_arms[joint])
     return dataclasses.replace(
         _scan_joint_range(machine, points, best, _FINE_SAMPLES),
         alternative_joints=tuple(joint for joint in candidates if joint != best),
@@ -330,10 +321,8 @@ def fit_to_joint_range(
 
 def warn_about_masses(machine: Machine, cylinder: SteelCylinder, joint: str) -> None:
     """Warn if all bodies that a joint moves are lighter than its cylinder."""
-    model, cylinder_mass = (
-        machine.model,
-        cylinder.barrel_inertial.mass + cylinder.rod_inertial.mass,
-    )
+    model = machine.model
+    cylinder_mass = cylinder.barrel_inertial.mass + cylinder.rod_inertial.mass
     rates = machine.closure.gamma(machine.home)[:, machine.active.index(joint)]
     moved_bodies = [
         i for i, x in enumerate(model.joints)

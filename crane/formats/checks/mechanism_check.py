@@ -11,9 +11,11 @@ from crane.closure.constraint_structure import OpenLoopError
 from crane.closure.constraint_tolerances import least_squares_step
 from crane.closure.home_search import within_limits
 from crane.closure.loop_equations import LoopEquations
+from crane.closure.multi_start_search import low_discrepancy_steps
 from crane.common.errors import ClosureError, CraneWarning, MechanismError
 from crane.common.samples import Array
 from crane.description.findings import Findings, report_error
+from crane.description.kinematic_tree import path_to_root
 from crane.description.specification import TIP_COORDINATES, MachineSpec, Task
 from crane.formats.assembly_warnings import add_remedy, check_home, warn_about_assembly_modes
 from crane.machine.machine_assembly import assemble_tree, build_closure, home_initial_guess
@@ -211,18 +213,16 @@ def check_strokes(spec: MachineSpec, closure: Closure) -> None:
     failures: list[tuple[float, str]] = []
     sample_count = max(1, min(_MAX_SAMPLES, _MAX_SAMPLED_JOINTS // len(closure.home)))
     span, home = (upper - lower)[is_moved], closure.home[active]
-    tried_count = 0
-    for share in _unit_box_points(int(is_moved.sum()), sample_count):
+    steps, tried_count = low_discrepancy_steps(len(span)), 0
+    while tried_count < sample_count and len(failures) < _MAX_FAILURES:
         tried_count += 1
         q_a = home.copy()
-        q_a[is_moved] = lower[is_moved] + share * span
+        q_a[is_moved] = lower[is_moved] + np.remainder(0.5 + tried_count * steps, 1.0) * span
         try:
             closure.solve(q_a)
         except ClosureError as error:
             distances = np.abs((q_a - home)[is_moved] / np.where(span > 0, span, 1.0))
             failures.append((float(distances.max()), str(error)))
-        if len(failures) == _MAX_FAILURES:
-            break
     failed_share = len(failures) / tried_count
     if failed_share >= _MIN_FAILED_SHARE:
         names = ", ".join(np.array(closure.active_names)[is_moved])
@@ -236,14 +236,11 @@ def check_strokes(spec: MachineSpec, closure: Closure) -> None:
 
 def _reach(spec: MachineSpec) -> float:
     """Return the length [m] of all links from the root to the tip in line, slides extended."""
-    parent_joints = {joint.child: joint for joint in spec.tree.joints.values()}
-    link, length = spec.tip, 0.0
-    while link in parent_joints:
-        joint = parent_joints[link]
+    length = 0.0
+    for joint in path_to_root(spec.tree.parent_joints, spec.tip or ""):
         length += float(np.linalg.norm(joint.xyz))
         if joint.kind == "prismatic":
             length += max(abs(joint.limits.lower), abs(joint.limits.upper))
-        link = joint.parent
     return length
 
 
@@ -259,19 +256,6 @@ def _task_positions(task: Task) -> Iterator[tuple[str, Mapping[str, float]]]:
     for phase in task.phases:
         positions |= phase.until
         yield f"at the end of phase '{phase.name}'", dict(positions)
-
-
-def _unit_box_points(count: int, samples: int) -> Array:
-    """Return (samples, count) points of the unit box, a low-discrepancy sequence.
-
-    They are multiples of powers of 1 / phi with phi^(k + 1) = phi + 1 for k coordinates (Roberts
-    2018).
-    """
-    phi = 2.0
-    for _ in range(40):
-        phi = (1 + phi) ** (1 / (count + 1))
-    steps = phi ** -np.arange(1.0, count + 1)
-    return np.remainder(0.5 + np.outer(np.arange(1, samples + 1), steps), 1.0)
 
 
 def _warn(text: str) -> None:

@@ -15,7 +15,7 @@ from crane.common.errors import CraneWarning
 from crane.common.number_text import parse_float
 from crane.common.plausible_ranges import LONGEST
 from crane.common.samples import Array
-from crane.description.kinematic_tree import inertia_problem
+from crane.description.kinematic_tree import TENSOR_ATTRIBUTES, Inertial, inertia_problem
 from crane.description.specification import MachineSpec
 from crane.formats.visuals.urdf_shapes import MeshShape, UrdfShapes, Visual, read_shapes
 from crane.formats.xml_file import XmlFile
@@ -61,6 +61,7 @@ _MAX_GYRATION_SHARE, _MIN_GYRATION_SHARE = 4.0, 0.01
 _MAX_GYRATION_BY_JOINTS, _MIN_GYRATION_BY_JOINTS = 20.0, 0.003
 _MAX_COM_DISTANCE = 3.0  # of the centre of mass, relative to the size of the shapes
 _MAX_DENSITY = 1e5  # [kg/m3] in the bounding box of a link; osmium has 2.3e4
+_ZERO = (0.0, 0.0, 0.0)
 _DUMMY_LIMITS = 1e-2, 1e-4  # [m], [kg] below which a link only represents a sensor or frame
 
 
@@ -181,13 +182,11 @@ def _warn_about_body(
         return
     mass_tag, tensor_tag, origin = (inertial.find(x) for x in ("mass", "inertia", "origin"))
     mass = read_numbers(mass_tag, "value", 1)
-    parts = [
-        read_numbers(tensor_tag, key, 1) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    ]
+    parts = [read_numbers(tensor_tag, key, 1) for key in TENSOR_ATTRIBUTES]
     if mass is None or not mass[0] > _DUMMY_LIMITS[1] or any(part is None for part in parts):
         return
-    xx, xy, xz, yy, yz, zz = (float(part[0]) for part in parts if part is not None)
-    tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    values = tuple(float(part[0]) for part in parts if part is not None)
+    tensor = Inertial(float(mass[0]), _ZERO, _ZERO, values).inertia_matrix
     if inertia_problem(float(mass[0]), tensor):
         return  # has an error or warning already
     com = read_numbers(origin, "xyz", 3)

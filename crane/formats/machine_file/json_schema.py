@@ -21,6 +21,7 @@ from crane.description.key_types import (
     SectionSchema,
     VariantKey,
 )
+from crane.description.kinematic_tree import unique_name
 from crane.description.machine_schema import EXTENDS_KEY, MACHINE
 
 SCHEMA_PATH = Path(__file__).with_name("machine_file.schema.json")  # shipped with the package
@@ -64,8 +65,7 @@ class _SchemaDefinitions:
         place = (id(section), is_partial)
         if place not in self._names:
             name += "_variant" * (is_partial and name != "variant")
-            while name in self.schemas:
-                name += "_"
+            name = unique_name(name, self.schemas)
             self._names[place], self.schemas[name] = name, {}
             self.schemas[name] = self._section(section, is_partial)
         return {"$ref": f"#/$defs/{self._names[place]}"}

@@ -15,7 +15,7 @@ import pinocchio as pin
 from crane.common.errors import CraneError, CraneWarning, DescriptionError, suggest_names
 from crane.description.findings import FollowUpError, error_recovery, report_error
 from crane.description.force_elements import ForceElement, Friction
-from crane.description.kinematic_tree import Joint, Link, Tree, body_of
+from crane.description.kinematic_tree import Joint, Link, Tree, body_of, path_to_root
 from crane.description.pinocchio_conversion import se3_from_xyz_rpy
 from crane.description.rotation_vectors import add_base_joints, check_freedoms
 from crane.description.specification import (
@@ -423,10 +423,8 @@ def _gap_text(parent_joints: Mapping[str, Joint], first: str, second: str) -> st
     placements = []
     for link in (first, second):
         placement = pin.SE3.Identity()
-        while link in parent_joints:
-            joint = parent_joints[link]
+        for joint in path_to_root(parent_joints, link):
             placement = se3_from_xyz_rpy(joint.xyz, joint.rpy) * placement
-            link = joint.parent
         placements.append(placement)
     relative_placement = placements[0].actInv(placements[1])
     if not np.isfinite(relative_placement.homogeneous).all():  # an origin is refused

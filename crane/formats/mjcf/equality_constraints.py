@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from crane.common.errors import DescriptionError
-from crane.description.kinematic_tree import to_vector
+from crane.description.kinematic_tree import to_vector, unique_name
 from crane.description.specification import Coupling, LoopSpec
 from crane.formats.mjcf.model_features import fixed_tendon_factors
 from crane.formats.mjcf.mujoco_file import MujocoFile, pose
@@ -34,8 +34,7 @@ class MjcfFrames:
 
     def add(self, name: str, body: int, placement: pin.SE3, source_location: str) -> str:
         """Add a frame under a name that no link has, and return the name."""
-        while name in self.used_names:
-            name += "_"
+        name = unique_name(name, self.used_names)
         self.used_names.add(name)
         self.placements[name] = body, placement, source_location
         return name
@@ -88,8 +87,7 @@ def read_equality_constraints(
         if len({int(model.body_weldid[end.body]) for end in ends}) == 1:
             mjcf.note_unsupported("constraints within one body", name)
             continue
-        while name in names:
-            name += "_"
+        name = unique_name(name, names)
         names.add(name)
         if kind not in ("CONNECT", "WELD", "JOINT", "TENDON"):
             raise DescriptionError(

@@ -8,6 +8,7 @@ import pinocchio as pin
 from lxml import etree
 
 from crane.common.errors import CraneWarning, InputError
+from crane.description.kinematic_tree import unique_name
 from crane.description.specification import Coupling
 from crane.formats.xml_file import format_numbers
 
@@ -34,9 +35,8 @@ def solve_polynomial(coupling: Coupling) -> tuple[list[str], list[float]]:
 
 def add_tendon(tendons: etree._Element, tag: str, name: str) -> etree._Element:
     """Add a tendon under a unique name."""
-    while any(tendon.get("name") == name for tendon in tendons):
-        name += "_"
-    return etree.SubElement(tendons, tag, name=name)
+    used_names = {tendon.get("name") for tendon in tendons}
+    return etree.SubElement(tendons, tag, name=unique_name(name, used_names))
 
 
 def add_fixed_tendon(tendons: etree._Element, name: str, factors: Mapping[str, float]) -> str:

@@ -17,6 +17,7 @@ from crane.description.kinematic_tree import (
     joint_series,
     parse_limit,
     to_vector,
+    unique_name,
     with_rotor_inertias,
 )
 from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
@@ -129,14 +130,10 @@ class _MjcfReader:
         """Return a name that no body and no other link has."""
         used_names = {self.mjcf.name("BODY", i) for i in range(self.model.nbody)}
         used_names |= self.links.keys()
-        while name in used_names:
-            name += "_"
-        return name
+        return unique_name(name, used_names)
 
     def _add_fixed_joint(self, link: str, parent: str, placement: pin.SE3) -> None:
-        name = f"{link}_fixed"
-        while name in self.joints or name in self.names:
-            name += "_"
+        name = unique_name(f"{link}_fixed", {*self.joints, *self.names})
         self.joints[name] = Joint(
             name,
             "fixed",

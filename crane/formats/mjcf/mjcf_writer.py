@@ -9,7 +9,7 @@ from lxml import etree
 from crane.common.atomic_output import replace_file
 from crane.common.errors import InputError
 from crane.description.force_elements import ForceElement, Friction, Rope, element_name
-from crane.description.kinematic_tree import ROTATIONS
+from crane.description.kinematic_tree import ROTATIONS, unique_name
 from crane.description.rotation_vectors import ROTATION_COUNT
 from crane.description.specification import Coupling, Drive, LoopSpec
 from crane.formats.mjcf.massless_struts import find_massless_struts
@@ -322,8 +322,7 @@ class _MjcfWriter:
 
     def _add_site(self, body: etree._Element, name: str, placement: pin.SE3) -> str:
         """Add a site under a unique name, and return the name."""
-        while name in self.site_names:
-            name += "_"
+        name = unique_name(name, self.site_names)
         self.site_names.add(name)
         site = etree.Element("site", {"name": name} | placement_attributes(placement))
         first = body.find("body")

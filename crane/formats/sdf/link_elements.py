@@ -11,12 +11,12 @@ from lxml import etree
 
 from crane.common.errors import CraneWarning
 from crane.common.samples import Array
-from crane.description.kinematic_tree import Inertial
+from crane.description.kinematic_tree import TENSOR_ATTRIBUTES, Inertial
 from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
 from crane.formats.sdf.frame_poses import SdfFramePoses
 from crane.formats.sdf.model_scope import ModelScope, NoteFunction, SdfElement
 from crane.formats.visuals.urdf_shapes import find_mesh_file, read_meshes
-from crane.formats.xml_file import TENSOR_ATTRIBUTES, add_inertial, add_origin
+from crane.formats.xml_file import add_inertial, add_origin
 
 _DEFAULT_DENSITY = 1000.0  # [kg/m3], default of SDF
 

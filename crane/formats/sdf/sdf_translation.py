@@ -17,7 +17,13 @@ from lxml import etree
 from crane.common.errors import CraneWarning, DescriptionError, suggest_names
 from crane.common.package_search import load_options
 from crane.description.force_elements import ForceElement
-from crane.description.kinematic_tree import Joint, Limits, to_vector
+from crane.description.kinematic_tree import (
+    TENSOR_ATTRIBUTES,
+    Joint,
+    Limits,
+    to_vector,
+    unique_name,
+)
 from crane.description.pinocchio_conversion import xyz_rpy_from_se3
 from crane.formats.conversion_notes import ConversionNotes
 from crane.formats.sdf.frame_poses import SdfFramePoses, canonical_link
@@ -63,7 +69,7 @@ _KNOWN_CHILDREN: Mapping[str, set[str]] = {
     "inertial": {
         "pose", "mass", "inertia", "density", "fluid_added_mass", "frame", "auto_inertia_params",
     },
-    "inertia": {"ixx", "ixy", "ixz", "iyy", "iyz", "izz"},
+    "inertia": {*TENSOR_ATTRIBUTES},
     "mimic": {"multiplier", "offset", "reference"},
     "link": {
         "pose", "inertial", "visual", "collision", "sensor", "plugin", "gravity", "self_collide",
@@ -249,8 +255,7 @@ class _SdfTranslation:
         return name
 
     def _unique_link_name(self, name: str) -> str:
-        while name in self._link_poses:
-            name += "_"
+        name = unique_name(name, self._link_poses)
         self._link_poses[name] = pin.SE3.Identity()
         return name
 

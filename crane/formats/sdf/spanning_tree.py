@@ -8,6 +8,7 @@ import pinocchio as pin
 
 from crane.common.errors import CraneWarning
 from crane.common.package_search import load_options
+from crane.description.kinematic_tree import unique_name
 from crane.formats.conversion_notes import ConversionNotes
 from crane.formats.sdf.frame_poses import canonical_link
 from crane.formats.sdf.model_scope import ModelScope, SdfElement
@@ -192,8 +193,6 @@ def ground_edges(
     used_names = {edge.name for edge in edges}
     added = []
     for link in unattached:
-        name = f"{link}_{suffix}"
-        while name in used_names:
-            name += "_"
+        name = unique_name(f"{link}_{suffix}", used_names)
         added.append(SdfJointEdge(name, kind, WORLD_NODE, link, link_poses[link], links[link]))
     return added

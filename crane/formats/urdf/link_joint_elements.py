@@ -13,6 +13,7 @@ from crane.description.findings import FollowUpError, error_recovery, is_strict,
 from crane.description.force_elements import Friction
 from crane.description.kinematic_tree import (
     MULTI_FREEDOM_TYPES,
+    TENSOR_ATTRIBUTES,
     Inertial,
     Joint,
     Limits,
@@ -61,8 +62,7 @@ def _read_inertial(xml: XmlFile, label: str, inertial: etree._Element, is_moved:
         raise FollowUpError(f"{label} has no inertia")
     mass = xml.number(mass_tag, "value", f"the mass of {label}")
     tensor = tuple(
-        xml.number(tensor_tag, key, f"the inertia of {label}")
-        for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        xml.number(tensor_tag, key, f"the inertia of {label}") for key in TENSOR_ATTRIBUTES
     )
     if mass < 0:
         raise xml.error_at(mass_tag, f"{label} has the mass {mass:g} kg, give a positive one")

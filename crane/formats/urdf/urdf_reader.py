@@ -15,7 +15,13 @@ from crane.description.findings import (
     record_parsed_file,
 )
 from crane.description.force_elements import Friction
-from crane.description.kinematic_tree import MULTI_FREEDOM_TYPES, Joint, Link, Tree
+from crane.description.kinematic_tree import (
+    MULTI_FREEDOM_TYPES,
+    TENSOR_ATTRIBUTES,
+    Joint,
+    Link,
+    Tree,
+)
 from crane.description.specification import (
     STANDARD_GRAVITY,
     Chain,
@@ -74,7 +80,7 @@ _ATTRIBUTES = {
     "origin": {"xyz", "rpy"},
     "axis": {"xyz"},
     "mass": {"value"},
-    "inertia": {"ixx", "ixy", "ixz", "iyy", "iyz", "izz"},
+    "inertia": {*TENSOR_ATTRIBUTES},
     "limit": {"lower", "upper", "effort", "velocity"},
     "dynamics": {"damping", "friction"},
 }
