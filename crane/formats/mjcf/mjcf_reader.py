@@ -24,12 +24,9 @@ from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rp
 from crane.description.rotation_vectors import with_rotation_vectors
 from crane.description.specification import Chain, MachineSpec, source_locations
 from crane.formats.machine_file.structure_sections import TreeBuilder
-from crane.formats.mjcf.actuator_cylinders import read_cylinders
+from crane.formats.mjcf.actuator_cylinders import MjcfCylinders
 from crane.formats.mjcf.equality_constraints import MjcfFrames, read_equality_constraints
-from crane.formats.mjcf.model_features import (
-    read_drives,
-    read_joint_effects,
-)
+from crane.formats.mjcf.model_features import ModelFeatures
 from crane.formats.mjcf.mujoco_file import MujocoFile, pose
 from crane.formats.mjcf.unsupported_features import note_unsupported_features
 
@@ -83,20 +80,19 @@ class _MjcfReader:
             self._add_fixed_joint(link, self.body_links[body], placement)
         used_names = {*self.links, *self.joints, *(loop.name for loop in loops)}
         qpos = self._home_coordinates()
-        cylinders = read_cylinders(mjcf, frames.link_of_site, used_names, qpos)
+        cylinders = MjcfCylinders(mjcf, frames.link_of_site, used_names, qpos)
         self.links |= {x.name: x for x in cylinders.parts if isinstance(x, Link)}
         self.joints |= {x.name: x for x in cylinders.parts if isinstance(x, Joint)}
         loops += tuple(cylinders.loops)
-        effects = read_joint_effects(mjcf, self.series_joints, frames.link_of_site, cylinders)
-        drives = read_drives(mjcf, self.series_joints, cylinders)
+        features = ModelFeatures(mjcf, self.series_joints, frames.link_of_site, cylinders)
         note_unsupported_features(mjcf, cylinders)
         tree = TreeBuilder(
-            with_rotor_inertias(Tree(self.links, self.joints), effects.rotor_inertias)
+            with_rotor_inertias(Tree(self.links, self.joints), features.rotor_inertias)
         )
         for loop in loops:
             tree.check_loop(loop)
         active = self._listed_joints("active")
-        for drive in drives if not active else ():
+        for drive in features.drives.values() if not active else ():
             # one joint of each drive: its other joints depend on that, or are other coordinates
             active += [x for x in drive.factors if x not in {*active, *cylinders.resting}][:1]
         free = tuple(self._listed_joints("free"))
@@ -112,14 +108,14 @@ class _MjcfReader:
             loops=loops,
             active=tuple(active) if active or loops or couplings else None,
             home=home,
-            friction=effects.friction,
-            forces=tuple(effects.springs),
-            ropes=tuple(effects.ropes),
+            friction=features.friction,
+            forces=tuple(features.springs),
+            ropes=tuple(features.ropes),
             tip=tip,
             couplings=couplings,
             source_locations=source_locations(loops, couplings) | home_locations,
             free=free,
-            drives=drives,
+            drives=tuple(features.drives.values()),
             gravity=(0.0,) * 3
             if "GRAVITY" in mjcf.disabled_features
             else to_vector(self.model.opt.gravity),

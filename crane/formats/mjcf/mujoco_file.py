@@ -333,6 +333,18 @@ class MujocoFile(ConversionNotes):
         if names := [self.name(object_type, index) for index in indices]:
             self.note_unsupported(feature, *names)
 
+    def tendon_path(self, tendon: int) -> list[tuple[str, int, float]]:
+        """Return the type, the index and the parameter of each object on the way of a tendon."""
+        model, start = self.model, self.model.tendon_adr[tendon]
+        return [
+            (
+                self.enumeration_name("Wrap", model.wrap_type[i]),
+                int(model.wrap_objid[i]),
+                float(model.wrap_prm[i]),
+            )
+            for i in range(start, start + model.tendon_num[tendon])
+        ]
+
     def transmission(self, actuator: int) -> tuple[str, int]:
         """Return the type of an actuator's transmission, such as JOINT, and its target's index."""
         kind = self.enumeration_name("Trn", self.model.actuator_trntype[actuator])
@@ -384,8 +396,4 @@ def pose(quaternion: np.ndarray, position: np.ndarray) -> pin.SE3:
 
     A quaternion of length zero is no rotation.
     """
-    length = float(np.linalg.norm(quaternion))
-    if length == 0:
-        return pin.SE3(np.eye(3), position.copy())
-    w, x, y, z = (float(value) / length for value in quaternion)
-    return pin.SE3(pin.Quaternion(w, x, y, z).toRotationMatrix(), position.copy())
+    return pin.SE3(pin.Quaternion(*quaternion).normalized().toRotationMatrix(), position.copy())

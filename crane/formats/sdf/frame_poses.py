@@ -67,14 +67,10 @@ class SdfFramePoses:
         self, scope: ModelScope, inner: ModelScope, referrer: SdfElement
     ) -> pin.SE3:
         """Return the pose of a model that is nested in a scope at any depth."""
-        steps = []
-        while inner is not scope and inner.parent is not None:
-            steps.append((inner.parent, inner.name))
-            inner = inner.parent
-        placement = pin.SE3.Identity()
-        for parent, name in reversed(steps):
-            placement = placement * self.pose_in_scope(parent, name, referrer)
-        return placement
+        if inner is scope or inner.parent is None:
+            return pin.SE3.Identity()
+        parent_pose = self.nested_model_pose(scope, inner.parent, referrer)
+        return parent_pose * self.pose_in_scope(inner.parent, inner.name, referrer)
 
     def _model_pose(self, scope: ModelScope, model: ModelScope, base: str) -> pin.SE3:
         """Return the pose of a model's frame in the parent scope."""

@@ -6,6 +6,7 @@ coupled to its rotation q by s = pitch q / 2 pi. A gearbox couples the angles of
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,12 +18,14 @@ from crane.formats.sdf.frame_poses import SdfFramePoses, find_link
 from crane.formats.sdf.model_scope import ModelScope, SdfElement, sdf_version
 
 WORLD_NODE = "::world"  # not a possible name of a link
-_SINGLE_FREEDOM_TYPES = {
-    "revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic",
+_EDGE_KINDS = {  # of joints that are one edge
+    "revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": "fixed",
+    "ball": "spherical",
 }  # fmt: skip
 _TWO_FREEDOM_TYPES = ("universal", "revolute2")
 _AXISLESS_TYPES = ("fixed", "ball")
-JOINT_TYPES = (*_SINGLE_FREEDOM_TYPES, *_TWO_FREEDOM_TYPES, *_AXISLESS_TYPES, "screw", "gearbox")
+JOINT_TYPES = (*_EDGE_KINDS, *_TWO_FREEDOM_TYPES, "screw", "gearbox")
+_PARALLEL_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ class SdfJointEdge:
 
     Attributes:
         name: Name in the whole machine.
-        kind: "revolute", "prismatic", "fixed" or "ball".
+        kind: "revolute", "prismatic", "fixed" or "spherical".
         parent: Parent node: the name of a link, or `WORLD_NODE`.
         child: Child node.
         placement: The joint's frame at coordinate zero, in the frame of the top model.
@@ -89,18 +92,32 @@ class CoupledCoordinate:
     item: SdfElement
 
 
-@dataclass(frozen=True)
-class Gearbox:
-    """A coupling q_2 = -ratio q_1 of the angles from a reference link to two links.
+class DisjointSets:
+    """Disjoint sets of names (union-find)."""
 
-    The directions (3,) of both angles are in the frame of the top model.
-    """
+    def __init__(self) -> None:
+        self._parents: dict[str, str] = {}
 
-    reference: str
-    links: tuple[str, str]
-    directions: tuple[np.ndarray, np.ndarray]
-    ratio: float
-    item: SdfElement
+    def representative(self, name: str) -> str:
+        """Return the representative of the set that a name belongs to."""
+        while (parent := self._parents.get(name, name)) != name:
+            self._parents[name] = name = self._parents.get(parent, parent)
+        return name
+
+    def join(self, first: str, second: str) -> bool:
+        """Join the sets of two names, and return whether they were different."""
+        root, other_root = self.representative(first), self.representative(second)
+        self._parents[other_root] = root
+        return root != other_root
+
+
+def rigid_bodies(edges: Sequence[SdfJointEdge]) -> DisjointSets:
+    """Return the sets of links that fixed joints join to one body."""
+    bodies = DisjointSets()
+    for edge in edges:
+        if edge.kind == "fixed":
+            bodies.join(edge.parent, edge.child)
+    return bodies
 
 
 class SdfJoints:
@@ -113,14 +130,13 @@ class SdfJoints:
     Attributes:
         edges: Joints in the order of the file.
         coupled_coordinates: Coordinates that depend on others.
-        gearboxes: Gearboxes.
     """
 
     def __init__(self, top: ModelScope, frames: SdfFramePoses):
         self._top, self._frames = top, frames
         self.edges: list[SdfJointEdge] = []
         self.coupled_coordinates: list[CoupledCoordinate] = []
-        self.gearboxes: list[Gearbox] = []
+        self._gearboxes: list[tuple[SdfElement, tuple[str, str], list[np.ndarray], str]] = []
         self._freedom_names: dict[str, list[str]] = {}  # joint -> its coordinates
         scopes = [scope for scope in top.nested_scopes() if not scope.is_static]
         for scope in scopes:
@@ -129,6 +145,7 @@ class SdfJoints:
         for scope in scopes:
             for joint in scope.joints.values():
                 self._read_mimic(scope, joint)
+        self._add_gear_couplings()
         leaders = {x for f in self.coupled_coordinates for x in (f.name, f.leader)}
         self.edges = [
             dataclasses.replace(edge, is_coupled=True) if edge.name in leaders else edge
@@ -159,12 +176,8 @@ class SdfJoints:
         self._freedom_names[name] = [name]
         if kind == "gearbox":
             reference = self._end_node(scope, joint, "gearbox_reference_body")
-            first, second = (np.asarray(placement.rotation @ axis.direction) for axis in axes)
-            self.gearboxes.append(
-                Gearbox(
-                    reference, ends, (first, second), joint.number("gearbox_ratio", 1.0), joint
-                )
-            )
+            directions = [np.asarray(placement.rotation @ axis.direction) for axis in axes]
+            self._gearboxes.append((joint, ends, directions, reference))
         if kind in _TWO_FREEDOM_TYPES:
             parts = [f"{name}_1", f"{name}_2"]
             self._freedom_names[name] = parts
@@ -180,9 +193,9 @@ class SdfJoints:
             self.coupled_coordinates.append(
                 CoupledCoordinate(parts[1], name, travel_per_radian, 0.0, joint)
             )
-        if kind in (*_SINGLE_FREEDOM_TYPES, *_AXISLESS_TYPES):
-            edge_kind, axis = _SINGLE_FREEDOM_TYPES.get(kind, kind), axes[0] if axes else None
-            self.edges.append(SdfJointEdge(name, edge_kind, *ends, placement, joint, axis))
+        if kind in _EDGE_KINDS:
+            axis = axes[0] if axes else None
+            self.edges.append(SdfJointEdge(name, _EDGE_KINDS[kind], *ends, placement, joint, axis))
 
     def _end_node(self, scope: ModelScope, joint: SdfElement, tag: str) -> str:
         name = joint.text(tag)
@@ -259,6 +272,45 @@ class SdfJoints:
             )
         )  # fmt: skip
         self.edges += [dataclasses.replace(first, composite_joint=joint.name), second]
+
+    def _add_gear_couplings(self) -> None:
+        """Add s_2 q_2 = -ratio s_1 q_1 with the signs s of the angles to both links of each gear.
+
+        Raises:
+            DescriptionError: No joint turns a link against the reference about the gear's axis.
+        """
+        bodies = rigid_bodies(self.edges)
+        for item, links, directions, reference in self._gearboxes:
+            (first, first_sign), (second, second_sign) = (
+                self._gear_angle(item, bodies, reference, link, direction)
+                for link, direction in zip(links, directions, strict=True)
+            )
+            factor = -item.number("gearbox_ratio", 1.0) * first_sign / second_sign
+            self.coupled_coordinates.append(CoupledCoordinate(second, first, factor, 0.0, item))
+
+    def _gear_angle(
+        self,
+        item: SdfElement,
+        bodies: DisjointSets,
+        reference: str,
+        link: str,
+        direction: np.ndarray,
+    ) -> tuple[str, float]:
+        """Return the joint between the reference and a link, and the sign of its coordinate."""
+        required_bodies = bodies.representative(reference), bodies.representative(link)
+        for edge in self.edges:
+            ends = bodies.representative(edge.parent), bodies.representative(edge.child)
+            if edge.kind != "revolute" or edge.axis is None or {*ends} != {*required_bodies}:
+                continue
+            cosine = float(direction @ edge.placement.rotation @ edge.axis.direction)
+            if abs(abs(cosine) - 1) <= _PARALLEL_TOLERANCE:
+                sign = 1.0 if ends == required_bodies else -1.0
+                return edge.name, float(np.sign(cosine)) * sign
+        raise item.error(
+            f"{item.label}: no joint turns '{link.removeprefix('::')}' against "
+            f"'{reference.removeprefix('::')}' "
+            "about the gear's axis, name another gearbox_reference_body",
+        )
 
     def _read_mimic(self, scope: ModelScope, joint: SdfElement) -> None:
         """Read axes that mimic an axis of another joint."""

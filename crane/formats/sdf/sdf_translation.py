@@ -32,14 +32,14 @@ from crane.formats.sdf.model_scope import ModelReader, ModelScope, SdfElement
 from crane.formats.sdf.sdf_joints import (
     WORLD_NODE,
     CoupledCoordinate,
+    DisjointSets,
     SdfAxis,
     SdfJointEdge,
     SdfJoints,
+    rigid_bodies,
 )
 from crane.formats.sdf.spanning_tree import (
-    DisjointSets,
     breadth_first,
-    gear_couplings,
     ground_edges,
     spanning_tree,
 )
@@ -158,11 +158,6 @@ class _SdfTranslation:
             canonical_link(self._top, self._top.item)  # raises
         joints = SdfJoints(self._top, self._frames)
         edges = [_fix_locked_joint(edge, self._notes) for edge in joints.edges]
-        gears = gear_couplings(edges, joints.gearboxes, _rigid_bodies(joints.edges))
-        geared_names = {name for gear in gears for name in (gear.name, gear.leader)}
-        edges = [
-            dataclasses.replace(x, is_coupled=True) if x.name in geared_names else x for x in edges
-        ]
         edges += ground_edges(edges, self._top, self._links, self._link_poses, self._notes)
         for edge in edges:
             if edge.composite_joint:
@@ -174,7 +169,7 @@ class _SdfTranslation:
         for edge in breadth_first(tree, DisjointSets(), WORLD_NODE):
             self._add_joint(edge, edge.parent in placed, driven_joints)
             placed |= {edge.parent, edge.child}
-        self._add_mimics([*joints.coupled_coordinates, *gears], {edge.name for edge in tree})
+        self._add_mimics(joints.coupled_coordinates, {edge.name for edge in tree})
         tree_edge_ids = {id(edge) for edge in tree}
         self._add_loops([edge for edge in edges if id(edge) not in tree_edge_ids], tree)
         if self._initial_positions:
@@ -196,7 +191,7 @@ class _SdfTranslation:
         self._set_source_location(
             etree.SubElement(self._robot, "link", name=self._ground_link), self._top.item
         )
-        bodies = _rigid_bodies(edges)
+        bodies = rigid_bodies(edges)
         for name, link in self._links.items():
             scope = self._scopes[name]
             is_moving = bodies.representative(name) != bodies.representative(WORLD_NODE)
@@ -222,9 +217,7 @@ class _SdfTranslation:
         axis = edge.axis
         placement = xyz_rpy_from_se3(self._link_poses[parent].actInv(edge.placement))
         ends = self._link_name(parent), self._joint_child_link(edge, child)
-        joint = Joint(
-            edge.name, {"ball": "spherical"}.get(edge.kind, edge.kind), *ends, "", *placement
-        )
+        joint = Joint(edge.name, edge.kind, *ends, "", *placement)
         if axis is not None:
             direction = to_vector(axis.direction if is_forward else -axis.direction)
             joint = dataclasses.replace(joint, axis=direction, limits=axis.limits)
@@ -277,7 +270,7 @@ class _SdfTranslation:
             self._set_source_location(mimic, follower.item)
 
     def _add_loops(self, loop_edges: list[SdfJointEdge], tree: list[SdfJointEdge]) -> None:
-        bodies = _rigid_bodies(tree)
+        bodies = rigid_bodies(tree)
         for edge in loop_edges:
             is_one_body = bodies.representative(edge.parent) == bodies.representative(edge.child)
             if is_one_body and edge.kind == "fixed":
@@ -287,8 +280,8 @@ class _SdfTranslation:
                     f"{edge.item.label} joins '{edge.parent}' and '{edge.child}', which are one "
                     "body: leave it out",
                 )
-            kind, axis = {"ball": "spherical"}.get(edge.kind, edge.kind), edge.axis
-            loop = etree.SubElement(self._robot, "loop", name=edge.name, type=kind)
+            axis = edge.axis
+            loop = etree.SubElement(self._robot, "loop", name=edge.name, type=edge.kind)
             for tag, link in (("predecessor", edge.parent), ("successor", edge.child)):
                 end = etree.SubElement(loop, tag, link=self._link_name(link))
                 add_origin(end, *xyz_rpy_from_se3(self._link_poses[link].actInv(edge.placement)))
@@ -301,15 +294,6 @@ class _SdfTranslation:
                     "friction and springs of joints that close loops", edge.name
                 )
             self._set_source_location(loop, edge.item)
-
-
-def _rigid_bodies(edges: list[SdfJointEdge]) -> DisjointSets:
-    """Return the sets of links that fixed joints join to one body."""
-    bodies = DisjointSets()
-    for edge in edges:
-        if edge.kind == "fixed":
-            bodies.join(edge.parent, edge.child)
-    return bodies
 
 
 def _fix_locked_joint(edge: SdfJointEdge, notes: ConversionNotes) -> SdfJointEdge:
