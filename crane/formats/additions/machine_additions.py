@@ -13,15 +13,14 @@ from crane.common.package_search import use_load_options
 from crane.formats.additions.distance_curve import (
     DistanceCurve,
     distance_curve,
-    fit_to_joint_range,
     warn_about_masses,
     warn_about_strokes,
 )
 from crane.formats.additions.open_loop_search import LoopProposal, propose_loops
 from crane.formats.additions.steel_cylinder import (
+    AttachmentPair,
     SteelCylinder,
     add_barrel_and_rod,
-    joints_between,
     parse_attachment_point,
 )
 from crane.formats.machine_file.machine_reader import read_machine_spec
@@ -133,19 +132,16 @@ def add_cylinder(
         raise InputError(f"the cylinder's name is {name!r}, give a word")
     loaded = load(machine)
     file = machine_file_path(out, f"{portable_file_name(f'{loaded.name}_{name}')}.yaml")
-    points = [parse_attachment_point(loaded, text) for text in between]
+    barrel, rod_eye = (parse_attachment_point(loaded, text) for text in between)
+    points = AttachmentPair(loaded, (barrel, rod_eye))
     draft = MachineDraft(loaded, file.stem)
     _check_names_are_free(loaded, name)
-    distances = distance_curve(loaded, points)
-    start_index, reached_distances = fit_to_joint_range(distances, cylinder, points, loaded)
-    joint_path = [
-        joint.name
-        for joint in joints_between(loaded.tree.parent_joints, points[0].link, points[1].link)
-    ]
+    distances = distance_curve(points)
+    start_index, reached_distances = distances.fit_cylinder(cylinder)
+    joint_path = [joint.name for joint in points.joints]
     shares_load = loaded.unit(distances.joint) == "m" and distances.joint not in joint_path
-    notes = _choice_notes(distances, start_index, shares_load) + add_barrel_and_rod(
-        draft, loaded, name, points, cylinder, distances.configurations[start_index]
-    )
+    notes = _choice_notes(distances, start_index, shares_load)
+    notes += add_barrel_and_rod(draft, name, points, cylinder, distances.samples[start_index][1])
     _replace_drive(draft, loaded, name, None if shares_load else distances.joint)
     check_files_are_new(draft, file, force)
     with fill_folder(file.parent) as output_folder:
