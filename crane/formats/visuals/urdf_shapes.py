@@ -3,6 +3,7 @@
 A shape that cannot be drawn is reported and left out; it is no reason to refuse a machine.
 """
 
+import io
 import json
 import os
 import signal
@@ -34,6 +35,7 @@ _MAX_NAME_LENGTH = 100  # characters shown
 _MAX_FILE_SIZE = 200e6  # bytes
 _MAX_CACHED_SIZE = 4 << 20  # bytes of a cached file, and of its answer
 _MAX_ATTEMPTS = 3
+_DAMAGE_ERRORS = ValueError, KeyError, TypeError, EOFError  # of an answer that is not complete
 _TIMEOUT_PER_FILE = 10 * mesh_process.MAX_SECONDS  # [s], for systems without CPU limits
 
 
@@ -82,8 +84,8 @@ def read_meshes(files: Iterable[Path]) -> dict[Path, tuple[MeshPart, ...] | str]
         cached = None if name is None else file_cache.read_entry(name)
         entry_names[file] = name
         if cached is not None:
-            with suppress(ValueError, KeyError, TypeError):  # else it is read anew
-                found[file], _ = _parse_answer(cached)
+            with suppress(*_DAMAGE_ERRORS):  # else it is read anew
+                found[file], _ = _parse_answer(io.BytesIO(cached))
                 del entry_names[file]
     for _ in range(_MAX_ATTEMPTS):
         remaining_triangles = mesh_process.MAX_TRIANGLES - sum(
@@ -94,7 +96,7 @@ def read_meshes(files: Iterable[Path]) -> dict[Path, tuple[MeshPart, ...] | str]
         )
         answers = _run_mesh_process(list(entry_names), remaining_triangles) if entry_names else []
         for (file, name), answer in zip(list(entry_names.items()), answers, strict=False):
-            found[file], is_self_contained = _parse_answer(answer)
+            found[file], is_self_contained = _parse_answer(io.BytesIO(answer))
             del entry_names[file]
             is_small = len(answer) <= _MAX_CACHED_SIZE
             if name and is_small and is_self_contained and name == _cache_entry_name(file):
@@ -129,14 +131,12 @@ def _run_mesh_process(files: list[Path], max_triangles: int) -> list[bytes]:
         output, status = completed.stdout, completed.returncode
     except subprocess.TimeoutExpired as late:
         output, status = late.stdout or b"", -signal.SIGTERM
-    answers, position = [], 0
-    while (end := output.find(b"\n", position)) >= 0:  # complete answers
-        parts = json.loads(output[position:end]).get("parts", ())
-        end += 1 + sum(8 * 3 * (part["vertices"] + part["faces"]) for part in parts)
-        if end > len(output):
-            break
-        answers.append(output[position:end])
-        position = end
+    answers, stream = [], io.BytesIO(output)
+    with suppress(*_DAMAGE_ERRORS):  # after the complete answers
+        for _ in files:
+            start = stream.tell()
+            _parse_answer(stream)
+            answers.append(output[start : stream.tell()])
     if len(answers) < len(files):
         reason = "damaged"
         if status in (-signal.SIGTERM, -signal.SIGXCPU):
@@ -145,20 +145,16 @@ def _run_mesh_process(files: list[Path], max_triangles: int) -> list[bytes]:
     return answers
 
 
-def _parse_answer(answer: bytes) -> tuple[tuple[MeshPart, ...] | str, bool]:
+def _parse_answer(answer: io.BytesIO) -> tuple[tuple[MeshPart, ...] | str, bool]:
     """Return the triangles of an answer, or its error text, and whether no other file was read."""
-    position = answer.index(b"\n") + 1
-    header = json.loads(answer[:position])
+    header = json.loads(answer.readline())
     if "wrong" in header:
         return str(header["wrong"]), False
-    parts = []
-    for part in header["parts"]:
-        v, f = 3 * part["vertices"], 3 * part["faces"]
-        vertices = np.frombuffer(answer, np.float64, v, position).reshape(-1, 3)
-        faces = np.frombuffer(answer, np.int64, f, position + 8 * v).reshape(-1, 3)
-        parts.append(MeshPart(vertices, faces, part["colour"] and tuple(part["colour"])))
-        position += 8 * (v + f)
-    return tuple(parts), bool(header.get("alone"))
+    parts = tuple(
+        MeshPart(np.load(answer), np.load(answer), part["colour"] and tuple(part["colour"]))
+        for part in header["parts"]
+    )
+    return parts, bool(header.get("alone"))
 
 
 @dataclass(frozen=True)
