@@ -25,8 +25,8 @@ from crane.formats.visuals.urdf_shapes import (
     CylinderShape,
     MeshShape,
     SphereShape,
+    UrdfShapes,
     find_mesh_file,
-    read_shapes,
 )
 from crane.formats.xml_file import XmlFile
 from crane.view.page import report
@@ -143,7 +143,7 @@ def test_colours_go_by_name_wherever_they_stand(tmp_path):
     )  # fmt: skip
     blue = '<material name="blue"><color rgba="0 0 1 1"/></material>'
     path.write_text(path.read_text().replace("</robot>", f"{blue}</robot>"))
-    drawn = read_shapes(XmlFile(path))
+    drawn = UrdfShapes(XmlFile(path))
     assert not drawn.problems
     colours = [visual.colour for visual in drawn.shapes["visual"]]
     assert colours == [(1, 0, 0, 0.5), (1, 0, 0, 0.5), (0, 0, 1, 1), DEFAULT_COLOUR]
@@ -153,7 +153,7 @@ def test_a_capsule_is_a_cylinder_between_two_balls(tmp_path):
     """Volume by points that fall into it: pi r^2 l + 4/3 pi r^3."""
     drawn = '<visual><origin xyz="0 0 1" rpy="0 1.5707963267948966 0"/><geometry>'
     drawn += '<capsule radius="0.1" length="0.4"/></geometry></visual>'
-    found = read_shapes(XmlFile(arm(tmp_path, drawn))).shapes["visual"]
+    found = UrdfShapes(XmlFile(arm(tmp_path, drawn))).shapes["visual"]
     assert [type(visual.shape) for visual in found] == [CylinderShape, SphereShape, SphereShape]
     corners = np.concatenate([visual.bounding_corners() for visual in found])
     np.testing.assert_allclose(corners.min(axis=0), [-0.3, -0.1, 0.9], atol=1e-12)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from itertools import permutations
 from pathlib import Path
 
 from crane.common.errors import DescriptionError, suggest_names
@@ -40,7 +41,9 @@ _MACHINE_FILE_PATTERN = re.compile(r"^(chains|name)\s*:", re.MULTILINE)
 _LOOP_TYPES = {"3d": "spherical", "6d": "fixed"}
 _AXES = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
 _JOINT_TYPES = ("SPHERICAL", "FIXED", "UJOINT_XY", "UJOINT_YZ", "UJOINT_ZX", "CARDAN")
-_UNIVERSAL_PATTERN = re.compile(r"UJOINT_([XYZ])([XYZ])")
+_UNIVERSAL_AXES = {"CARDAN": ("X", "Y")} | {
+    f"UJOINT_{first}{second}": (first, second) for first, second in permutations("XYZ", 2)
+}
 
 
 def is_parallel_robot(file: Path) -> bool:
@@ -69,13 +72,8 @@ def read_parallel_robot(path: Path) -> MachineSpec:
     replaced_types = _replaced_joint_types(top)
     urdf = read_urdf(file, lambda xml: _replace_joint_types(xml, replaced_types, top))
     for joint, kind in replaced_types.items():
-        if kind not in ("SPHERICAL", "FIXED"):
-            universal_axes = _UNIVERSAL_PATTERN.fullmatch(kind)
-            urdf = _split_universal_joint(
-                urdf,
-                joint,
-                (universal_axes[1], universal_axes[2]) if universal_axes else ("X", "Y"),
-            )
+        if kind in _UNIVERSAL_AXES:
+            urdf = _split_universal_joint(urdf, joint, _UNIVERSAL_AXES[kind])
     if urdf.loops:
         raise DescriptionError(
             f"{urdf.loops[0].source_location}: the loops stand in {path.name}, keep <loop> or "
@@ -122,10 +120,7 @@ def _replaced_joint_types(top: YamlSection) -> dict[str, str]:
             "joint_type", f"{len(types)} joint types for {len(names)} joints, give one of each"
         )
     for kind in types:
-        universal_axes = _UNIVERSAL_PATTERN.fullmatch(kind)
-        if kind not in _JOINT_TYPES and (
-            universal_axes is None or universal_axes[1] == universal_axes[2]
-        ):
+        if kind not in (*_JOINT_TYPES, *_UNIVERSAL_AXES):
             raise top.error_at(
                 "joint_type",
                 f"joint type '{kind}' is unknown, {suggest_names(_JOINT_TYPES, kind)}",
@@ -192,21 +187,16 @@ def _read_loops(top: YamlSection, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
         raise top.error_at(
             "type", f"{len(kinds)} types for {len(pairs)} closed loops, give each one"
         )
-    child_links = {joint.name: joint.child for joint in tree.tree.joints.values()}
+    link_of_name = {joint.name: joint.child for joint in tree.tree.joints.values()}
+    link_of_name |= dict(zip(tree.links, tree.links, strict=True))
     loops: dict[str, LoopSpec] = {}
     for pair, kind in zip(pairs, kinds, strict=True):
         if kind.lower() not in _LOOP_TYPES:
             raise top.error_at("type", f"a closed loop has the type '{kind}', write 3d or 6d")
-        links = [name if name in tree.links else child_links.get(name, "") for name in pair]
-        unknown_frames = [name for name, link in zip(pair, links, strict=True) if not link]
-        if unknown_frames:
-            raise top.error_at(
-                "closed_loop",
-                (
-                    f"the frame '{unknown_frames[0]}' is unknown, "
-                    f"{suggest_names(tree.links, unknown_frames[0])}"
-                ),
-            )
+        for frame in pair:
+            if frame not in link_of_name:
+                known = suggest_names(tree.links, frame)
+                raise top.error_at("closed_loop", f"the frame '{frame}' is unknown, {known}")
         name = f"{pair[0]}_{pair[1]}"
         if name in loops:
             raise top.error_at(
@@ -215,8 +205,7 @@ def _read_loops(top: YamlSection, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
         loop = LoopSpec(
             name,
             _LOOP_TYPES[kind.lower()],
-            links[0],
-            links[1],
+            *(link_of_name[frame] for frame in pair),
             (0.0, 0.0, 1.0),
             top.source_location("closed_loop"),
         )

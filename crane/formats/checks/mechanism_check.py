@@ -81,14 +81,10 @@ def _report_with_gaps(
             text = text.replace(f"it {residual_text}", f"its smallest gap is {own_gap}")
     report_error(MechanismError(text, error.subject))
     for subject, gap in gaps.items():
-        problem = (
-            f"loop '{subject.removeprefix('loop ')}' stays open, too: its smallest gap is {gap}"
-        )
-        report_error(
-            MechanismError(
-                f"{spec.source_locations.get(subject, spec.path.name)}: {problem}", subject
-            )
-        )
+        location = spec.source_locations.get(subject, spec.path.name)
+        name = subject.removeprefix("loop ")
+        problem = f"loop '{name}' stays open, too: its smallest gap is {gap}"
+        report_error(MechanismError(f"{location}: {problem}", subject))
 
 
 def _loop_gaps(spec: MachineSpec, model: pin.Model, initial_guess: Array) -> dict[str, str]:
@@ -111,12 +107,11 @@ def _loop_gaps(spec: MachineSpec, model: pin.Model, initial_guess: Array) -> dic
         length = float(np.linalg.norm(phi[rows & equations.is_translation]))
         # rows of rotations are cosines of angles that are right ones when closed
         sine = min(1.0, float(np.linalg.norm(phi[rows & ~equations.is_translation])))
-        if max(length, sine) > _OPEN_TOLERANCE:
-            metres = length * equations.characteristic_length
-            length_text = f"{metres:.3g} m" if metres >= 1 else f"{1e3 * metres:.3g} mm"
-            angle_text = f"{np.degrees(np.arcsin(sine)):.3g} deg"
-            parts = ((length, length_text), (sine, angle_text))
-            open_parts = [text for gap, text in parts if gap > _OPEN_TOLERANCE]
+        metres = length * equations.characteristic_length
+        length_text = f"{metres:.3g} m" if metres >= 1 else f"{1e3 * metres:.3g} mm"
+        angle_text = f"{np.degrees(np.arcsin(sine)):.3g} deg"
+        parts = ((length, length_text), (sine, angle_text))
+        if open_parts := [text for gap, text in parts if gap > _OPEN_TOLERANCE]:
             gap_texts[f"loop {loop.name}"] = " and ".join(open_parts)
     return gap_texts
 
@@ -124,18 +119,14 @@ def _loop_gaps(spec: MachineSpec, model: pin.Model, initial_guess: Array) -> dic
 def _warn_about_limits(spec: MachineSpec, closure: Closure) -> None:
     coordinates = closure.equations.coordinates
     is_within_limits = within_limits(closure.equations, closure.home)
-    for column in closure.passive:
+    for column in closure.passive[~is_within_limits[closure.passive]]:
         name = coordinates.names[int(column)]
         lower, upper = coordinates.lower[column], coordinates.upper[column]
-        q = closure.home[column]
-        if not is_within_limits[column]:
-            location = spec.tree.joints[name].source_location
-            warnings.warn(
-                f"{location}: passive joint '{name}' is at {q:.4g} with the loops closed at home, "
-                f"outside of its limits {lower:g} to {upper:g}, widen them or correct the home",
-                CraneWarning,
-                stacklevel=2,
-            )
+        _warn(
+            f"{spec.tree.joints[name].source_location}: passive joint '{name}' is at "
+            f"{closure.home[column]:.4g} with the loops closed at home, outside of its limits "
+            f"{lower:g} to {upper:g}, widen them or correct the home"
+        )
 
 
 _MAX_SAMPLES, _MAX_SAMPLED_JOINTS = 150, 6000  # of the strokes; samples times joints

@@ -17,7 +17,7 @@ from crane.common.plausible_ranges import LONGEST
 from crane.common.samples import Array
 from crane.description.kinematic_tree import TENSOR_ATTRIBUTES, Inertial, inertia_problem
 from crane.description.specification import MachineSpec
-from crane.formats.visuals.urdf_shapes import MeshShape, UrdfShapes, Visual, read_shapes
+from crane.formats.visuals.urdf_shapes import MeshShape, UrdfShapes, Visual
 from crane.formats.xml_file import XmlFile
 from crane.hydraulics.circuit_elements import MAIN_PUMP, TANK_NODE
 from crane.hydraulics.components import Valve
@@ -68,7 +68,7 @@ _DUMMY_LIMITS = 1e-2, 1e-4  # [m], [kg] below which a link only represents a sen
 def warn_about_implausible_values(files: Sequence[XmlFile], spec: MachineSpec | None) -> None:
     """Warn of implausible values in parsed files and in the home configuration."""
     for xml in {xml.file: xml for xml in files}.values():
-        shapes = read_shapes(xml, ("visual", "collision"))
+        shapes = UrdfShapes(xml, ("visual", "collision"))
         _warn_about_shapes(shapes)
         if _warn_about_units(xml):  # inertias cannot be compared with sizes in other units
             continue
@@ -192,12 +192,11 @@ def _warn_about_body(
     com = read_numbers(origin, "xyz", 3)
     gyration_radius = math.sqrt(float(np.linalg.eigvalsh(tensor).max()) / float(mass[0]))
     joint_distance = max(joint_distance, 0.0 if com is None else float(np.linalg.norm(com)))
-    name = link.get("name")
-    for where, problem in _size_problems(
+    for tag, problem in _size_problems(
         bounds, joint_distance, gyration_radius, com, float(mass[0])
     ):
-        element = {"mass": mass_tag, "origin": origin, "inertia": tensor_tag}[where]
-        _warn(f"{xml.source_location(element)}: link '{name}' {problem}")
+        location = xml.source_location(inertial.find(tag))
+        _warn(f"{location}: link '{link.get('name')}' {problem}")
 
 
 def _size_problems(
@@ -298,8 +297,8 @@ def _node_problems(hydraulics: Hydraulics) -> Iterator[tuple[str, str]]:
     return_nodes = {node for x in valves for node in (x.return_a, x.return_b)} & {
         *hydraulics.lines
     }
-    kinds = {name: "line" for name in hydraulics.lines}
-    kinds |= {name: "accumulator" for name in hydraulics.accumulators}
+    kinds = dict.fromkeys(hydraulics.lines, "line")
+    kinds |= dict.fromkeys(hydraulics.accumulators, "accumulator")
     for name, kind in kinds.items():
         if name not in connected or (name in return_nodes and name not in drained_nodes):
             continue  # has an error already

@@ -142,8 +142,6 @@ def _read_machine(path: Path) -> MachineSpec:
     )
     friction |= _read_or_default(read_friction, {}, top, tree)
     forces = springs + _read_or_default(read_forces, (), top, tree)
-    gas_springs = _read_or_default(read_gas_springs, (), top, tree)
-    end_stops = _read_or_default(read_end_stops, (), top, tree)
     tip = _read_tip(top, tree)
     payload = _read_or_default(_read_payload, None, top, tree, tip)
     # a machine whose active joints are not named is not driven either: `load` proposes some
@@ -171,8 +169,8 @@ def _read_machine(path: Path) -> MachineSpec:
         home,
         friction,
         forces,
-        gas_springs,
-        end_stops,
+        _read_or_default(read_gas_springs, (), top, tree),
+        _read_or_default(read_end_stops, (), top, tree),
         tip,
         tasks,
         control,

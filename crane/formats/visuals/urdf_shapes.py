@@ -225,21 +225,6 @@ class Visual:
 
 
 @dataclass(frozen=True)
-class UrdfShapes:
-    """The shapes of a URDF.
-
-    Attributes:
-        shapes: Shapes by tag.
-        missing_meshes: File and line by name of each mesh whose file does not exist.
-        problems: Other problems, with file, line, consequence and advice.
-    """
-
-    shapes: Mapping[str, Sequence[Visual]]
-    missing_meshes: Mapping[str, str]
-    problems: Sequence[str]
-
-
-@dataclass(frozen=True)
 class _UnloadedMesh:
     """A mesh on a link that is not read yet: its name, scale (3,) and file."""
 
@@ -252,36 +237,27 @@ class _UnloadedMesh:
     source_location: str
 
 
-def read_shapes(
-    xml: XmlFile, tags: Sequence[str] = ("visual",), replacement: BoxShape | None = None
-) -> UrdfShapes:
-    """Read the shapes of a URDF that can be drawn.
+class UrdfShapes:
+    """The shapes of a URDF that can be drawn, and the problems with others.
 
     Args:
         xml: The file.
         tags: Tags of the elements of links to read: visual, collision.
         replacement: Shape in place of a mesh that cannot be read; None to leave it out.
+
+    Attributes:
+        shapes: Shapes by tag.
+        missing_meshes: File and line by name of each mesh whose file does not exist.
+        problems: Other problems, with file, line, consequence and advice.
     """
-    reader = _ShapeReader(xml)
-    shapes = {tag: reader.read_elements(tag) for tag in tags}
-    meshes = read_meshes(
-        shape.file
-        for found in shapes.values()
-        for shape in found
-        if isinstance(shape, _UnloadedMesh) and shape.file is not None
-    )
-    visuals = {
-        tag: [x for shape in found for x in reader.create_visuals(shape, meshes, replacement)]
-        for tag, found in shapes.items()
-    }
-    return UrdfShapes(visuals, reader.missing_meshes, tuple(dict.fromkeys(reader.problems)))
 
-
-class _ShapeReader:
-    """Reads the shapes of a file, and collects problems."""
-
-    def __init__(self, xml: XmlFile):
-        self.xml = xml
+    def __init__(
+        self,
+        xml: XmlFile,
+        tags: Sequence[str] = ("visual",),
+        replacement: BoxShape | None = None,
+    ):
+        self._xml, self._replacement = xml, replacement
         self.missing_meshes: dict[str, str] = {}
         self._damaged_meshes: dict[str, str] = {}
         self.problems: list[str] = []
@@ -293,11 +269,23 @@ class _ShapeReader:
                 if (colour := self._read_colour(material)) is not None
             }
         self.problems.clear()  # reported for the visuals that use them
+        found = {tag: self._read_elements(tag) for tag in tags}
+        meshes = read_meshes(
+            shape.file
+            for shapes in found.values()
+            for shape in shapes
+            if isinstance(shape, _UnloadedMesh) and shape.file is not None
+        )
+        self.shapes: Mapping[str, Sequence[Visual]] = {
+            tag: [x for shape in shapes for x in self._create_visuals(shape, meshes)]
+            for tag, shapes in found.items()
+        }
+        self.problems = list(dict.fromkeys(self.problems))
 
-    def read_elements(self, tag: str) -> list[Visual | _UnloadedMesh]:
+    def _read_elements(self, tag: str) -> list[Visual | _UnloadedMesh]:
         """Return the shapes of elements with a tag."""
         found: list[Visual | _UnloadedMesh] = []
-        for element in self.xml.root.iterfind(f"link/{tag}"):
+        for element in self._xml.root.iterfind(f"link/{tag}"):
             link = element.getparent().get("name", "").strip()
             try:
                 found += self._read_element(element, link, f"a {tag} of link '{link}'")
@@ -309,29 +297,29 @@ class _ShapeReader:
     def _read_element(
         self, element: etree._Element, link: str, label: str
     ) -> Sequence[Visual | _UnloadedMesh]:
-        xyz, rpy = self.xml.placement(element, label)
+        xyz, rpy = self._xml.placement(element, label)
         self._check_distance(element, label, xyz)
         placement = _pose_matrix(xyz, rpy)
-        material = self.xml.single_child(element, "material", label)
+        material = self._xml.single_child(element, "material", label)
         colour = None
         if material is not None:
             colour = self._read_colour(material) or self._colours.get(
                 material.get("name", "").strip()
             )
-        geometry = self.xml.single_child(element, "geometry", label)
+        geometry = self._xml.single_child(element, "geometry", label)
         shapes = [] if geometry is None else [x for x in geometry if isinstance(x.tag, str)]
         if len(shapes) != 1 or shapes[0].tag not in _SHAPE_TAGS:
             shape_text = ", ".join(f"<{shape.tag}>" for shape in shapes[:4]) or "no shape"
             listed = ", ".join(f"<{shape}>" for shape in _SHAPE_TAGS)
-            raise self.xml.error_at(element, f"{label} has {shape_text}, give one of {listed}")
+            raise self._xml.error_at(element, f"{label} has {shape_text}, give one of {listed}")
         shape = shapes[0]
         if shape.tag == "mesh":
             if not (name := shape.get("filename", "")):
-                raise self.xml.error_at(shape, f'{label} names no mesh, add filename="..."')
-            scale = self.xml.vector(shape, "scale", label, 3, (1.0, 1.0, 1.0))
+                raise self._xml.error_at(shape, f'{label} names no mesh, add filename="..."')
+            scale = self._xml.vector(shape, "scale", label, 3, (1.0, 1.0, 1.0))
             file, place = (
-                find_mesh_file(name, self.xml.file.parent),
-                self.xml.source_location(shape),
+                find_mesh_file(name, self._xml.file.parent),
+                self._xml.source_location(shape),
             )
             return [_UnloadedMesh(link, name, scale, file, placement, colour, place)]
         return [
@@ -356,10 +344,10 @@ class _ShapeReader:
     def _read_sizes(
         self, shape: etree._Element, key: str, label: str, count: int
     ) -> tuple[float, ...]:
-        sizes = self.xml.vector(shape, key, label, count)
+        sizes = self._xml.vector(shape, key, label, count)
         if min(sizes) <= 0:
             given = f'{key}="{shape.get(key)}"'
-            raise self.xml.error_at(shape, f"{given} of {label} is not positive, give metres")
+            raise self._xml.error_at(shape, f"{given} of {label} is not positive, give metres")
         self._check_distance(shape, label, sizes)
         return sizes
 
@@ -368,7 +356,9 @@ class _ShapeReader:
     ) -> None:
         largest = max(lengths, key=abs)
         if abs(largest) > _MAX_DISTANCE:
-            raise self.xml.error_at(element, f"{label} has a length of {largest:g} m, give metres")
+            raise self._xml.error_at(
+                element, f"{label} has a length of {largest:g} m, give metres"
+            )
 
     def _read_colour(self, material: etree._Element) -> Colour | None:
         """Return the colour of a material, None if it has no valid one."""
@@ -376,10 +366,10 @@ class _ShapeReader:
         if colour is None:
             return None
         try:
-            rgba = self.xml.vector(colour, "rgba", "a colour", 4)
+            rgba = self._xml.vector(colour, "rgba", "a colour", 4)
             if not 0 <= min(rgba) <= max(rgba) <= 1:
                 given = f'rgba="{colour.get("rgba")}"'
-                raise self.xml.error_at(
+                raise self._xml.error_at(
                     colour, f"{given} of a colour is not within 0 to 1, correct it"
                 )
         except DescriptionError as error:
@@ -388,11 +378,8 @@ class _ShapeReader:
         red, green, blue, opacity = rgba
         return red, green, blue, opacity
 
-    def create_visuals(
-        self,
-        mesh: Visual | _UnloadedMesh,
-        meshes: Mapping[Path, tuple[MeshPart, ...] | str],
-        replacement: BoxShape | None,
+    def _create_visuals(
+        self, mesh: Visual | _UnloadedMesh, meshes: Mapping[Path, tuple[MeshPart, ...] | str]
     ) -> list[Visual]:
         """Return a shape with the triangles of its mesh."""
         if isinstance(mesh, Visual):
@@ -401,9 +388,8 @@ class _ShapeReader:
         if len(name) >= _MAX_NAME_LENGTH:
             name = f"...{name[-_MAX_NAME_LENGTH:]}"
         mesh_label = f"{mesh.source_location}: mesh '{name}'"
-        box = (
-            [] if replacement is None else [Visual(mesh.link, replacement, mesh.placement, colour)]
-        )
+        shapes = [] if self._replacement is None else [self._replacement]
+        box = [Visual(mesh.link, shape, mesh.placement, colour) for shape in shapes]
         if mesh.file is None:
             self.missing_meshes.setdefault(name, mesh.source_location)
             return box
