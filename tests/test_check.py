@@ -367,8 +367,11 @@ INERTIAS = [
 UNITS = [
     seen(
         [
-            "ground.urdf:5: warning: 400 m in <origin> is a long way for a machine (3 such "
-            "in this file), write metres if these are millimetres",
+            *(
+                f"ground.urdf:{where} m in <origin> is a long way for a machine, write "
+                "metres if these are millimetres"
+                for where in ("5: warning: 400", "26: warning: 200", "41: warning: 400")
+            ),
             "rocker.urdf:17: warning: 300 m in <origin> is a long way for a machine, write "
             "metres if these are millimetres",
         ],

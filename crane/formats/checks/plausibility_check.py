@@ -103,10 +103,7 @@ def _warn_about_units(xml: XmlFile) -> bool:
         f"write {unit} if these are {other}"
         for unit, other in (("metres", "millimetres"), ("radians", "degrees"))
     )
-    limit_hint = f"{rotation_hint}, or make it continuous"
-    problems: dict[str, list[tuple[etree._Element, str]]] = {
-        rotation_hint: [], limit_hint: [], length_hint: [],
-    }  # fmt: skip
+    long_elements: list[tuple[etree._Element, str]] = []
     attributes = (
         ("origin", "rpy", 3), ("origin", "xyz", 3), ("box", "size", 3), ("cylinder", "length", 1),
         ("cylinder", "radius", 1), ("sphere", "radius", 1),
@@ -120,26 +117,24 @@ def _warn_about_units(xml: XmlFile) -> bool:
         largest = 0.0 if values is None else values[np.abs(values).argmax()]
         if key == "rpy" and abs(largest) > _REVOLUTION * 1.01:
             problem = f'rpy="{element.get("rpy")}" turns more than once'
-            problems[rotation_hint].append((element, problem))
+            _warn(f"{xml.source_location(element)}: {problem}, {rotation_hint}")
         if key != "rpy" and abs(largest) > LONGEST:
             problem = f"{largest:g} m in <{element.tag}> is a long way for a machine"
-            problems[length_hint].append((element, problem))
+            long_elements.append((element, problem))
     for joint in xml.root.iterfind("joint"):
         limit, label = joint.find("limit"), f"of joint '{joint.get('name')}'"
         limits = (read_numbers(limit, key, 1) for key in ("lower", "upper"))
         largest = max((float(end[0]) for end in limits if end is not None), key=abs, default=0.0)
         if joint.get("type") == "prismatic" and LONGEST < abs(largest) <= _NO_LIMIT:
-            problem = f"the limit {largest:g} m {label} is a long way"
-            problems[length_hint].append((limit, problem))
+            long_elements.append((limit, f"the limit {largest:g} m {label} is a long way"))
         if joint.get("type") == "revolute" and 2 * _REVOLUTION < abs(largest) <= _NO_LIMIT:
-            problem = f"the limit {largest:g} rad {label} is many turns"
-            problems[limit_hint].append((limit, problem))
-    for hint, found in problems.items():
-        found.sort(key=lambda item: item[0].sourceline or 0)
-        count_text = f" ({len(found)} such in this file)" if len(found) > 1 else ""
-        for element, problem in found[:1]:
-            _warn(f"{xml.source_location(element)}: {problem}{count_text}, {hint}")
-    return bool(problems[length_hint])
+            _warn(
+                f"{xml.source_location(limit)}: the limit {largest:g} rad {label} is many turns, "
+                f"{rotation_hint}, or make it continuous"
+            )
+    for element, problem in long_elements:
+        _warn(f"{xml.source_location(element)}: {problem}, {length_hint}")
+    return bool(long_elements)
 
 
 def _warn_about_home(spec: MachineSpec) -> None:

@@ -2,8 +2,9 @@
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Collection, Container, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Container, Mapping, Sequence
 from difflib import get_close_matches
+from functools import cache
 from pathlib import Path
 
 from lxml import etree
@@ -105,7 +106,6 @@ _FOREIGN_ELEMENTS = {
     "collision": {"verbose", "contact_coefficients", "surface", "contact", "map"},
     "visual": {"map"},
 }  # fmt: skip
-_MAX_WARNINGS = 3  # for one file
 _MIN_SIMILARITY = 0.6  # of a suggested name
 # elements of drafts of URDF+
 _OBSOLETE_ELEMENTS = {"loop_constraint": "loop", "joint_constraint": "coupling"}
@@ -340,11 +340,7 @@ def _read_coordinate(
 
 
 def _warn_about_unknown_elements(xml: XmlFile, joints: Mapping[str, etree._Element]) -> None:
-    """Warn of unknown elements, which are left out, and of incomplete limits.
-
-    Equal elements have one warning, at the first of them, with their number.
-    """
-    found: dict[tuple[str, str], list[etree._Element]] = {}
+    """Warn of unknown elements, which are left out, and of incomplete limits."""
     known_tags = set().union(*_CHILDREN.values())  # a misplaced known element is an error
     read_elements = [xml.root]
     for element in read_elements:
@@ -353,48 +349,27 @@ def _warn_about_unknown_elements(xml: XmlFile, joints: Mapping[str, etree._Eleme
         known = known_tags | _FOREIGN_ELEMENTS.get(element.tag, set())
         other = [x for x in element if isinstance(x.tag, str) and x.tag not in known]
         for child in [x for x in other if not x.tag.startswith("{")]:
-            found.setdefault((element.tag, child.tag), []).append(child)
-    groups = [
-        (elements, parent, _suggest_element(tag, _CHILDREN[parent]))
-        for (parent, tag), elements in found.items()
-    ]
-    groups.sort(key=lambda item: item[2].startswith("known"))  # likely mistakes first
-    for elements, parent, hint in groups[:_MAX_WARNINGS]:
-        _warn_about_elements(
-            xml,
-            elements,
-            f"unknown <{elements[0].tag}> in <{parent}>",
-            f", it is left out, {hint}",
-        )
-    if remaining := [elements[0] for elements, _, _ in groups[_MAX_WARNINGS:]]:
-        listed = ", ".join(f"<{element.tag}>" for element in remaining[:_MAX_WARNINGS])
-        dots = ", ..." if len(remaining) > _MAX_WARNINGS else ""
-        problem = f"{len(remaining)} more unknown elements ({listed}{dots}) are left out"
-        _warn_about_elements(xml, remaining[:1], problem, "")
-    incomplete = []
+            hint = _suggest_element(child.tag, element.tag)
+            problem = f"unknown <{child.tag}> in <{element.tag}>, it is left out, {hint}"
+            _warn_at(xml, child, problem)
     for name, joint in joints.items():
         limit = joint.find("limit")
         if limit is None or joint.get("type") == "fixed":
             continue
-        missing = [key for key in ("effort", "velocity") if limit.get(key) is None]
-        if missing:
-            incomplete.append(
-                (limit, f"the limit of joint '{name}' has no {' and no '.join(missing)}")
-            )
-    if incomplete:
-        hint = ", nothing is limited then: add it, 1e9 for no limit"
-        _warn_about_elements(xml, [limit for limit, _ in incomplete], incomplete[0][1], hint)
+        if missing := [key for key in ("effort", "velocity") if limit.get(key) is None]:
+            problem = f"the limit of joint '{name}' has no {' and no '.join(missing)}"
+            _warn_at(xml, limit, f"{problem}, nothing is limited then: add it, 1e9 for no limit")
 
 
-def _suggest_element(tag: str, tags: Set[str]) -> str:
+@cache
+def _suggest_element(tag: str, parent: str) -> str:
     if tag == "constraint":
         return CONSTRAINT_HINT
+    tags = sorted(_CHILDREN[parent])
     element_of_attribute = {
-        name: other for other in sorted(tags) for name in sorted(_ATTRIBUTES.get(other, ()))
+        name: other for other in tags for name in sorted(_ATTRIBUTES.get(other, ()))
     }
-    similar = get_close_matches(
-        tag.lower(), [*sorted(tags), *element_of_attribute], 1, _MIN_SIMILARITY
-    )
+    similar = get_close_matches(tag.lower(), [*tags, *element_of_attribute], 1, _MIN_SIMILARITY)
     if not similar:
         return suggest_names(tags)
     if similar[0] in tags:
@@ -402,10 +377,5 @@ def _suggest_element(tag: str, tags: Set[str]) -> str:
     return f'did you mean {similar[0]}="..." of <{element_of_attribute[similar[0]]}>?'
 
 
-def _warn_about_elements(
-    xml: XmlFile, elements: list[etree._Element], problem: str, hint: str
-) -> None:
-    count = f" ({len(elements)} such in this file)" if len(elements) > 1 else ""
-    warnings.warn(
-        f"{xml.source_location(elements[0])}: {problem}{count}{hint}", CraneWarning, stacklevel=4
-    )
+def _warn_at(xml: XmlFile, element: etree._Element, problem: str) -> None:
+    warnings.warn(f"{xml.source_location(element)}: {problem}", CraneWarning, stacklevel=4)
