@@ -5,7 +5,7 @@ import re
 from itertools import permutations
 from pathlib import Path
 
-from crane.common.errors import DescriptionError, suggest_names
+from crane.common.errors import DescriptionError
 from crane.common.package_search import read_plain_file
 from crane.description.key_types import (
     Key,
@@ -40,10 +40,10 @@ _CONVENTION_PATTERN = re.compile(r"^(closed_loop|name_mot)\s*:", re.MULTILINE)
 _MACHINE_FILE_PATTERN = re.compile(r"^(chains|name)\s*:", re.MULTILINE)
 _LOOP_TYPES = {"3d": "spherical", "6d": "fixed"}
 _AXES = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
-_JOINT_TYPES = ("SPHERICAL", "FIXED", "UJOINT_XY", "UJOINT_YZ", "UJOINT_ZX", "CARDAN")
 _UNIVERSAL_AXES = {"CARDAN": ("X", "Y")} | {
     f"UJOINT_{first}{second}": (first, second) for first, second in permutations("XYZ", 2)
 }
+_JOINT_TYPES = ("SPHERICAL", "FIXED", *_UNIVERSAL_AXES)
 
 
 def is_parallel_robot(file: Path) -> bool:
@@ -120,21 +120,14 @@ def _replaced_joint_types(top: YamlSection) -> dict[str, str]:
             "joint_type", f"{len(types)} joint types for {len(names)} joints, give one of each"
         )
     for kind in types:
-        if kind not in (*_JOINT_TYPES, *_UNIVERSAL_AXES):
-            raise top.error_at(
-                "joint_type",
-                f"joint type '{kind}' is unknown, {suggest_names(_JOINT_TYPES, kind)}",
-            )
+        top.check_name("joint_type", kind, _JOINT_TYPES, f"joint type '{kind}' is unknown")
     return dict(zip(names, types, strict=True))
 
 
 def _replace_joint_types(xml: XmlFile, replaced_types: dict[str, str], top: YamlSection) -> None:
     joints = {joint.get("name", "").strip(): joint for joint in xml.root.iterfind("joint")}
     for name, kind in replaced_types.items():
-        if name not in joints:
-            raise top.error_at(
-                "joint_name", f"joint '{name}' is unknown, {suggest_names(joints, name)}"
-            )
+        top.check_name("joint_name", name, joints, f"joint '{name}' is unknown")
         joint = joints[name]
         if joint.get("type") not in MOVABLE_TYPES:
             raise top.error_at(
@@ -194,9 +187,8 @@ def _read_loops(top: YamlSection, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
         if kind.lower() not in _LOOP_TYPES:
             raise top.error_at("type", f"a closed loop has the type '{kind}', write 3d or 6d")
         for frame in pair:
-            if frame not in link_of_name:
-                known = suggest_names(tree.links, frame)
-                raise top.error_at("closed_loop", f"the frame '{frame}' is unknown, {known}")
+            problem = f"the frame '{frame}' is unknown"
+            top.check_name("closed_loop", frame, link_of_name, problem)
         name = f"{pair[0]}_{pair[1]}"
         if name in loops:
             raise top.error_at(

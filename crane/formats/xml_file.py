@@ -5,14 +5,14 @@ Reading expands no entities, has no network access, and names source locations i
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
 from lxml import etree
 
-from crane.common.errors import DescriptionError, suggest_names
+from crane.common.errors import DescriptionError, check_name, suggest_names
 from crane.common.number_text import parse_float
 from crane.common.package_search import read_plain_file
 from crane.description.findings import report_error
@@ -129,6 +129,12 @@ class XmlFile:
     def error_at(self, element: etree._Element, problem: str) -> DescriptionError:
         """Return an error with the source location of an element."""
         return DescriptionError(f"{self.source_location(element)}: {problem}")
+
+    def check_name(
+        self, element: etree._Element, name: str, names: Collection[str], problem: str
+    ) -> None:
+        """Raise for a name in an element that is not among some."""
+        check_name(name, names, f"{self.source_location(element)}: {problem}", DescriptionError)
 
     def report(self, element: etree._Element, problem: str, harmless: bool = False) -> None:
         """Raise an error with the source location of an element, or record it.

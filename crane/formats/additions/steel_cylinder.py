@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from lxml import etree
 
-from crane.common.errors import CraneWarning, InputError, suggest_names
+from crane.common.errors import CraneWarning, InputError, check_name
 from crane.common.plausible_ranges import LONGEST, implausible_value_text, suggested_units_text
 from crane.common.samples import Array, as_number
 from crane.common.unit_conversions import UnitError, parse_number
@@ -75,10 +75,7 @@ def parse_attachment_point(machine: Machine, text: str) -> AttachmentPoint:
         raise InputError(
             f"'{text}' is no point, write LINK or LINK:x,y,z with metres in the link's frame"
         )
-    if link not in machine.tree.links:
-        raise InputError(
-            f"'{link}' is no link of '{machine.name}', {suggest_names(machine.tree.links, link)}"
-        )
+    check_name(link, machine.tree.links, f"'{link}' is no link of '{machine.name}'")
     return AttachmentPoint(link, to_vector(point))
 
 

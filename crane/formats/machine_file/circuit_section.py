@@ -8,7 +8,7 @@ from collections.abc import Callable, Container
 from functools import partial
 from typing import Any
 
-from crane.common.errors import CraneWarning, DescriptionError, suggest_names
+from crane.common.errors import CraneWarning, DescriptionError, check_name
 from crane.common.plausible_ranges import implausible_value_text
 from crane.description.circuit_schema import AREA_KEYS, BORE_KEYS, ORIFICE_KEYS, PUMP
 from crane.description.findings import (
@@ -155,10 +155,7 @@ def check_active_joint(active: tuple[str, ...], joint: str, location: str) -> No
     Raises:
         DescriptionError: With file and line, and the joints that are.
     """
-    if joint not in active:
-        raise DescriptionError(
-            f"{location}: '{joint}' is not an active joint, {suggest_names(active, joint)}"
-        )
+    check_name(joint, active, f"{location}: '{joint}' is not an active joint", DescriptionError)
 
 
 def read_component(

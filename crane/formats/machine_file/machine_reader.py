@@ -215,15 +215,13 @@ def _read_supports(
 def _read_pins(top: YamlSection, tree: TreeBuilder, loops: Sequence[LoopSpec]) -> dict[str, float]:
     """The largest force that pins bear, by joint or loop [N]."""
     names = [*tree.joints, *(loop.name for loop in loops)]
-
-    def check_name(name: str, location: str) -> None:
-        if name not in names:
-            known = suggest_names(names, name)
-            raise tree.unknown_name_error(
-                f"{location}: '{name}' under 'pins' is no joint or loop, {known}"
-            )
-
-    return top.value_map("pins", YamlSection.number, check_name)
+    return top.value_map(
+        "pins",
+        YamlSection.number,
+        lambda name, location: tree.check_name(
+            name, names, f"{location}: '{name}' under 'pins' is no joint or loop"
+        ),
+    )
 
 
 def _read_free_joints(

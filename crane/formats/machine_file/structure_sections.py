@@ -6,7 +6,7 @@ The tree grows chain by chain, and knows whether names that others use are in it
 import math
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -68,12 +68,10 @@ class TreeBuilder:
             DescriptionError: The frame is unknown, or a name is taken by an earlier chain.
         """
         with error_recovery():
-            if chain.parent is not None and chain.parent not in self.links:
-                raise self.unknown_name_error(
-                    f"{chain.source_location}: chain '{chain.name}' hangs from '{chain.parent}', "
-                    f"no frame of an earlier chain, {suggest_names(self.links, chain.parent)}",
-                    chain.parent,
-                )
+            label = f"{chain.source_location}: chain '{chain.name}' hangs from '{chain.parent}'"
+            if chain.parent is not None:
+                problem = f"{label}, no frame of an earlier chain"
+                self.check_name(chain.parent, self.links, problem)
             attachments = [chain.attachment_joint(urdf.tree.root_link)] * (
                 chain.parent is not None
             )
@@ -111,6 +109,11 @@ class TreeBuilder:
         is_follow_up = not self.is_complete or not name
         return FollowUpError(message) if is_follow_up else DescriptionError(message)
 
+    def check_name(self, name: str, names: Collection[str], problem: str) -> None:
+        """Raise for a name that is not among some."""
+        if name not in names:
+            raise self.unknown_name_error(f"{problem}, {suggest_names(names, name)}", name)
+
     def check_joint(self, joint: str, source_location: str) -> None:
         """Raise for a joint that does not exist or does not move."""
         if joint in self.joints:
@@ -118,21 +121,11 @@ class TreeBuilder:
         if joint in self.tree.joints:
             problem = f"{source_location}: joint '{joint}' is fixed, name a moving one"
             raise DescriptionError(problem) if self.joints else FollowUpError(problem)
-        raise self.unknown_name_error(
-            f"{source_location}: joint '{joint}' is unknown, {suggest_names(self.joints, joint)}",
-            joint,
-        )
+        self.check_name(joint, self.joints, f"{source_location}: joint '{joint}' is unknown")
 
     def check_link(self, link: str, source_location: str, label: str) -> None:
         """Raise for a link that does not exist, called `label`."""
-        if link not in self.links:
-            raise self.unknown_name_error(
-                (
-                    f"{source_location}: {label} '{link}' is unknown, "
-                    f"{suggest_names(self.links, link)}"
-                ),
-                link,
-            )
+        self.check_name(link, self.links, f"{source_location}: {label} '{link}' is unknown")
 
     def read_frame_pair(self, section: YamlSection) -> tuple[str, str]:
         """The two frames that a section is between, on two bodies.
@@ -286,11 +279,10 @@ def read_loops(top: YamlSection, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
         frames = []
         for end in ("predecessor", "successor"):
             frame = section.text(end)
-            if frame and frame not in tree.links and tree.is_complete:
-                known = suggest_names(tree.links, frame)
-                report_error(
-                    section.error_at(end, f"{label} has the unknown {end} '{frame}', {known}")
-                )
+            location = section.source_location(end)
+            with error_recovery():
+                problem = f"{location}: {label} has the unknown {end} '{frame}'"
+                tree.check_name(frame, tree.links, problem)
             frames.append(frame)
         axis = None
         with error_recovery():

@@ -250,13 +250,9 @@ def _read_mimic(
     other = mimic.get("joint", "")
     if other not in joints and "joint" in xml.unnamed_kinds:
         raise FollowUpError(f"joint '{other}' may be one without a name")
-    if other not in movable_joints:
-        problem = f"mimics the unknown joint '{other}'"
-        if other in joints:
-            problem = f"mimics '{other}', which does not move"
-        raise xml.error_at(
-            mimic, f"joint '{name}' {problem}, {suggest_names(movable_joints, other)}"
-        )
+    known = f"'{other}', which does not move"
+    mimicked = known if other in joints else f"the unknown joint '{other}'"
+    xml.check_name(mimic, other, movable_joints, f"joint '{name}' mimics {mimicked}")
     if other == name:
         raise xml.error_at(mimic, f"joint '{name}' mimics itself, name another")
     if name in independent_names:
@@ -315,11 +311,8 @@ def _read_tip(xml: XmlFile, links: Mapping[str, etree._Element]) -> str | None:
     if not tips:
         return None
     link = str(tips[0].get("parent_link", "")).strip()
-    if link not in links:
-        problem = (
-            f"is the unknown link '{link}'" if link else 'has no link, write parent_link="LINK"'
-        )
-        raise xml.error_at(tips[0], f"the tip {problem}, {suggest_names(links, link or None)}")
+    problem = f"is the unknown link '{link}'" if link else 'has no link, write parent_link="LINK"'
+    xml.check_name(tips[0], link, links, f"the tip {problem}")
     return link
 
 
@@ -327,12 +320,8 @@ def _read_coordinate(
     xml: XmlFile, joint: etree._Element, joints: Collection[str], earlier_names: Container[str]
 ) -> tuple[str, float]:
     name = joint.get("name", "").strip()
-    if name not in joints:
-        raise xml.error_at(
-            joint,
-            f"home names the joint '{name}', which is unknown or does not move, "
-            f"{suggest_names(joints, name)}",
-        )
+    problem = f"home names the joint '{name}', which is unknown or does not move"
+    xml.check_name(joint, name, joints, problem)
     value = xml.number(joint, "value", f"home of '{name}'")
     if name in earlier_names:
         raise xml.error_at(joint, f"home of '{name}' is there twice, keep one")
