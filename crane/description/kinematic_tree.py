@@ -17,12 +17,12 @@ Vector = tuple[float, float, float]
 Placement = tuple[Vector, Vector]  # xyz [m], rpy [rad] as URDF has them: R_z(y) R_y(p) R_x(r)
 Freedom = tuple[str, str, Vector]  # of a composite joint: suffix, kind, axis
 
-_X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+X_AXIS, Y_AXIS, Z_AXIS = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 ROTATIONS: tuple[Freedom, ...] = (
-    ("rx", "revolute", _X), ("ry", "revolute", _Y), ("rz", "revolute", _Z),
+    ("rx", "revolute", X_AXIS), ("ry", "revolute", Y_AXIS), ("rz", "revolute", Z_AXIS),
 )  # fmt: skip
 _TRANSLATIONS: tuple[Freedom, ...] = (
-    ("x", "prismatic", _X), ("y", "prismatic", _Y), ("z", "prismatic", _Z),
+    ("x", "prismatic", X_AXIS), ("y", "prismatic", Y_AXIS), ("z", "prismatic", Z_AXIS),
 )  # fmt: skip
 MULTI_FREEDOM_TYPES = ("floating", "planar", "spherical")  # types of URDF, and ball joints
 NO_LIMIT = 1e9  # a limit of this magnitude in a file, in any unit, means none

@@ -19,6 +19,7 @@ from crane.description.findings import report_error
 from crane.description.kinematic_tree import (
     NO_LIMIT,
     TENSOR_ATTRIBUTES,
+    X_AXIS,
     Inertial,
     Joint,
     Limits,
@@ -29,7 +30,6 @@ from crane.description.kinematic_tree import (
 from crane.description.specification import AXISLESS_TYPES, unit_vector
 
 MAX_FILE_SIZE = 50_000_000  # bytes
-_X = (1.0, 0.0, 0.0)
 _ROOT_ELEMENTS = {  # by suffix, if not a <robot>
     ".sdf": "an <sdf>", ".world": "an <sdf>", ".mjcf": "a <mujoco>",
     ".xml": "a <robot>, an <sdf> or a <mujoco>",
@@ -297,12 +297,12 @@ class XmlFile:
             DescriptionError: It is zero or malformed.
         """
         if element.get("type") in AXISLESS_TYPES:
-            return _X
+            return X_AXIS
         axis = self.single_child(element, "axis", label)
         xyz = default if axis is None else self.vector(axis, "xyz", f"the axis of {label}", 3)
         if (unit := unit_vector(xyz)) is None:
             self.report(axis, f"the axis of {label} is zero, give a direction")
-            return _X
+            return X_AXIS
         return unit
 
     def placement(self, element: etree._Element, label: str) -> Placement:

@@ -14,6 +14,9 @@ from crane.common.plausible_ranges import LONGEST, implausible_value_text, sugge
 from crane.common.samples import Array, as_number
 from crane.common.unit_conversions import UnitError, parse_number
 from crane.description.kinematic_tree import (
+    X_AXIS,
+    Y_AXIS,
+    Z_AXIS,
     Inertial,
     Joint,
     Limits,
@@ -252,7 +255,6 @@ def _add_cylinder_visual(link: etree._Element, start: float, end: float, diamete
 
 _OFFSET_TOLERANCE = 1e-6  # relative to the cylinder's length
 _PARALLEL_TOLERANCE = 1e-9  # sine of an angle; a larger deviation gets a universal joint
-_X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 
 def add_barrel_and_rod(
@@ -297,7 +299,9 @@ def add_barrel_and_rod(
     )
     draft.data["loops"].append(
         loop_data(
-            LoopSpec(name, "revolute" if is_planar else "spherical", f"{name}_rod", eye, _Y, "")
+            LoopSpec(
+                name, "revolute" if is_planar else "spherical", f"{name}_rod", eye, Y_AXIS, ""
+            )
         )
     )
     home = dict(zip(pair.machine.joints, q.tolist(), strict=True))
@@ -340,12 +344,12 @@ def _cylinder_urdf(
     xyz, rpy = xyz_rpy_from_se3(base_placement)
     links = [Link(f"{name}_base", "")]
     if is_planar:
-        pins = [Joint(f"{name}_pin", "revolute", links[0].name, barrel, "", xyz, rpy, _Y)]
+        pins = [Joint(f"{name}_pin", "revolute", links[0].name, barrel, "", xyz, rpy, Y_AXIS)]
     else:
         links.append(Link(cross, "", composite_joint=f"{name}_pin"))
         pins = [
-            Joint(f"{name}_pin_y", "revolute", links[0].name, cross, "", xyz, rpy, _Y),
-            Joint(f"{name}_pin_z", "revolute", cross, barrel, "", axis=_Z),
+            Joint(f"{name}_pin_y", "revolute", links[0].name, cross, "", xyz, rpy, Y_AXIS),
+            Joint(f"{name}_pin_z", "revolute", cross, barrel, "", axis=Z_AXIS),
         ]
     links += [Link(barrel, "", cylinder.barrel_inertial), Link(rod, "", cylinder.rod_inertial)]
     slide = Joint(
@@ -355,7 +359,7 @@ def _cylinder_urdf(
         rod,
         "",
         to_vector(np.array([cylinder.retracted_length, 0, 0])),
-        axis=_X,
+        axis=X_AXIS,
         limits=Limits(0.0, cylinder.stroke, cylinder.max_force),
     )
     for link in links:

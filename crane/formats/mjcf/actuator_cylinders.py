@@ -14,7 +14,15 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 
-from crane.description.kinematic_tree import Joint, Limits, Link, joint_series
+from crane.description.kinematic_tree import (
+    X_AXIS,
+    Y_AXIS,
+    Z_AXIS,
+    Joint,
+    Limits,
+    Link,
+    joint_series,
+)
 from crane.description.pinocchio_conversion import xyz_rpy_from_se3
 from crane.description.specification import LoopSpec
 from crane.formats.mjcf.mujoco_file import MujocoFile
@@ -24,7 +32,6 @@ _MIN_SINE = 0.1  # of the angle between a strut and the axis of a hinge that its
 _DEAD_CENTRE_TOLERANCE = 1e-6  # of the lever arm over the length
 _RANGE_SAMPLES = 201  # over the range of a joint
 _MAX_STRUTS = 100  # each adds three joints
-_X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 _NAME_SUFFIXES = (
     "", "_1", "_2", "_pin_y", "_pin_z", "_end", "_eye", "_slider", "_rod", "_rod_1", "_rod_2",
     "_rod_pin_y", "_rod_pin_z", "_rod_end", "_rod_eye",
@@ -32,7 +39,7 @@ _NAME_SUFFIXES = (
 _ACTUATOR_TAGS = (
     "general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder", "muscle",
 )  # fmt: skip
-_PINS = [("pin_y", "revolute", _Y), ("pin_z", "revolute", _Z)]
+_PINS = [("pin_y", "revolute", Y_AXIS), ("pin_z", "revolute", Z_AXIS)]
 
 
 class MjcfCylinders:
@@ -139,7 +146,7 @@ class MjcfCylinders:
         name = self._unique_name(self._mjcf.name("ACTUATOR", actuator))
         location = self._mjcf.source_location(name, *_ACTUATOR_TAGS)
         slide = f"{name}_slider"
-        joint = Joint(name, "prismatic", self._links[slider], slide, location, axis=_Z)
+        joint = Joint(name, "prismatic", self._links[slider], slide, location, axis=Z_AXIS)
         self.parts += [Link(slide, location, composite_joint=name), joint]
         self.actuator_joints[actuator] = name
         self.home[name] = length
@@ -173,7 +180,7 @@ class MjcfCylinders:
         rotation = np.column_stack([direction, normal, np.cross(direction, normal)])
         placement = xyz_rpy_from_se3(pin.SE3(self._rotation(sites[0]).T @ rotation, np.zeros(3)))
         rod_end = f"{name}_end"
-        series = joint_series(name, [*_PINS, ("slide", "prismatic", _X)], placement,
+        series = joint_series(name, [*_PINS, ("slide", "prismatic", X_AXIS)], placement,
                               (link or self._links[sites[0]], rod_end), location)  # fmt: skip
         *pins, slide = series
         assert isinstance(slide, Joint)
@@ -184,7 +191,7 @@ class MjcfCylinders:
             self.home[name] = length
         self.parts += [*pins, slide, Link(rod_end, location, composite_joint=name)]
         self.loops.append(
-            LoopSpec(f"{name}_eye", "spherical", rod_end, self._links[sites[1]], _Z,
+            LoopSpec(f"{name}_eye", "spherical", rod_end, self._links[sites[1]], Z_AXIS,
                      location)
         )  # fmt: skip
 

@@ -133,6 +133,8 @@ def _read_sizes(element: SdfElement, tag: str, count: int) -> tuple[float, ...]:
 
 
 def _mesh_inertia(mesh_element: SdfElement, density: float) -> pin.Inertia:
+    import trimesh  # slow to import, and few files have inertias of meshes
+
     name, file = _find_mesh(mesh_element)
     if mesh_element.single_child("submesh") is not None:
         raise _unknown_volume_error(mesh_element, f"takes a part of the mesh '{name}'")
@@ -149,10 +151,15 @@ def _mesh_inertia(mesh_element: SdfElement, density: float) -> pin.Inertia:
         raise _unknown_volume_error(
             mesh_element, f"has the mesh '{name}', which {edges} edges leave open"
         )
-    mass, com, tensor = inertia_of_triangles(triangles, density)
-    if not mass > 0:
+    centroid = triangles.reshape(-1, 3).mean(axis=0)  # as origin it reduces rounding errors
+    corners = (triangles - centroid).reshape(-1, 3)
+    mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+    if mesh.volume < 0:  # its triangles face inwards
+        mesh.invert()
+    mesh.density = density
+    if not mesh.mass > 0:
         raise _unknown_volume_error(mesh_element, f"has the mesh '{name}', which is flat")
-    return pin.Inertia(mass, com, tensor)
+    return pin.Inertia(mesh.mass, centroid + mesh.center_mass, mesh.moment_inertia)
 
 
 def _count_open_edges(triangles: Array) -> int:
@@ -169,32 +176,6 @@ def _count_open_edges(triangles: Array) -> int:
     sign = np.where(directed_edges[:, 0] < directed_edges[:, 1], 1, -1)
     _, edge = np.unique(np.sort(directed_edges, axis=1), axis=0, return_inverse=True)
     return int(np.count_nonzero(np.bincount(edge.ravel(), weights=sign)))
-
-
-def inertia_of_triangles(triangles: Array, density: float) -> tuple[float, Array, Array]:
-    """Return mass, centre of mass (3,) and central inertia (3, 3) of a closed mesh (F, 3, 3).
-
-    The tetrahedron from the origin to a triangle a, b, c has, with six times its signed volume
-    d = a . (b x c) and s = a + b + c,
-
-        V = d / 6,    int x dV = d s / 24,
-        int x x^T dV = d (s s^T + a a^T + b b^T + c c^T) / 120.
-
-    The sum over all triangles is the integral over the body, negative if they face inwards.
-    """
-    centroid = triangles.reshape(-1, 3).mean(axis=0)  # as origin it reduces rounding errors
-    corners = triangles - centroid
-    volumes = np.linalg.det(corners)
-    sums = corners.sum(axis=1)
-    volume = volumes.sum() / 6
-    first = volumes @ sums / 24
-    second = np.einsum("f,fi,fj->ij", volumes, sums, sums)
-    second = (second + np.einsum("f,fki,fkj->ij", volumes, corners, corners)) / 120
-    if volume == 0:
-        return 0.0, centroid, np.zeros((3, 3))
-    com = first / volume
-    second = math.copysign(density, volume) * (second - volume * np.outer(com, com))
-    return density * abs(float(volume)), centroid + com, np.trace(second) * np.eye(3) - second
 
 
 _SIZE_ATTRIBUTES = {

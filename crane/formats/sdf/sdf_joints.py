@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
+from lxml import etree
 
 from crane.common.errors import suggest_names
 from crane.description.kinematic_tree import Limits, parse_limit
@@ -81,17 +82,6 @@ class SdfJointEdge:
     composite_joint: str = ""
 
 
-@dataclass(frozen=True)
-class CoupledCoordinate:
-    """A coordinate that depends on another: q = multiplier q_leader + offset."""
-
-    name: str
-    leader: str
-    multiplier: float
-    offset: float
-    item: SdfElement
-
-
 class DisjointSets:
     """Disjoint sets of names (union-find)."""
 
@@ -129,13 +119,13 @@ class SdfJoints:
 
     Attributes:
         edges: Joints in the order of the file.
-        coupled_coordinates: Coordinates that depend on others.
+        mimics: Coordinates that depend on others: name, `<mimic>` of URDF, and where it is from.
     """
 
     def __init__(self, top: ModelScope, frames: SdfFramePoses):
         self._top, self._frames = top, frames
         self.edges: list[SdfJointEdge] = []
-        self.coupled_coordinates: list[CoupledCoordinate] = []
+        self.mimics: list[tuple[str, etree._Element, SdfElement]] = []
         self._gearboxes: list[tuple[SdfElement, tuple[str, str], list[np.ndarray], str]] = []
         self._freedom_names: dict[str, list[str]] = {}  # joint -> its coordinates
         scopes = [scope for scope in top.nested_scopes() if not scope.is_static]
@@ -146,9 +136,9 @@ class SdfJoints:
             for joint in scope.joints.values():
                 self._read_mimic(scope, joint)
         self._add_gear_couplings()
-        leaders = {x for f in self.coupled_coordinates for x in (f.name, f.leader)}
+        coupled = {x for name, mimic, _ in self.mimics for x in (name, mimic.get("joint"))}
         self.edges = [
-            dataclasses.replace(edge, is_coupled=True) if edge.name in leaders else edge
+            dataclasses.replace(edge, is_coupled=True) if edge.name in coupled else edge
             for edge in self.edges
         ]
 
@@ -190,9 +180,7 @@ class SdfJoints:
             if joint.single_child("screw_thread_pitch") is None:
                 pitch = joint.number("thread_pitch", 1.0)  # [rad/m], positive if left-handed
                 travel_per_radian = -1.0 / pitch if pitch else 0.0
-            self.coupled_coordinates.append(
-                CoupledCoordinate(parts[1], name, travel_per_radian, 0.0, joint)
-            )
+            self._add_mimic(joint, parts[1], name, travel_per_radian)
         if kind in _EDGE_KINDS:
             axis = axes[0] if axes else None
             self.edges.append(SdfJointEdge(name, _EDGE_KINDS[kind], *ends, placement, joint, axis))
@@ -286,7 +274,7 @@ class SdfJoints:
                 for link, direction in zip(links, directions, strict=True)
             )
             factor = -item.number("gearbox_ratio", 1.0) * first_sign / second_sign
-            self.coupled_coordinates.append(CoupledCoordinate(second, first, factor, 0.0, item))
+            self._add_mimic(item, second, first, factor)
 
     def _gear_angle(
         self,
@@ -338,6 +326,11 @@ class SdfJoints:
             leader_part = parts[-1 if mimic.element.get("axis") == "axis2" else 0]
             multiplier = mimic.number("multiplier", 1.0)
             offset = mimic.number("offset", 0.0) - multiplier * mimic.number("reference", 0.0)
-            self.coupled_coordinates.append(
-                CoupledCoordinate(name, leader_part, multiplier, offset, mimic)
-            )
+            self._add_mimic(mimic, name, leader_part, multiplier, offset)
+
+    def _add_mimic(
+        self, item: SdfElement, name: str, leader: str, multiplier: float, offset: float = 0.0
+    ) -> None:
+        """Add a coordinate q = multiplier q_leader + offset."""
+        values = {"multiplier": repr(multiplier), "offset": repr(offset)}
+        self.mimics.append((name, etree.Element("mimic", {"joint": leader, **values}), item))

@@ -31,7 +31,6 @@ from crane.formats.sdf.link_elements import add_link_inertial, add_shapes
 from crane.formats.sdf.model_scope import ModelReader, ModelScope, SdfElement
 from crane.formats.sdf.sdf_joints import (
     WORLD_NODE,
-    CoupledCoordinate,
     DisjointSets,
     SdfAxis,
     SdfJointEdge,
@@ -164,12 +163,12 @@ class _SdfTranslation:
                 self._link_poses[edge.child] = edge.placement
         tree = spanning_tree(edges, WORLD_NODE)
         self._add_links(edges)
-        driven_joints = _driven_joints(edges, joints.coupled_coordinates)
+        driven_joints = _driven_joints(edges, {name for name, _, _ in joints.mimics})
         placed = {WORLD_NODE}
         for edge in breadth_first(tree, DisjointSets(), WORLD_NODE):
             self._add_joint(edge, edge.parent in placed, driven_joints)
             placed |= {edge.parent, edge.child}
-        self._add_mimics(joints.coupled_coordinates, {edge.name for edge in tree})
+        self._add_mimics(joints, {edge.name for edge in tree})
         tree_edge_ids = {id(edge) for edge in tree}
         self._add_loops([edge for edge in edges if id(edge) not in tree_edge_ids], tree)
         if self._initial_positions:
@@ -252,22 +251,18 @@ class _SdfTranslation:
         self._link_poses[name] = pin.SE3.Identity()
         return name
 
-    def _add_mimics(self, followers: list[CoupledCoordinate], joints: set[str]) -> None:
+    def _add_mimics(self, joints: SdfJoints, names: set[str]) -> None:
         elements = {joint.get("name"): joint for joint in self._robot.iterfind("joint")}
-        for follower in followers:
-            if missing := [x for x in (follower.name, follower.leader) if x not in joints]:
-                raise follower.item.error(
-                    f"{follower.item.label}: joint '{missing[0]}' is coupled and closes a loop of "
+        for name, mimic, item in joints.mimics:
+            if missing := [x for x in (name, mimic.get("joint")) if x not in names]:
+                raise item.error(
+                    f"{item.label}: joint '{missing[0]}' is coupled and closes a loop of "
                     "coupled joints, leave one of them out",
                 )
-            joint = elements[follower.name]
-            if joint.find("mimic") is not None:
-                raise follower.item.error(f"joint '{follower.name}' follows two others, keep one")
-            mimic = etree.SubElement(
-                joint, "mimic", joint=follower.leader,
-                multiplier=repr(follower.multiplier), offset=repr(follower.offset),
-            )  # fmt: skip
-            self._set_source_location(mimic, follower.item)
+            if elements[name].find("mimic") is not None:
+                raise item.error(f"joint '{name}' follows two others, keep one")
+            elements[name].append(mimic)
+            self._set_source_location(mimic, item)
 
     def _add_loops(self, loop_edges: list[SdfJointEdge], tree: list[SdfJointEdge]) -> None:
         bodies = rigid_bodies(tree)
@@ -305,15 +300,12 @@ def _fix_locked_joint(edge: SdfJointEdge, notes: ConversionNotes) -> SdfJointEdg
     return dataclasses.replace(edge, kind="fixed", axis=None)
 
 
-def _driven_joints(
-    edges: list[SdfJointEdge], followers: list[CoupledCoordinate]
-) -> set[str] | None:
+def _driven_joints(edges: list[SdfJointEdge], coupled_names: set[str]) -> set[str] | None:
     """Return the joints with an effort, None if all or no joints have one.
 
     An effort of 0 means that no actuator drives the joint, unless all joints have it.
     """
     axis_of_joint = {edge.name: edge.axis for edge in edges if edge.axis is not None}
-    coupled_names = {follower.name for follower in followers}
     without_effort = {name for name, axis in axis_of_joint.items() if not axis.limits.effort}
     with_effort = axis_of_joint.keys() - without_effort - coupled_names
     return with_effort if with_effort and without_effort else None

@@ -23,6 +23,7 @@ from crane.common.errors import DescriptionError
 from crane.common.package_search import find_file
 from crane.common.samples import Array
 from crane.description.findings import raise_errors
+from crane.description.pinocchio_conversion import se3_from_xyz_rpy
 from crane.formats.visuals import mesh_process
 from crane.formats.xml_file import XmlFile
 
@@ -299,7 +300,7 @@ class UrdfShapes:
     ) -> Sequence[Visual | _UnloadedMesh]:
         xyz, rpy = self._xml.placement(element, label)
         self._check_distance(element, label, xyz)
-        placement = _pose_matrix(xyz, rpy)
+        placement = se3_from_xyz_rpy(xyz, rpy)
         material = self._xml.single_child(element, "material", label)
         colour = None
         if material is not None:
@@ -321,25 +322,27 @@ class UrdfShapes:
                 find_mesh_file(name, self._xml.file.parent),
                 self._xml.source_location(shape),
             )
-            return [_UnloadedMesh(link, name, scale, file, placement, colour, place)]
+            return [_UnloadedMesh(link, name, scale, file, placement.homogeneous, colour, place)]
         return [
-            Visual(link, part, placement @ _pose_matrix((0.0, 0.0, z)), colour or DEFAULT_COLOUR)
-            for part, z in self._read_shape(shape, label)
+            Visual(link, part, (placement * offset).homogeneous, colour or DEFAULT_COLOUR)
+            for part, offset in self._read_shape(shape, label)
         ]
 
-    def _read_shape(self, shape: etree._Element, label: str) -> list[tuple[Shape, float]]:
-        """Return the parts of a shape, each with its coordinate z."""
+    def _read_shape(self, shape: etree._Element, label: str) -> list[tuple[Shape, pin.SE3]]:
+        """Return the parts of a shape, each with its pose."""
+        centre = pin.SE3.Identity()
         if shape.tag == "box":
             x, y, z = self._read_sizes(shape, "size", label, 3)
-            return [(BoxShape((x, y, z)), 0.0)]
+            return [(BoxShape((x, y, z)), centre)]
         (radius,) = self._read_sizes(shape, "radius", label, 1)
         sphere = SphereShape(radius)
         if shape.tag == "sphere":
-            return [(sphere, 0.0)]
+            return [(sphere, centre)]
         (length,) = self._read_sizes(shape, "length", label, 1)
         # the length of a capsule is between the centres of its spheres
-        ends = [(sphere, -length / 2), (sphere, length / 2)] if shape.tag == "capsule" else []
-        return [(CylinderShape(radius, length), 0.0), *ends]
+        heights = (-length / 2, length / 2) if shape.tag == "capsule" else ()
+        ends = [(sphere, pin.SE3(np.eye(3), np.array([0.0, 0.0, z]))) for z in heights]
+        return [(CylinderShape(radius, length), centre), *ends]
 
     def _read_sizes(
         self, shape: etree._Element, key: str, label: str, count: int
@@ -421,8 +424,3 @@ class UrdfShapes:
 def _largest_coordinate(part: MeshPart, scale: tuple[float, ...]) -> float:
     with np.errstate(over="ignore"):
         return float(np.abs(part.vertices * scale).max())
-
-
-def _pose_matrix(xyz: Sequence[float], rpy: Sequence[float] = (0.0, 0.0, 0.0)) -> Array:
-    """Return a pose (4, 4) from a position and angles about the fixed axes x, y, z."""
-    return np.asarray(pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(xyz)).homogeneous)
