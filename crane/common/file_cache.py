@@ -9,7 +9,6 @@ folder, or a folder or link on the way to it. Elsewhere nothing is cached.
 import hashlib
 import os
 import stat
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from importlib.util import find_spec
@@ -18,7 +17,7 @@ from pathlib import Path
 from platformdirs import user_cache_path
 
 from crane.common.atomic_output import replace_file
-from crane.common.errors import CraneWarning, OutputError
+from crane.common.errors import OutputError, warn
 
 MAX_CACHE_SIZE = 256 << 20  # [bytes]; the least recently used entries are removed
 _CLEANUPS_PER_CACHE_SIZE = 16  # cleanups per `MAX_CACHE_SIZE` written bytes
@@ -127,11 +126,9 @@ def _is_private(folder: Path) -> bool:
     """
     place = _changeable_place(folder)
     if place is not None:
-        warnings.warn(
+        warn(
             f"nothing is kept in {folder}, because other users can change {place}, and each "
-            "command takes longer: take this right from them (chmod go-w), or set XDG_CACHE_HOME",
-            CraneWarning,
-            stacklevel=2,
+            "command takes longer: take this right from them (chmod go-w), or set XDG_CACHE_HOME"
         )
     return place is None
 

@@ -1,6 +1,5 @@
 """Errors and warnings about the home configuration and about other assembly modes of a machine."""
 
-import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,7 +10,7 @@ from crane.closure.closure import Closure
 from crane.closure.constraint_structure import OpenLoopError
 from crane.closure.constraint_tolerances import CLOSED_TOLERANCE
 from crane.closure.home_search import HomeSearchResult
-from crane.common.errors import CraneWarning, MechanismError
+from crane.common.errors import MechanismError, warn
 from crane.common.package_search import NEAREST_ASSEMBLY, own_argument
 from crane.common.samples import Array
 from crane.description.findings import report_error
@@ -54,9 +53,9 @@ def check_home(
                 )
             )
         else:
-            warnings.warn(_home_search_text(spec, closure, search), CraneWarning, stacklevel=3)
+            warn(_home_search_text(spec, closure, search), stacklevel=3)
     if message := _rounding_text(spec, closure):
-        warnings.warn(message, CraneWarning, stacklevel=3)
+        warn(message, stacklevel=3)
 
 
 def add_remedy(
@@ -185,9 +184,7 @@ def warn_about_assembly_modes(
         remainder = f"; {len(alternatives) - 1} more such: crane check lists them"
         alternatives = alternatives[:1]
     for alternative in alternatives:
-        warnings.warn(
-            _alternative_text(spec, closure, alternative) + remainder, CraneWarning, stacklevel=3
-        )
+        warn(_alternative_text(spec, closure, alternative) + remainder, stacklevel=3)
 
 
 def alternative_configurations(machine: Machine) -> list[Array]:

@@ -2,7 +2,6 @@
 
 import re
 import shutil
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ import yaml
 from lxml import etree
 
 from crane.common.atomic_output import check_file_is_writable, replace_file
-from crane.common.errors import CraneError, CraneWarning, OutputError
+from crane.common.errors import CraneError, OutputError, ignore_warnings
 from crane.common.package_search import NEAREST_ASSEMBLY
 from crane.common.unit_conversions import WrittenNumber
 from crane.description.machine_lookup import bundled_machines, example_robots
@@ -62,8 +61,7 @@ def write_home(
         OutputError: The file belongs to a package, is SDF or MJCF, or cannot be written.
         CraneError: As `load`.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
+    with ignore_warnings():
         machine = load(
             name,
             active=active,

@@ -1,7 +1,6 @@
 """Load machines: read a description, assemble it and close its loops."""
 
 import json
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -12,7 +11,12 @@ import pinocchio as pin
 
 from crane.closure.closure import Closure
 from crane.closure.constraint_structure import OpenLoopError
-from crane.common.errors import CraneWarning, DescriptionError, InputError, summarize_warnings
+from crane.common.errors import (
+    DescriptionError,
+    InputError,
+    ignore_warnings,
+    summarize_warnings,
+)
 from crane.common.package_search import (
     check_argument_values,
     check_package_folders,
@@ -178,8 +182,7 @@ class MachineVariants:
 
         No warnings are issued; see `Closure.perturbed_machine`.
         """
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", CraneWarning)
+        with ignore_warnings():
             return self._build_variant(changes, self._machine.closure.with_perturbed_model)
 
     def _build_variant(

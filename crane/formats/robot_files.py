@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +10,12 @@ from typing import Any
 
 from lxml import etree
 
-from crane.common.errors import CraneWarning, DescriptionError, InputError, suggest_names
+from crane.common.errors import (
+    DescriptionError,
+    InputError,
+    ignore_warnings,
+    suggest_names,
+)
 from crane.common.optional_libraries import installation_hint
 from crane.common.package_search import OWN_ARGUMENTS, load_options, use_load_options
 from crane.description.force_elements import ForceElement
@@ -136,8 +140,7 @@ def open_robots(machine: Machine, chains: Iterable[str] | None = None) -> Iterat
     """
     chain_names = None if chains is None else set(chains)
     with use_load_options(machine.packages, machine.arguments, trust_xacro=machine.trusts_xacro):
-        with warnings.catch_warnings():  # they were issued when it was loaded
-            warnings.simplefilter("ignore", CraneWarning)
+        with ignore_warnings():  # they were issued when it was loaded
             documents = [
                 open_robot(chain.urdf)[0]
                 for chain in machine.chains

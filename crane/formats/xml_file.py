@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from lxml import etree
 
-from crane.common.errors import DescriptionError, check_name, suggest_names
+from crane.common.errors import DescriptionError, check_name, suggest_names, warn
 from crane.common.number_text import parse_float
 from crane.common.package_search import read_plain_file
 from crane.description.findings import report_error
@@ -135,6 +135,10 @@ class XmlFile:
     ) -> None:
         """Raise for a name in an element that is not among some."""
         check_name(name, names, f"{self.source_location(element)}: {problem}", DescriptionError)
+
+    def warn(self, element: etree._Element, problem: str) -> None:
+        """Warn with the source location of an element."""
+        warn(f"{self.source_location(element)}: {problem}", stacklevel=4)
 
     def report(self, element: etree._Element, problem: str, harmless: bool = False) -> None:
         """Raise an error with the source location of an element, or record it.

@@ -1,11 +1,10 @@
 """The distance of two attachment points over the range of a joint, and cylinders that fit it."""
 
-import warnings
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from crane.common.errors import CraneError, CraneWarning, InputError
+from crane.common.errors import CraneError, InputError, warn
 from crane.common.plausible_ranges import LONGEST
 from crane.common.samples import Array
 from crane.formats.additions.steel_cylinder import AttachmentPair, SteelCylinder
@@ -145,13 +144,12 @@ class DistanceCurve:
             f", with a dead centre at {' and '.join(dead_centres)}" if dead_centres else ""
         )
         if dead_centres or (ends and not is_unlimited):  # the stroke limits one without limits
-            warnings.warn(
+            warn(
                 f"'{self.joint}' moves from {range_text}, and a cylinder of "
                 f"{length_limits[0]:.4g} to {length_limits[1]:.4g} m drives it from "
                 f"{reached.values[0]:.4g} to {reached.values[-1]:.4g}{dead_centre_text}: its eyes "
                 f"are {length_text} apart over all of it, choose stroke, dead length or eyes by "
                 "that",
-                CraneWarning,
                 stacklevel=4,
             )
         return fit
@@ -283,11 +281,10 @@ def warn_about_masses(machine: Machine, cylinder: SteelCylinder, joint: str) -> 
     bodies = {body for i in moved_bodies for body in model.subtrees[i]}
     mass = sum(model.inertias[body].mass for body in bodies)
     if mass < cylinder_mass:
-        warnings.warn(
+        warn(
             f"the cylinder weighs {cylinder_mass:.4g} kg, and all that '{joint}' moves "
             f"{mass:.3g} kg: forces are little more than its own weight, give the bodies the "
             "masses of the real machine",
-            CraneWarning,
             stacklevel=4,
         )
 
@@ -305,9 +302,8 @@ def warn_about_strokes(machine: Machine, name: str) -> None:
         if abs(end - last_stroke) > tolerance:
             unreachable.append(f"{min(last_stroke, end):.4g} to {max(last_stroke, end):.4g} m")
     if unreachable:
-        warnings.warn(
+        warn(
             f"the linkage does not close at {' and '.join(unreachable)} of the stroke of "
             f"'{name}', beyond its dead centre: choose another stroke, dead length or eyes",
-            CraneWarning,
             stacklevel=4,
         )

@@ -1,6 +1,5 @@
 """Add a hydraulic cylinder, or the loops that a description leaves open, to a machine file."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from crane.common.atomic_output import check_file_is_writable, fill_folder, portable_file_name
-from crane.common.errors import CraneError, CraneWarning, InputError, MechanismError, OutputError
+from crane.common.errors import (
+    CraneError,
+    InputError,
+    MechanismError,
+    OutputError,
+    ignore_warnings,
+    warn,
+)
 from crane.common.package_search import use_load_options
 from crane.formats.additions.distance_curve import (
     DistanceCurve,
@@ -146,8 +152,7 @@ def add_cylinder(
     check_files_are_new(draft, file, force)
     with fill_folder(file.parent) as output_folder:
         draft.write(output_folder, file.name)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", CraneWarning)
+        with ignore_warnings():
             closed = load(output_folder / file.name)  # a file that does not load is not kept
         warn_about_strokes(closed, name)
     warn_about_masses(loaded, cylinder, distances.joint)
@@ -211,10 +216,9 @@ def _replace_drive(draft: MachineDraft, machine: Machine, name: str, joint: str 
         if not cylinders:
             del draft.data["hydraulics"]
     if removed:
-        warnings.warn(
+        warn(
             f"{machine.name}: {', '.join(removed)} belonged to the active joints as they were, "
             "left out: write those of the new ones",
-            CraneWarning,
             stacklevel=4,
         )
 
@@ -310,8 +314,7 @@ def add_loops(
         MechanismError: The machine does not close with them.
         OutputError: The files cannot be written, or exist already.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
+    with ignore_warnings():
         loaded = load(machine, packages=packages, arguments=arguments)
         with use_load_options(loaded.packages, loaded.arguments, trust_xacro=loaded.trusts_xacro):
             spec = read_machine_spec(machine)

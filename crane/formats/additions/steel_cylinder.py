@@ -1,7 +1,6 @@
 """Hydraulic cylinders of steel between attachment points: masses, shapes, links and loop."""
 
 import math
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -9,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 from lxml import etree
 
-from crane.common.errors import CraneWarning, InputError, check_name
+from crane.common.errors import InputError, check_name, warn
 from crane.common.plausible_ranges import LONGEST, implausible_value_text, suggested_units_text
 from crane.common.samples import Array, as_number
 from crane.common.unit_conversions import UnitError, parse_number
@@ -191,7 +190,7 @@ class SteelCylinder:
                 )
                 raise InputError(f"the {label} is {value:g} m{unit_hint}")
             if warning := implausible_value_text(range_name, value):
-                warnings.warn(f"the {label} {warning}", CraneWarning, stacklevel=4)
+                warn(f"the {label} {warning}", stacklevel=4)
         bore, rod, stroke = float(bore), float(rod), float(stroke)
         return cls(bore, rod, stroke, stroke + 4 * bore if dead_length is None else dead_length)
 

@@ -182,8 +182,10 @@ def _check_machine(
     path = find_machine_file(name)
     spec: MachineSpec | None = None
     closure: Closure | None = None
-    with warnings.catch_warnings(record=True) as caught, collect_findings() as collected:
-        warnings.simplefilter("always", CraneWarning)
+    with (
+        warnings.catch_warnings(record=True, action="always", category=CraneWarning) as caught,
+        collect_findings() as collected,
+    ):
         with error_recovery():
             spec = read_machine_spec(path)
             spec = add_floating_base(spec) if floating else spec

@@ -1,6 +1,5 @@
 """Check that the loops of a machine close, at home, in its tasks and over its strokes."""
 
-import warnings
 from collections.abc import Iterator, Mapping
 
 import numpy as np
@@ -12,7 +11,7 @@ from crane.closure.constraint_tolerances import least_squares_step
 from crane.closure.home_search import within_limits
 from crane.closure.loop_equations import LoopEquations
 from crane.closure.multi_start_search import low_discrepancy_steps
-from crane.common.errors import ClosureError, CraneWarning, MechanismError
+from crane.common.errors import ClosureError, MechanismError, warn
 from crane.common.samples import Array
 from crane.description.findings import Findings, report_error
 from crane.description.kinematic_tree import path_to_root
@@ -122,7 +121,7 @@ def _warn_about_limits(spec: MachineSpec, closure: Closure) -> None:
     for column in closure.passive[~is_within_limits[closure.passive]]:
         name = coordinates.names[int(column)]
         lower, upper = coordinates.lower[column], coordinates.upper[column]
-        _warn(
+        warn(
             f"{spec.tree.joints[name].source_location}: passive joint '{name}' is at "
             f"{closure.home[column]:.4g} with the loops closed at home, outside of its limits "
             f"{lower:g} to {upper:g}, widen them or correct the home"
@@ -151,7 +150,7 @@ def check_tasks(spec: MachineSpec, closure: Closure) -> None:
         for via in task.via if task.space == "tip" else ():
             distance = float(np.linalg.norm([via.point.get(x, 0.0) for x in TIP_COORDINATES]))
             if distance > reach:
-                _warn(
+                warn(
                     f"{location}: task '{name}' has its tip {distance:.4g} m from the root at t = "
                     f"{via.time:g} s, and all links in line are {reach:.4g} m long, choose a "
                     "point within reach"
@@ -159,7 +158,7 @@ def check_tasks(spec: MachineSpec, closure: Closure) -> None:
                 break
         for instant, positions in _task_positions(task):
             if problem := _position_problem(closure, instant, positions):
-                _warn(f"{location}: task '{name}' {problem}")
+                warn(f"{location}: task '{name}' {problem}")
 
 
 def _position_problem(closure: Closure, instant: str, positions: Mapping[str, float]) -> str:
@@ -217,7 +216,7 @@ def check_strokes(spec: MachineSpec, closure: Closure) -> None:
     failed_share = len(failures) / tried_count
     if failed_share >= _MIN_FAILED_SHARE:
         names = ", ".join(np.array(closure.active_names)[is_moved])
-        _warn(
+        warn(
             f"{spec.source_locations.get('active', spec.path.name)}: {100 * failed_share:.0f} % "
             f"of the strokes within the limits of {names} lie beyond dead centres, the nearest "
             f"of those tried: {min(failures)[1]}; narrow the limits, or see that the lengths are "
@@ -247,7 +246,3 @@ def _task_positions(task: Task) -> Iterator[tuple[str, Mapping[str, float]]]:
     for phase in task.phases:
         positions |= phase.until
         yield f"at the end of phase '{phase.name}'", dict(positions)
-
-
-def _warn(text: str) -> None:
-    warnings.warn(text, CraneWarning, stacklevel=3)

@@ -5,13 +5,12 @@ to sevenfold, perhaps because only a part of the body is drawn, so the bounds ar
 """
 
 import math
-import warnings
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 from lxml import etree
 
-from crane.common.errors import CraneWarning
+from crane.common.errors import warn
 from crane.common.number_text import parse_float
 from crane.common.plausible_ranges import LONGEST
 from crane.common.samples import Array
@@ -93,10 +92,6 @@ def _bounds_by_link(visuals: Sequence[Visual]) -> dict[str, Bounds]:
     return {link: (found.min(axis=0), found.max(axis=0)) for link, found in points.items()}
 
 
-def _warn(text: str) -> None:
-    warnings.warn(text, CraneWarning, stacklevel=2)
-
-
 def _warn_about_units(xml: XmlFile) -> bool:
     """Warn of lengths and angles in other units, and return whether lengths seem to be."""
     length_hint, rotation_hint = (
@@ -117,7 +112,7 @@ def _warn_about_units(xml: XmlFile) -> bool:
         largest = 0.0 if values is None else values[np.abs(values).argmax()]
         if key == "rpy" and abs(largest) > _REVOLUTION * 1.01:
             problem = f'rpy="{element.get("rpy")}" turns more than once'
-            _warn(f"{xml.source_location(element)}: {problem}, {rotation_hint}")
+            xml.warn(element, f"{problem}, {rotation_hint}")
         if key != "rpy" and abs(largest) > LONGEST:
             problem = f"{largest:g} m in <{element.tag}> is a long way for a machine"
             long_elements.append((element, problem))
@@ -128,12 +123,12 @@ def _warn_about_units(xml: XmlFile) -> bool:
         if joint.get("type") == "prismatic" and LONGEST < abs(largest) <= _NO_LIMIT:
             long_elements.append((limit, f"the limit {largest:g} m {label} is a long way"))
         if joint.get("type") == "revolute" and 2 * _REVOLUTION < abs(largest) <= _NO_LIMIT:
-            _warn(
+            warn(
                 f"{xml.source_location(limit)}: the limit {largest:g} rad {label} is many turns, "
                 f"{rotation_hint}, or make it continuous"
             )
     for element, problem in long_elements:
-        _warn(f"{xml.source_location(element)}: {problem}, {length_hint}")
+        xml.warn(element, f"{problem}, {length_hint}")
     return bool(long_elements)
 
 
@@ -142,7 +137,7 @@ def _warn_about_home(spec: MachineSpec) -> None:
     for name, value in spec.home.items():
         if name in revolute_joints and abs(value) > 2 * _REVOLUTION:
             location = spec.source_locations.get(f"home {name}", spec.path.name)
-            _warn(
+            warn(
                 f"{location}: home of '{name}' is {value:g} rad, many turns, write radians if "
                 "these are degrees"
             )
@@ -150,12 +145,12 @@ def _warn_about_home(spec: MachineSpec) -> None:
 
 def _warn_about_shapes(shapes: UrdfShapes) -> None:
     for name, where in shapes.missing_meshes.items():
-        _warn(
+        warn(
             f"{where}: mesh file '{name}' is not there, correct its path or "
             "install the package that has it; a box is drawn instead"
         )
     for problem in shapes.problems:
-        _warn(problem)
+        warn(problem)
     sizes: dict[str, Array] = {}
     for visual in (*shapes.shapes["visual"], *shapes.shapes["collision"]):
         if isinstance(visual.shape, MeshShape):
@@ -163,7 +158,7 @@ def _warn_about_shapes(shapes: UrdfShapes) -> None:
             sizes[visual.mesh_label] = np.maximum(size, sizes.get(visual.mesh_label, 0.0))
     for mesh, size in sizes.items():
         if size.max() > LONGEST:
-            _warn(
+            warn(
                 f"{mesh} is {size.max():.3g} m large, give it "
                 'scale="0.001 0.001 0.001" if it is in millimetres'
             )
@@ -191,7 +186,7 @@ def _warn_about_body(
         bounds, joint_distance, gyration_radius, com, float(mass[0])
     ):
         location = xml.source_location(inertial.find(tag))
-        _warn(f"{location}: link '{link.get('name')}' {problem}")
+        warn(f"{location}: link '{link.get('name')}' {problem}")
 
 
 def _size_problems(
@@ -261,7 +256,7 @@ def warn_about_circuit(spec: MachineSpec) -> None:
         location = spec.source_locations.get(
             key, spec.source_locations.get("hydraulics", spec.path.name)
         )
-        warnings.warn(f"{location}: {text}", CraneWarning, stacklevel=2)
+        warn(f"{location}: {text}")
 
 
 def flow_shortages(spec: MachineSpec) -> list[str]:

@@ -3,12 +3,11 @@
 import itertools
 import math
 import string
-import warnings
 from collections.abc import Callable, Container
 from functools import partial
 from typing import Any
 
-from crane.common.errors import CraneWarning, DescriptionError, check_name
+from crane.common.errors import DescriptionError, check_name, warn
 from crane.common.plausible_ranges import implausible_value_text
 from crane.description.circuit_schema import AREA_KEYS, BORE_KEYS, ORIFICE_KEYS, PUMP
 from crane.description.findings import (
@@ -188,11 +187,7 @@ def _warn_about_unit(
 ) -> None:
     text = implausible_value_text(key, value, is_rotary, section.schema.component)
     if text and math.isfinite(value):
-        warnings.warn(
-            f"{section.source_location(key)}: '{key}' of {section.title} {text}",
-            CraneWarning,
-            stacklevel=2,
-        )
+        warn(f"{section.source_location(key)}: '{key}' of {section.title} {text}")
 
 
 def _check_relief(supply: Supply | None, cylinder: Cylinder) -> None:
@@ -204,14 +199,10 @@ def _warn_about_relief(section: YamlSection, supply: Supply | None, cylinder: Cy
     if supply is None or implausible_value_text("relief", cylinder.relief):
         return
     if 0 < cylinder.relief <= supply.pressure:
-        warnings.warn(
-            (
-                f"{section.source_location('relief')}: 'relief' of {section.title} is "
-                f"{cylinder.relief:g} Pa, not above the supply's {supply.pressure:g} Pa: what the "
-                "pump gives flows off there before it can press, give a higher one"
-            ),
-            CraneWarning,
-            stacklevel=2,
+        warn(
+            f"{section.source_location('relief')}: 'relief' of {section.title} is "
+            f"{cylinder.relief:g} Pa, not above the supply's {supply.pressure:g} Pa: what the "
+            "pump gives flows off there before it can press, give a higher one"
         )
 
 

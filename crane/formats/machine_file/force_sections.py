@@ -1,10 +1,9 @@
 """The sections of a machine file on forces: of joints, between frames, and external ones."""
 
 import dataclasses
-import warnings
 from typing import Any
 
-from crane.common.errors import CraneWarning, InputError
+from crane.common.errors import InputError, warn
 from crane.description.external_force_schema import CONTACT, CONTACT_LAW_KEYS, CUTTER, GROUND, LOAD
 from crane.description.external_forces import ExternalForce, PhasedWrench, Wrench
 from crane.description.findings import FollowUpError, error_recovery
@@ -32,11 +31,10 @@ def read_friction(top: YamlSection, tree: TreeBuilder) -> dict[str, Friction]:
         for kind in () if is_drive_intended else ("coulomb", "viscous"):
             mean, offset = getattr(law, kind), getattr(law, f"{kind}_offset")
             if abs(offset) > mean:
-                warnings.warn(
+                warn(
                     f"{item.source_location()}: friction of '{joint}' drives the joint in one "
                     f"direction (|{kind}_offset| {abs(offset):g} > {kind} {mean:g}), a constant "
                     "force may hide in it; write drives: true if it is meant",
-                    CraneWarning,
                     stacklevel=3,
                 )
         return law

@@ -1,6 +1,5 @@
 """A machine file with a URDF per sub-chain."""
 
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -8,7 +7,13 @@ from typing import Any
 from lxml import etree
 
 from crane.common.atomic_output import portable_file_name, replace_folder
-from crane.common.errors import CraneError, CraneWarning, InputError, OutputError, format_one_line
+from crane.common.errors import (
+    CraneError,
+    InputError,
+    OutputError,
+    format_one_line,
+    ignore_warnings,
+)
 from crane.common.unit_conversions import KeyPath
 from crane.description.force_elements import Friction
 from crane.description.kinematic_tree import Tree
@@ -319,8 +324,7 @@ def _payload_urdf(machine: Machine) -> Path | None:
     ):
         return None
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", CraneWarning)
+        with ignore_warnings():
             load = read_machine_spec(machine.path).payload
     except CraneError:  # its files are gone
         return None

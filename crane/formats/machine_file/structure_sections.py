@@ -5,14 +5,13 @@ The tree grows chain by chain, and knows whether names that others use are in it
 
 import math
 import re
-import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 
-from crane.common.errors import CraneError, CraneWarning, DescriptionError, suggest_names
+from crane.common.errors import CraneError, DescriptionError, suggest_names, warn
 from crane.description.findings import FollowUpError, error_recovery, report_error
 from crane.description.force_elements import ForceElement, Friction
 from crane.description.kinematic_tree import Joint, Link, Tree, body_of, path_to_root
@@ -381,12 +380,10 @@ def warn_about_open_loops(spec: MachineSpec) -> None:
     ]
     remainder_text = [f"{len(pairs) - _MAX_SHOWN} more"] if len(pairs) > _MAX_SHOWN else []
     location = spec.tree.links[pairs[0][0]].source_location
-    warnings.warn(
+    warn(
         f"{location}: no joint closes what looks like {len(pairs)} loop{'s' * (len(pairs) > 1)}, "
         f"{', '.join(pair_texts + remainder_text)}: close them by crane add loops, paste what "
-        "crane check proposes into a machine file, or rename the frames",
-        CraneWarning,
-        stacklevel=2,
+        "crane check proposes into a machine file, or rename the frames"
     )
 
 

@@ -1,13 +1,12 @@
 """Elements of written MJCF: placements, inertias, tendons and coefficients of couplings."""
 
-import warnings
 from collections.abc import Mapping
 
 import numpy as np
 import pinocchio as pin
 from lxml import etree
 
-from crane.common.errors import CraneWarning, InputError
+from crane.common.errors import InputError, warn
 from crane.description.kinematic_tree import unique_name
 from crane.description.specification import Coupling
 from crane.formats.xml_file import format_numbers
@@ -66,10 +65,9 @@ def add_inertial(body: etree._Element, inertia: pin.Inertia) -> None:
     moments = np.maximum(moments, _MIN_MOMENT)
     violation = moments[2] - moments[0] - moments[1]
     if violation > _ROUNDING_TOLERANCE * moments[2]:
-        warnings.warn(
+        warn(
             f"the inertia of '{body.get('name')}' is of no possible body by {violation:.2g} kg "
             "m2, which MuJoCo refuses: two moments are written larger",
-            CraneWarning,
             stacklevel=5,
         )
     if violation > 0:

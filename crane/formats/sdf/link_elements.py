@@ -2,14 +2,13 @@
 
 import dataclasses
 import math
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 from lxml import etree
 
-from crane.common.errors import CraneWarning
+from crane.common.errors import warn
 from crane.common.samples import Array
 from crane.description.kinematic_tree import TENSOR_ATTRIBUTES, Inertial
 from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
@@ -38,11 +37,9 @@ def add_link_inertial(
     """
     inertial_element = link.single_child("inertial")
     if inertial_element is None and is_moving:
-        warnings.warn(
+        warn(
             f"{link.source_location}: {link.label} has no <inertial>, which SDF takes as 1 kg "
-            "and 1 kg m2: write what it has",
-            CraneWarning,
-            stacklevel=2,
+            "and 1 kg m2: write what it has"
         )
     inertial_element = inertial_element or link.wrap(etree.Element("inertial"), link.label)
     tensor_element = inertial_element.single_child("inertia") or link.wrap(

@@ -7,14 +7,13 @@ coordinate is that of SDF.
 """
 
 import dataclasses
-import warnings
 from collections.abc import Mapping
 from difflib import get_close_matches
 
 import pinocchio as pin
 from lxml import etree
 
-from crane.common.errors import CraneWarning, DescriptionError, suggest_names
+from crane.common.errors import DescriptionError, suggest_names, warn
 from crane.common.package_search import load_options
 from crane.description.force_elements import ForceElement
 from crane.description.kinematic_tree import (
@@ -344,9 +343,7 @@ def _warn_about_unknown_children(part: SdfElement, element: etree._Element) -> N
                 if similar
                 else (f"it belongs into <{other_parents[0]}>")
             )
-            warnings.warn(
+            warn(
                 f"{part.xml.source_location(child)}: unknown <{name}> in <{element.tag}> of "
-                f"{part.label}, it is left out, {hint}",
-                CraneWarning,
-                stacklevel=2,
+                f"{part.label}, it is left out, {hint}"
             )

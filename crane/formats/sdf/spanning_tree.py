@@ -1,12 +1,11 @@
 """The graph of links and joints of an SDF model: spanning tree, joints to the ground."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pinocchio as pin
 
-from crane.common.errors import CraneWarning
+from crane.common.errors import warn
 from crane.common.package_search import load_options
 from crane.description.kinematic_tree import unique_name
 from crane.formats.conversion_notes import ConversionNotes
@@ -102,11 +101,10 @@ def ground_edges(
     if unattached and not is_floating:
         if is_fixed:
             listed = ", ".join(f"'{link}'" for link in unattached[:_MAX_LISTED])
-            warnings.warn(
+            warn(
                 f"{links[unattached[0]].source_location}: nothing joins '{top.name}' to the "
                 f"world, it is taken as standing on the ground by link {listed}: --floating "
                 "(floating=True) lets it float",
-                CraneWarning,
                 stacklevel=3,
             )
         else:

@@ -2,13 +2,12 @@
 
 import dataclasses
 import math
-import warnings
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 
 from lxml import etree
 
-from crane.common.errors import CraneWarning, suggest_names
+from crane.common.errors import suggest_names, warn
 from crane.description.findings import FollowUpError, error_recovery, is_strict, report_error
 from crane.description.force_elements import Friction
 from crane.description.kinematic_tree import (
@@ -25,6 +24,8 @@ from crane.description.kinematic_tree import (
 )
 from crane.formats.urdf.loop_elements import read_end_link
 from crane.formats.xml_file import XmlFile
+
+_UNLIMITED_HINT = "taken as unlimited: give it lower and upper"
 
 
 def read_link(xml: XmlFile, name: str, element: etree._Element, is_moved: bool) -> Link:
@@ -79,7 +80,7 @@ def _read_inertial(xml: XmlFile, label: str, inertial: etree._Element, is_moved:
         report_error(error, harmless=True)
     elif is_strict() or not problem.is_formal:
         # a fixed link only adds to another body, whose total inertia is checked later
-        warnings.warn(str(error), CraneWarning, stacklevel=2)
+        warn(str(error))
     finding_location = xml.source_location(tensor_tag) if problem.is_formal else ""
     return dataclasses.replace(link_inertial, finding_location=finding_location)
 
@@ -147,7 +148,7 @@ def read_limits(xml: XmlFile, name: str, joint: etree._Element) -> Limits:
     element = xml.single_child(joint, "limit", label)
     if element is None:
         if kind != "continuous":
-            _warn_about_missing_limits(xml, joint, f"{label} is {kind} and has no <limit>")
+            xml.warn(joint, f"{label} is {kind} and has no <limit>, {_UNLIMITED_HINT}")
         return Limits(source_location=xml.source_location(joint))
     found: dict[str, float] = {}
     for key in ("effort", "velocity"):
@@ -157,13 +158,13 @@ def read_limits(xml: XmlFile, name: str, joint: etree._Element) -> Limits:
     if kind == "continuous":
         return limits
     if element.get("lower") is None and element.get("upper") is None:
-        _warn_about_missing_limits(xml, element, f"the limit of {label} has no lower and no upper")
+        xml.warn(element, f"the limit of {label} has no lower and no upper, {_UNLIMITED_HINT}")
         return limits
     lower, upper = (
         xml.number(element, key, f"the limit of {label}", 0.0) for key in ("lower", "upper")
     )
     if lower == upper == 0 and not any(found.values()):
-        _warn_about_missing_limits(xml, element, f"all limits of {label} are 0")
+        xml.warn(element, f"all limits of {label} are 0, {_UNLIMITED_HINT}")
         return Limits(source_location=limits.source_location)
     if lower > upper:
         xml.report(
@@ -175,13 +176,6 @@ def read_limits(xml: XmlFile, name: str, joint: etree._Element) -> Limits:
             f"lower and upper limit of {label} are both {lower:g}, widen them or make it fixed",
         )
     return dataclasses.replace(limits, lower=parse_limit(lower), upper=parse_limit(upper))
-
-
-def _warn_about_missing_limits(xml: XmlFile, element: etree._Element, problem: str) -> None:
-    message = (
-        f"{xml.source_location(element)}: {problem}, taken as unlimited: give it lower and upper"
-    )
-    warnings.warn(message, CraneWarning, stacklevel=4)
 
 
 def read_friction(xml: XmlFile, name: str, joint: etree._Element) -> Friction | None:

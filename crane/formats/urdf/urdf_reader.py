@@ -1,7 +1,6 @@
 """Strict reading of URDF files, with errors where other readers ignore mistakes."""
 
 import dataclasses
-import warnings
 from collections.abc import Callable, Collection, Container, Mapping, Sequence
 from difflib import get_close_matches
 from functools import cache
@@ -9,7 +8,7 @@ from pathlib import Path
 
 from lxml import etree
 
-from crane.common.errors import CraneWarning, suggest_names
+from crane.common.errors import suggest_names
 from crane.description.findings import (
     FollowUpError,
     error_recovery,
@@ -339,15 +338,14 @@ def _warn_about_unknown_elements(xml: XmlFile, joints: Mapping[str, etree._Eleme
         other = [x for x in element if isinstance(x.tag, str) and x.tag not in known]
         for child in [x for x in other if not x.tag.startswith("{")]:
             hint = _suggest_element(child.tag, element.tag)
-            problem = f"unknown <{child.tag}> in <{element.tag}>, it is left out, {hint}"
-            _warn_at(xml, child, problem)
+            xml.warn(child, f"unknown <{child.tag}> in <{element.tag}>, it is left out, {hint}")
     for name, joint in joints.items():
         limit = joint.find("limit")
         if limit is None or joint.get("type") == "fixed":
             continue
         if missing := [key for key in ("effort", "velocity") if limit.get(key) is None]:
             problem = f"the limit of joint '{name}' has no {' and no '.join(missing)}"
-            _warn_at(xml, limit, f"{problem}, nothing is limited then: add it, 1e9 for no limit")
+            xml.warn(limit, f"{problem}, nothing is limited then: add it, 1e9 for no limit")
 
 
 @cache
@@ -364,7 +362,3 @@ def _suggest_element(tag: str, parent: str) -> str:
     if similar[0] in tags:
         return f"did you mean <{similar[0]}>?"
     return f'did you mean {similar[0]}="..." of <{element_of_attribute[similar[0]]}>?'
-
-
-def _warn_at(xml: XmlFile, element: etree._Element, problem: str) -> None:
-    warnings.warn(f"{xml.source_location(element)}: {problem}", CraneWarning, stacklevel=4)

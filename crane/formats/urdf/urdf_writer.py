@@ -7,14 +7,13 @@ document, and the warning about what is left out.
 import copy
 import dataclasses
 import re
-import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from lxml import etree
 
 from crane.common.atomic_output import replace_file
-from crane.common.errors import CraneWarning, InputError, format_one_line
+from crane.common.errors import InputError, format_one_line, warn
 from crane.description.kinematic_tree import Tree
 from crane.description.specification import STANDARD_GRAVITY, Coupling, LoopSpec
 from crane.formats.robot_files import open_robots
@@ -338,9 +337,8 @@ def warn_about_unsupported(machine: Machine, format_name: str, others: Sequence[
     }
     names += [name for name, section in sections.items() if section]
     if listed := ", ".join([*names, *others]):
-        warnings.warn(
+        warn(
             f"{machine.name}: {format_name} has no place for {listed}, left out (a machine "
             "file has)",
-            CraneWarning,
             stacklevel=3,
         )
