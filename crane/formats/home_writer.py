@@ -170,8 +170,7 @@ def _yaml_edits(text: str, home: Mapping[str, float | str]) -> list[TextEdit]:
         edits.append((value.start_mark.index, value.end_mark.index, new))
     if missing and home_node.flow_style:
         end = text.rindex("}", 0, span.stop)
-        comma = ", " if home_node.value else ""
-        edits.append((end, end, comma + _flow_text(missing)))
+        edits.append((end, end, (", " if home_node.value else "") + _flow_text(missing)))
     elif missing:
         key, last = home_node.value[-1]
         after = text.find("\n", last.end_mark.index)

@@ -109,8 +109,9 @@ def load(
     ):
         chosen_joints = _check_chosen_joints(active=active, free=free)
         changes = _with_gravity(changes or {}, gravity)
-        spec = _read_spec(name, chosen_joints, floating)
-        return _assemble_machine(spec, changes, lock, chosen_joints, floating)
+        return _assemble_machine(
+            _read_spec(name, chosen_joints, floating), changes, lock, chosen_joints, floating
+        )
 
 
 def _with_gravity(

@@ -209,8 +209,9 @@ class _AttributeCalls(ast.NodeTransformer):
         self.generic_visit(node)
         if node.attr.startswith("_"):
             raise UnsafeExpressionError(f"the attribute '{node.attr}' is not allowed")
-        function = ast.Name(_ATTRIBUTE_FUNCTION, ast.Load())
-        return ast.Call(function, [node.value, ast.Constant(node.attr)], [])
+        return ast.Call(
+            ast.Name(_ATTRIBUTE_FUNCTION, ast.Load()), [node.value, ast.Constant(node.attr)], []
+        )
 
 
 def restrict_expressions(xacro: Any, substitution: Any) -> None:

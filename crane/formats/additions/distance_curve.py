@@ -100,8 +100,9 @@ class DistanceCurve:
                         machine, self.joint, half[-1], end, resolution, is_driven_at
                     )
                 )
-        samples = [*before[:0:-1], *after]
-        return start_index, DistanceCurve(self.points, self.joint, samples, len(before) - 1)
+        return start_index, DistanceCurve(
+            self.points, self.joint, [*before[:0:-1], *after], len(before) - 1
+        )
 
     def fit_cylinder(self, cylinder: SteelCylinder) -> "tuple[int, DistanceCurve]":
         """Fit a cylinder to the range, with a warning if it does not drive all of it.

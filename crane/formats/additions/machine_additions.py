@@ -144,8 +144,9 @@ def add_cylinder(
     _check_names_are_free(loaded, name)
     distances = distance_curve(points)
     start_index, reached_distances = distances.fit_cylinder(cylinder)
-    joint_path = [joint.name for joint in points.joints]
-    shares_load = loaded.unit(distances.joint) == "m" and distances.joint not in joint_path
+    shares_load = loaded.unit(distances.joint) == "m" and distances.joint not in [
+        joint.name for joint in points.joints
+    ]
     notes = _choice_notes(distances, start_index, shares_load)
     notes += add_barrel_and_rod(draft, name, points, cylinder, distances.samples[start_index][1])
     _replace_drive(draft, loaded, name, None if shares_load else distances.joint)

@@ -365,8 +365,7 @@ def _cylinder_urdf(
         add_link(robot, link)
     barrel_element, rod_element = robot.findall("link")[-2:]
     length, part = cylinder.retracted_length, cylinder.part_length
-    outer_diameter = (1 + 2 * _WALL_SHARE) * cylinder.bore
-    _add_cylinder_visual(barrel_element, 0, length - part, outer_diameter)
+    _add_cylinder_visual(barrel_element, 0, length - part, ((1 + 2 * _WALL_SHARE) * cylinder.bore))
     _add_cylinder_visual(rod_element, 2 * part - length, 0, cylinder.rod)
     for joint in (*pins, slide):
         add_joint(robot, joint)

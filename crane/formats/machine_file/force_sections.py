@@ -102,8 +102,13 @@ def read_external_forces(
         with error_recovery():
             values = section.values()
             contact_law |= {key: values.pop(key) for key in CONTACT_LAW_KEYS if key in values}
-            rows = section.rows("profile") if "profile" in section else ()
-            ground = section.create(Ground, profile=tuple(map(tuple, rows)), **values)
+            ground = section.create(
+                Ground,
+                profile=tuple(
+                    map(tuple, (section.rows("profile") if "profile" in section else ()))
+                ),
+                **values,
+            )
 
     def read_contact(item: YamlSection) -> Contact:
         frame = _read_moving_frame(item, tree)

@@ -214,8 +214,7 @@ def read_chains(
         tree.add_floating_base(check_freedoms(top.names("floating")))
     if not tree.joints and tree.is_complete:
         report_error(top.error_at("chains", "no joint of these chains moves, add one"))
-    gravity = _read_gravity(top, gravities)
-    return tuple(chains), tree, friction, couplings, springs, gravity
+    return tuple(chains), tree, friction, couplings, springs, _read_gravity(top, gravities)
 
 
 def _read_gravity(

@@ -232,8 +232,7 @@ class YamlValues:
             key: The key.
             position: Where it is in the list or the rows of the key.
         """
-        lists = (NumberListKey, RowListKey)
-        spec = self._number_key(key, *(lists if position else (NumberKey,)))
+        spec = self._number_key(key, *((NumberListKey, RowListKey) if position else (NumberKey,)))
         if not isinstance(spec, NumberKey):
             return ("",)
         coordinate = key if key not in self.schema.keys else ""

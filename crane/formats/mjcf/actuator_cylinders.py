@@ -249,10 +249,12 @@ class MjcfCylinders:
 
         In a planar mechanism the second pin then stays at zero.
         """
-        joints = self._joints_between(first, second)
-        hinges = [joint for joint in joints if self._mjcf.joint_type(joint) == "HINGE"]
-        candidates = [*self._data.xaxis[hinges], *np.eye(3)]
-        across = (x - (x @ direction) * direction for x in candidates)
+        hinges = [
+            joint
+            for joint in self._joints_between(first, second)
+            if self._mjcf.joint_type(joint) == "HINGE"
+        ]
+        across = (x - (x @ direction) * direction for x in [*self._data.xaxis[hinges], *np.eye(3)])
         found = next(x for x in across if np.linalg.norm(x) > _MIN_SINE)
         return found / np.linalg.norm(found)
 

@@ -64,5 +64,10 @@ def _strut_of_loop(machine: Machine, loop: LoopSpec) -> MasslessStrut | None:
         return None
     if rod.any() != is_crank:
         return None
-    slide = parts[0 if is_crank else 2].name
-    return MasslessStrut(slide, tuple(joints), first.parent, loop, float(np.linalg.norm(rod)))
+    return MasslessStrut(
+        parts[0 if is_crank else 2].name,
+        tuple(joints),
+        first.parent,
+        loop,
+        float(np.linalg.norm(rod)),
+    )

@@ -75,10 +75,12 @@ class _MjcfWriter:
     def __init__(self, machine: Machine):
         self.machine, self.model, self.tree = machine, machine.model, machine.tree
         self.joints = range(1, self.model.njoints)
-        last_columns = machine.coordinates.body_of_joint[1:]  # by index of the joint, from 1
         self.moved_links = [
             self.tree.root_link,
-            *(self.tree.joints[machine.joints[column - 1]].child for column in last_columns),
+            *(
+                self.tree.joints[machine.joints[column - 1]].child
+                for column in machine.coordinates.body_of_joint[1:]
+            ),
         ]
         self.frames = [  # of all other links
             frame
@@ -102,8 +104,13 @@ class _MjcfWriter:
         """Return the file's content."""
         add = etree.SubElement
         add(self.root, "compiler", angle="radian", autolimits="false", inertiafromgeom="false")
-        gravity = format_numbers(self.machine.gravity)
-        add(self.root, "option", timestep="0.001", gravity=gravity, integrator="implicitfast")
+        add(
+            self.root,
+            "option",
+            timestep="0.001",
+            gravity=format_numbers(self.machine.gravity),
+            integrator="implicitfast",
+        )
         self._add_texts()
         self.bodies[0] = add(self.root, "worldbody")
         pending = [(joint, self.bodies[0]) for joint in reversed(self._child_joints(0))]
@@ -295,8 +302,7 @@ class _MjcfWriter:
         MuJoCo has one value of each effect for all axes.
         """
         machine, data = self.machine, self.model.createData()
-        configuration = machine.coordinates.configuration(machine.home)
-        pin.forwardKinematics(self.model, data, configuration)
+        pin.forwardKinematics(self.model, data, machine.coordinates.configuration(machine.home))
         first = self.model.joints[joint].idx_v
         names = machine.joints[first : first + self.model.joints[joint].nv]
         is_ball = len(names) == ROTATION_COUNT

@@ -112,8 +112,10 @@ def _note_joints(mjcf: MujocoFile, disabled: set[str]) -> None:
         ("jnt_springyield", "yielding of springs"),
         ("jnt_actfrclimited", "limits of the force on joints (actuatorfrcrange)"),
     ):
-        of_dofs = attribute.startswith("dof")
-        found = [int(model.dof_jntid[i]) if of_dofs else i for i in nonzero_rows(model, attribute)]
+        found = [
+            int(model.dof_jntid[i]) if attribute.startswith("dof") else i
+            for i in nonzero_rows(model, attribute)
+        ]
         mjcf.note_unsupported_elements(feature, "JOINT", found)
     for switch, fields in (
         ("SPRING", ("jnt_stiffness", "tendon_stiffness")),

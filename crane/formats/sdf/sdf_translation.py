@@ -277,8 +277,10 @@ class _SdfTranslation:
             axis = edge.axis
             loop = etree.SubElement(self._robot, "loop", name=edge.name, type=edge.kind)
             for tag, link in (("predecessor", edge.parent), ("successor", edge.child)):
-                end = etree.SubElement(loop, tag, link=self._link_name(link))
-                add_origin(end, *xyz_rpy_from_se3(self._link_poses[link].actInv(edge.placement)))
+                add_origin(
+                    etree.SubElement(loop, tag, link=self._link_name(link)),
+                    *xyz_rpy_from_se3(self._link_poses[link].actInv(edge.placement)),
+                )
             if axis is not None:
                 etree.SubElement(loop, "axis", xyz=format_numbers(axis.direction))
             if axis is not None and finite_limits(axis.limits) is not None:

@@ -38,8 +38,9 @@ def spanning_tree(edges: Sequence[SdfJointEdge], root: str) -> list[SdfJointEdge
     """
     bodies, found = DisjointSets(), []
     for rank in range(_PRIORITY_CLASSES):
-        some = [edge for edge in edges if _priority_class(edge) == rank]
-        found += breadth_first(some, bodies, root)
+        found += breadth_first(
+            [edge for edge in edges if _priority_class(edge) == rank], bodies, root
+        )
     return found
 
 

@@ -119,9 +119,12 @@ def read_multi_freedom_joint(
         if (found := xml.single_child(element, tag, label)) is not None:
             xml.report(found, f"{label} is {kind}, for which <{tag}> has no meaning, remove it")
     axis = xml.direction(element, label, (1.0, 0.0, 0.0))
-    placement = xml.placement(element, label)
     return joint_series(
-        name, joint_freedoms(kind, axis), placement, end_links, xml.source_location(element)
+        name,
+        joint_freedoms(kind, axis),
+        xml.placement(element, label),
+        end_links,
+        xml.source_location(element),
     )
 
 

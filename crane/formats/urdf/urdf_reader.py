@@ -332,8 +332,9 @@ def _warn_about_unknown_elements(xml: XmlFile, joints: Mapping[str, etree._Eleme
     known_tags = set().union(*_CHILDREN.values())  # a misplaced known element is an error
     read_elements = [xml.root]
     for element in read_elements:
-        tags = _CHILDREN[element.tag]
-        read_elements += [x for x in element if x.tag in tags and x.tag in _CHILDREN]
+        read_elements += [
+            x for x in element if x.tag in _CHILDREN[element.tag] and x.tag in _CHILDREN
+        ]
         known = known_tags | _FOREIGN_ELEMENTS.get(element.tag, set())
         other = [x for x in element if isinstance(x.tag, str) and x.tag not in known]
         for child in [x for x in other if not x.tag.startswith("{")]:

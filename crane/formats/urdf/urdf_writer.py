@@ -134,8 +134,11 @@ def _add_coupling(machine: Machine, robot: etree._Element, coupling: Coupling) -
     # the joint that a held joint mimics has no effect
     other = [*joints[1:], *(name for name in machine.joints if name != joints[0])][0]
     (follower,) = (j for j in robot.iterfind("joint") if j.get("name") == joints[0])
-    multiplier = format_numbers([derivatives[0] if derivatives else 0.0])
-    mimic = {"joint": other, "multiplier": multiplier, "offset": format_numbers([offset])}
+    mimic = {
+        "joint": other,
+        "multiplier": format_numbers([derivatives[0] if derivatives else 0.0]),
+        "offset": format_numbers([offset]),
+    }
     if follower.get("independent") == "true":
         raise InputError(
             f"'{joints[0]}' is active and follows '{other}' by the coupling '{coupling.name}', "
