@@ -10,12 +10,10 @@ import csv
 import hashlib
 import io
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from stat import S_ISREG
 from types import CodeType, FunctionType
 from typing import Any
 
@@ -74,7 +72,7 @@ class Checkpoint:
             raise writing_error(self._path, error) from error
 
     def _read(self, head: bytes) -> None:
-        if not S_ISREG(os.fstat(self._file.fileno()).st_mode):
+        if not self._path.is_file():
             raise InputError(f"{self._path}: is no plain file, give another name")
         if not try_lock(self._file.fileno()):
             raise InputError(f"{self._path}: another process computes this, wait for its end")

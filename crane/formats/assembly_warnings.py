@@ -1,7 +1,5 @@
 """Errors and warnings about the home configuration and about other assembly modes of a machine."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import pinocchio as pin
 
@@ -148,7 +146,7 @@ def _coordinate_text(closure: Closure, column: int, value: float, verb: str = ""
     return f"{coordinates.names[column]}{verb} {value:.3g} {unit}"
 
 
-def _list_names(names: Sequence[str]) -> str:
+def _list_names(names: list[str]) -> str:
     remaining = len(names) - _MAX_LISTED
     return ", ".join(names[:_MAX_LISTED]) + (f" and {remaining} more" if remaining > 0 else "")
 

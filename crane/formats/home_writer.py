@@ -3,9 +3,7 @@
 import re
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 import yaml
@@ -86,7 +84,7 @@ def write_home(
             edited = edited[:start] + new + edited[end:]
         _replace_text(path, _BYTE_ORDER_MARK * text.startswith(_BYTE_ORDER_MARK) + edited)
         try:
-            _check_written_home(path, machine)
+            _check_written_home(path, machine, arguments)
         except CraneError:
             _replace_text(path, text)
             raise
@@ -99,20 +97,11 @@ def _replace_text(path: Path, text: str) -> None:
         shutil.copymode(path, temporary_file)
 
 
-def _without_lenience(machine: Machine) -> Machine:
-    return replace(
-        machine,
-        arguments=MappingProxyType(
-            {x: value for x, value in machine.arguments.items() if x != NEAREST_ASSEMBLY}
-        ),
-    )
-
-
 def _check_is_writable(machine: Machine, path: Path) -> None:
-    search = machine.closure.home_search
+    search, command_line = machine.closure.home_search, machine.command_line_arguments
     if search is None or not search.is_far:
-        machine = _without_lenience(machine)
-    copy_hint = f"write it into a copy: crane convert {machine.command_line_arguments} FOLDER"
+        command_line = command_line.replace(f" --arg {NEAREST_ASSEMBLY}:=true", "")
+    copy_hint = f"write it into a copy: crane convert {command_line} FOLDER"
     packaged_files = {
         place.resolve() for place in (*bundled_machines().values(), *example_robots().values())
     }
@@ -124,14 +113,16 @@ def _check_is_writable(machine: Machine, path: Path) -> None:
     check_file_is_writable(path)
 
 
-def _check_written_home(path: Path, expected: Machine) -> None:
+def _check_written_home(
+    path: Path, expected: Machine, arguments: Mapping[str, object] | None
+) -> None:
     try:
         machine = load(
             path,
             active=expected.chosen_joints.get("active"),
             free=expected.chosen_joints.get("free"),
             packages=expected.packages,
-            arguments=_without_lenience(expected).arguments,
+            arguments=arguments,
             trust_xacro=expected.trusts_xacro,
         )
     except CraneError as error:

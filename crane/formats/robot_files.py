@@ -57,7 +57,9 @@ def _expand_xacro(xml: XmlFile) -> XmlFile:
                 f"{xml.file.name} has no argument '{name}', "
                 f"{suggest_names(answer['arguments'], name)}"
             )
-    parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
+    parser = etree.XMLParser(
+        resolve_entities=False, no_network=True, remove_comments=True, remove_pis=True
+    )
     root = etree.fromstring(answer["text"].encode("utf-8"), parser)
     locations = {xml.file.name: 0}
     for element in root.iter(etree.Element):
@@ -97,8 +99,7 @@ def open_robot(file: Path) -> tuple[XmlFile, tuple[ForceElement, ...]]:
     """
     xml = XmlFile(file)
     if file.suffix.lower() == ".xacro" or any(
-        isinstance(element.tag, str) and element.tag.startswith("{") and "xacro" in element.tag
-        for element in xml.root.iter()
+        element.tag.startswith("{") and "xacro" in element.tag for element in xml.root.iter()
     ):
         xml = _expand_xacro(xml)
     if file.suffix.lower() in _SDF_SUFFIXES and xml.root.tag not in ("sdf", "robot"):

@@ -172,8 +172,6 @@ class XmlFile:
         self._check_attributes(element, attributes.get(element.tag, set()), closed_elements)
         tags = children.get(element.tag, set())
         for child in element:
-            if not isinstance(child.tag, str):  # an entity, not expanded
-                continue
             if child.tag not in tags:
                 self._check_unknown_child(element, child, children)
             if child.tag in tags:  # possibly after a correction
@@ -323,6 +321,14 @@ class XmlFile:
             self.vector(origin, key, f"the origin of {label}", 3, zero) for key in ("xyz", "rpy")
         )
         return (x, y, z), (roll, pitch, yaw)
+
+
+def parse_attribute(element: etree._Element, key: str) -> list[float]:
+    """Return the numbers of an attribute, none if it is malformed, which others report."""
+    try:
+        return [parse_float(word) for word in element.get(key, "").split()]
+    except ValueError:
+        return []
 
 
 def format_numbers(values: Sequence[float] | np.ndarray) -> str:

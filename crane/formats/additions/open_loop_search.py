@@ -39,12 +39,10 @@ class LoopProposal:
     Attributes:
         loop: The proposed loop.
         gap: Distance of its frames at home, less the travel of slides at its ends [m].
-        is_named: Whether names indicate it, and not positions.
     """
 
     loop: LoopSpec
     gap: float
-    is_named: bool
 
     def __str__(self) -> str:
         """Return an entry of `loops` in a machine file, with the gap as a comment."""
@@ -130,7 +128,6 @@ class _OpenLoopSearch:
             yield LoopProposal(
                 LoopSpec(name, kind, first, second, axis, ""),
                 self._gap(first, second),
-                is_named=True,
             )
 
     def _slide_proposals(self) -> Iterator[LoopProposal]:
@@ -166,7 +163,6 @@ class _OpenLoopSearch:
                 yield LoopProposal(
                     LoopSpec(barrel, "prismatic", barrel, rod, _round_direction(axes[0]), ""),
                     0.0,
-                    True,
                 )
 
     def _meeting_proposals(self) -> Iterator[LoopProposal]:
@@ -187,9 +183,7 @@ class _OpenLoopSearch:
                 and self._is_away_from_origin(second)
             )
             if kind != "spherical" or are_separate_frames:
-                yield LoopProposal(
-                    LoopSpec(second, kind, first, second, axis, ""), gap, is_named=False
-                )
+                yield LoopProposal(LoopSpec(second, kind, first, second, axis, ""), gap)
 
     def _nearby_pairs(self) -> Iterator[tuple[str, str]]:
         """Yield pairs of frames that are close or can be moved together by slides."""

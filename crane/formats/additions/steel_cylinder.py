@@ -1,7 +1,6 @@
 """Hydraulic cylinders of steel between attachment points: masses, shapes, links and loop."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,7 +81,7 @@ def parse_attachment_point(machine: Machine, text: str) -> AttachmentPoint:
 
 
 def joints_between(
-    parent_joints: Mapping[str, Joint], first_link: str, second_link: str
+    parent_joints: dict[str, Joint], first_link: str, second_link: str
 ) -> list[Joint]:
     """Return the movable joints of a tree between two links, see `Tree.parent_joints`."""
     first, second = (path_to_root(parent_joints, link) for link in (first_link, second_link))

@@ -11,13 +11,12 @@ import numpy as np
 from lxml import etree
 
 from crane.common.errors import warn
-from crane.common.number_text import parse_float
 from crane.common.plausible_ranges import LONGEST
 from crane.common.samples import Array
 from crane.description.kinematic_tree import TENSOR_ATTRIBUTES, Inertial, inertia_problem
 from crane.description.specification import MachineSpec
 from crane.formats.visuals.urdf_shapes import MeshShape, UrdfShapes, Visual
-from crane.formats.xml_file import XmlFile
+from crane.formats.xml_file import XmlFile, parse_attribute
 from crane.hydraulics.circuit_elements import MAIN_PUMP, TANK_NODE
 from crane.hydraulics.components import Valve
 from crane.hydraulics.hydraulic_circuit import (
@@ -45,11 +44,7 @@ _MISSING_INPUT_TEXTS = {  # by type of control that needs valves, or their open 
 
 def read_numbers(element: etree._Element | None, key: str, count: int) -> Array | None:
     """Return the finite numbers of an attribute, None if it has others."""
-    text = None if element is None else element.get(key)
-    try:
-        found = np.array([parse_float(word) for word in (text or "").split()])
-    except ValueError:
-        return None
+    found = np.array([] if element is None else parse_attribute(element, key))
     return found if found.shape == (count,) and np.isfinite(found).all() else None
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from collections.abc import Callable, Container, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -289,7 +288,9 @@ def _read_payload(top: YamlSection, tree: TreeBuilder, tip: str | None) -> Paylo
 
 def _read_control(top: YamlSection, active: tuple[str, ...]) -> dict[str, PIGains]:
     gains = top.read_map(
-        "control", lambda _, item: PIGains(**item.values()), partial(check_active_joint, active)
+        "control",
+        lambda _, item: PIGains(**item.values()),
+        lambda joint, location: check_active_joint(active, joint, location),
     )
     named_joints = top.item_names("control")
     missing = [joint for joint in active if named_joints and joint not in named_joints]

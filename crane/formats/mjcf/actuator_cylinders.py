@@ -8,7 +8,6 @@ over the same two sites share it. An actuator by a slider and a crank has a pris
 the z axis of the slider's site, and a strut of constant length from there to the crank's site.
 """
 
-from collections.abc import Mapping
 from itertools import pairwise
 
 import numpy as np
@@ -62,7 +61,7 @@ class MjcfCylinders:
     """
 
     def __init__(
-        self, mjcf: MujocoFile, sites: Mapping[int, str], used_names: set[str], home: np.ndarray
+        self, mjcf: MujocoFile, sites: dict[int, str], used_names: set[str], home: np.ndarray
     ):
         self.parts: list[Link | Joint] = []
         self.loops: list[LoopSpec] = []

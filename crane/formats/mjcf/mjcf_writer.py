@@ -12,11 +12,11 @@ from crane.description.force_elements import ForceElement, Friction, Rope, eleme
 from crane.description.kinematic_tree import ROTATIONS, unique_name
 from crane.description.rotation_vectors import ROTATION_COUNT
 from crane.description.specification import Coupling, Drive, LoopSpec
-from crane.formats.mjcf.massless_struts import find_massless_struts
 from crane.formats.mjcf.mjcf_elements import (
     add_fixed_tendon,
     add_inertial,
     add_tendon,
+    find_massless_struts,
     placement_attributes,
     solve_polynomial,
 )

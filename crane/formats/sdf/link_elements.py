@@ -210,7 +210,7 @@ def add_shapes(
 
 def _geometry_shape(item: SdfElement) -> SdfElement | None:
     geometry = item.single_child("geometry")
-    tags = [] if geometry is None else [x.tag for x in geometry.element if isinstance(x.tag, str)]
+    tags = [] if geometry is None else [x.tag for x in geometry.element]
     return geometry.single_child(tags[0]) if geometry is not None and tags else None
 
 

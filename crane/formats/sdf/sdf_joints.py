@@ -6,7 +6,6 @@ coupled to its rotation q by s = pitch q / 2 pi. A gearbox couples the angles of
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,7 +100,7 @@ class DisjointSets:
         return root != other_root
 
 
-def rigid_bodies(edges: Sequence[SdfJointEdge]) -> DisjointSets:
+def rigid_bodies(edges: list[SdfJointEdge]) -> DisjointSets:
     """Return the sets of links that fixed joints join to one body."""
     bodies = DisjointSets()
     for edge in edges:

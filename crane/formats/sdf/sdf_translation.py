@@ -7,7 +7,6 @@ coordinate is that of SDF.
 """
 
 import dataclasses
-from collections.abc import Mapping
 from difflib import get_close_matches
 
 import pinocchio as pin
@@ -54,7 +53,7 @@ from crane.formats.xml_file import (
 _IDENTITY_TOLERANCE = 1e-15
 _MAX_SHOWN_NAMES = 4  # of unsupported elements in a warning
 # Children that are read, and those that simulators and viewers read.
-_KNOWN_CHILDREN: Mapping[str, set[str]] = {
+_KNOWN_CHILDREN: dict[str, set[str]] = {
     "joint": {
         "parent", "child", "axis", "axis2", "pose", "gearbox_ratio", "gearbox_reference_body",
         "thread_pitch", "screw_thread_pitch", "physics", "sensor", "frame", "plugin",
@@ -335,7 +334,7 @@ def _warn_about_unknown_children(part: SdfElement, element: etree._Element) -> N
         return
     for child in element:
         name = child.tag
-        if not isinstance(name, str) or name in tags or name.startswith("{"):
+        if name in tags or name.startswith("{"):
             continue
         similar = get_close_matches(name.lower(), sorted(tags), 1, 0.75)
         other_parents = [x for x, inside in _KNOWN_CHILDREN.items() if name in inside]

@@ -336,8 +336,7 @@ def _warn_about_unknown_elements(xml: XmlFile, joints: Mapping[str, etree._Eleme
             x for x in element if x.tag in _CHILDREN[element.tag] and x.tag in _CHILDREN
         ]
         known = known_tags | _FOREIGN_ELEMENTS.get(element.tag, set())
-        other = [x for x in element if isinstance(x.tag, str) and x.tag not in known]
-        for child in [x for x in other if not x.tag.startswith("{")]:
+        for child in [x for x in element if x.tag not in known and not x.tag.startswith("{")]:
             hint = _suggest_element(child.tag, element.tag)
             xml.warn(child, f"unknown <{child.tag}> in <{element.tag}>, it is left out, {hint}")
     for name, joint in joints.items():

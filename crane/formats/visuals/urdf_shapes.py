@@ -308,7 +308,7 @@ class UrdfShapes:
                 material.get("name", "").strip()
             )
         geometry = self._xml.single_child(element, "geometry", label)
-        shapes = [] if geometry is None else [x for x in geometry if isinstance(x.tag, str)]
+        shapes = [] if geometry is None else list(geometry)
         if len(shapes) != 1 or shapes[0].tag not in _SHAPE_TAGS:
             shape_text = ", ".join(f"<{shape.tag}>" for shape in shapes[:4]) or "no shape"
             listed = ", ".join(f"<{shape}>" for shape in _SHAPE_TAGS)
