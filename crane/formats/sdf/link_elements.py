@@ -9,7 +9,6 @@ import pinocchio as pin
 from lxml import etree
 
 from crane.common.errors import warn
-from crane.common.samples import Array
 from crane.description.kinematic_tree import TENSOR_ATTRIBUTES, Inertial
 from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
 from crane.formats.sdf.frame_poses import SdfFramePoses
@@ -144,35 +143,24 @@ def _mesh_inertia(mesh_element: SdfElement, density: float) -> pin.Inertia:
         )
     scale = np.array(mesh_element.numbers("scale", 3, (1.0, 1.0, 1.0)))
     triangles = np.concatenate([part.vertices[part.faces] for part in parts]) * scale
-    if edges := _count_open_edges(triangles):
+    centroid = triangles.reshape(-1, 3).mean(axis=0)  # as origin it reduces rounding errors
+    corners = (triangles - centroid).reshape(-1, 3)
+    # equal vertices are merged: formats such as STL contain each several times
+    mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3))
+    if edges := len(trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)):
         raise _unknown_volume_error(
             mesh_element, f"has the mesh '{name}', which {edges} edges leave open"
         )
-    centroid = triangles.reshape(-1, 3).mean(axis=0)  # as origin it reduces rounding errors
-    corners = (triangles - centroid).reshape(-1, 3)
-    mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+    if not mesh.is_winding_consistent:
+        raise _unknown_volume_error(
+            mesh_element, f"has the mesh '{name}', whose triangles do not all face outwards"
+        )
     if mesh.volume < 0:  # its triangles face inwards
         mesh.invert()
     mesh.density = density
     if not mesh.mass > 0:
         raise _unknown_volume_error(mesh_element, f"has the mesh '{name}', which is flat")
     return pin.Inertia(mesh.mass, centroid + mesh.center_mass, mesh.moment_inertia)
-
-
-def _count_open_edges(triangles: Array) -> int:
-    """Count the edges that triangles do not traverse equally often in both directions.
-
-    Vertices that agree to nine digits of the mesh's size are the same: formats without shared
-    vertices, such as STL, contain each several times.
-    """
-    points = triangles.reshape(-1, 3)
-    grid = float(np.ptp(points, axis=0).max()) * 1e-9 or 1.0
-    _, index = np.unique(np.round(points / grid), axis=0, return_inverse=True)
-    directed_edges = index.reshape(-1, 3)[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    directed_edges = directed_edges[directed_edges[:, 0] != directed_edges[:, 1]]
-    sign = np.where(directed_edges[:, 0] < directed_edges[:, 1], 1, -1)
-    _, edge = np.unique(np.sort(directed_edges, axis=1), axis=0, return_inverse=True)
-    return int(np.count_nonzero(np.bincount(edge.ravel(), weights=sign)))
 
 
 _SIZE_ATTRIBUTES = {
