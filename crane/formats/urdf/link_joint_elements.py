@@ -235,12 +235,14 @@ def read_graph(
             cut_joints.add(name)
     roots = [name for name in links if name not in parents]
     joined_count = len(parents)
-    while (repeated_link := _link_in_cycle(parents, links)) is not None:
-        closing_joint = parents[repeated_link][1]
+    while ring := _find_ring(parents, links):
+        closing_joint = ring[-1]
+        repeated_link = end_links[closing_joint][1]
+        listed = ", ".join(ring[:_MAX_LISTED]) + (", ..." if len(ring) > _MAX_LISTED else "")
         xml.report(
             joints[closing_joint],
-            f"link '{repeated_link}' is its own ancestor: cut the ring of joints "
-            f"{_loop_text(parents, repeated_link)} at '{closing_joint}' and close it as a loop",
+            f"link '{repeated_link}' is its own ancestor: cut the ring of joints {listed} at "
+            f"'{closing_joint}' and close it as a loop",
         )
         cut_joints.add(closing_joint)
         del parents[repeated_link]
@@ -280,26 +282,16 @@ def _read_end_links(
     return parent, child
 
 
-def _link_in_cycle(parents: Mapping[str, tuple[str, str]], links: Iterable[str]) -> str | None:
-    """Return the first link that occurs twice among the ancestors of a link, None without one."""
+def _find_ring(parents: Mapping[str, tuple[str, str]], links: Iterable[str]) -> list[str]:
+    """Return the joints of the first cycle of links, from parents to children; [] without one."""
     visited = {""}  # links whose ancestors have been followed
     for link in links:
-        seen: set[str] = set()
-        while link in parents and link not in visited and link not in seen:
-            seen.add(link)
+        joints: dict[str, str] = {}  # by link the joint above it, upwards
+        while link in parents and link not in visited and link not in joints:
+            joints[link] = parents[link][1]
             link = parents[link][0]
-        if link in seen:
-            return link
-        visited |= seen
-    return None
-
-
-def _loop_text(parents: Mapping[str, tuple[str, str]], link: str) -> str:
-    """List the joints of the cycle that a link is in, from the link on."""
-    found: list[str] = []
-    current = link
-    while current != link or not found:
-        current, joint = parents[current]
-        found.append(joint)
-    found.reverse()
-    return ", ".join(found[:_MAX_LISTED]) + (", ..." if len(found) > _MAX_LISTED else "")
+        if link in joints:
+            ring = [*joints.values()][[*joints].index(link) :]
+            return ring[::-1]
+        visited |= joints.keys()
+    return []
