@@ -212,16 +212,14 @@ def _alternative_text(spec: MachineSpec, closure: Closure, alternative: Assembly
     )
     names = closure.equations.coordinates.names
     deviation_text = _coordinate_text(closure, *alternative.largest_deviation)
-    home_text = "outside of limits"
-    if not alternative.home_outside_limits:
-        home_text = f"{_coordinate_text(closure, *alternative.home_deviation)} off what it says"
+    deviation = f"{_coordinate_text(closure, *alternative.home_deviation)} off what it says"
+    home_text = "outside of limits" if alternative.home_outside_limits else deviation
     columns = [int(i) for i in alternative.changed_columns]
     if len(columns) > _MAX_COORDINATES:  # with the largest differences
         differences = np.abs(closure.home - alternative.q)[columns]
         columns = [columns[i] for i in np.argsort(-differences, kind="stable")[:_MAX_LISTED]]
-    pattern = "{}: {:.4g}"
-    if spec.path.suffix in (".urdf", ".xacro"):
-        pattern = '<joint name="{}" value="{:.4g}"/>'
+    is_urdf = spec.path.suffix in (".urdf", ".xacro")
+    pattern = '<joint name="{}" value="{:.4g}"/>' if is_urdf else "{}: {:.4g}"
     home_values, alternative_values = (
         ", ".join(pattern.format(names[i], q[i]) for i in columns)
         for q in (closure.home, alternative.q)

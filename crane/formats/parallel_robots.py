@@ -16,7 +16,7 @@ from crane.description.key_types import (
 )
 from crane.description.kinematic_tree import Joint, Link, Tree, joint_series
 from crane.description.specification import Chain, Drive, LoopSpec, MachineSpec, source_locations
-from crane.formats.machine_file.structure_sections import TreeBuilder, read_home
+from crane.formats.machine_file.structure_sections import TreeBuilder, links_by_name, read_home
 from crane.formats.machine_file.yaml_section import YamlSection
 from crane.formats.machine_file.yaml_text import MAX_FILE_SIZE, format_value
 from crane.formats.urdf.link_joint_elements import MOVABLE_TYPES
@@ -180,8 +180,7 @@ def _read_loops(top: YamlSection, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
         raise top.error_at(
             "type", f"{len(kinds)} types for {len(pairs)} closed loops, give each one"
         )
-    link_of_name = {joint.name: joint.child for joint in tree.tree.joints.values()}
-    link_of_name |= dict(zip(tree.links, tree.links, strict=True))
+    link_of_name = links_by_name(tree.tree)
     loops: dict[str, LoopSpec] = {}
     for pair, kind in zip(pairs, kinds, strict=True):
         if kind.lower() not in _LOOP_TYPES:

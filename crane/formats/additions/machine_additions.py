@@ -225,9 +225,8 @@ def _replace_drive(draft: MachineDraft, machine: Machine, name: str, joint: str 
 
 
 def _check_names_are_free(machine: Machine, name: str) -> None:
-    used_names = {*machine.tree.links, *machine.tree.joints}
+    used_names = {*machine.tree.links, *machine.tree.joints, *machine.closure.equations.names}
     used_names |= {chain.name for chain in machine.chains}
-    used_names |= set(machine.closure.equations.names)
     for suffix in _NAME_SUFFIXES:
         if name + suffix in used_names:
             raise InputError(

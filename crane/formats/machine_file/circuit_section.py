@@ -353,5 +353,4 @@ def _read_valve(joint: str, item: YamlSection) -> Valve:
         constants["spool_b"] = read_component(
             second_section, second_section.values(), joint=joint, **shared
         )
-    valve: Valve = read_component(item, values, **constants)
-    return valve
+    return read_component(item, values, **constants)

@@ -386,13 +386,16 @@ def warn_about_open_loops(spec: MachineSpec) -> None:
     )
 
 
+def links_by_name(tree: Tree) -> dict[str, str]:
+    """Return links by their names, and child links by the names of joints."""
+    children = {name: x.child for name, x in tree.joints.items() if name not in tree.links}
+    return {name: name for name in tree.links} | children
+
+
 def loop_end_pairs(tree: Tree) -> list[tuple[str, str, str]]:
     """A name for each loop, and its two links, which have the names themselves or their joints."""
-    link_of_name = {name: name for name in tree.links}
-    for name, joint in tree.joints.items():
-        link_of_name.setdefault(name, joint.child)
     ends: dict[str, dict[str, str]] = {}
-    for name, link in link_of_name.items():
+    for name, link in links_by_name(tree).items():
         if match := _LOOP_END_PATTERN.fullmatch(name):
             ends.setdefault(match[1], {})[match[2].upper()] = link
     return [

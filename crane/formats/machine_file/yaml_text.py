@@ -93,13 +93,12 @@ def written_numbers_by_path(
     """The numbers that were read of a machine file, as written, by the ways to them."""
     found = {(*path, *place): quantity for place, quantity in data.written_numbers.items()}
     for key, value in data.items():
-        items: dict[str | int, Any] = {key: value}
-        if isinstance(value, list):
-            items = dict(zip(_item_labels(value), value, strict=True))
-        for label, item in items.items():
+        if isinstance(value, LocatedMapping):
+            found |= written_numbers_by_path(value, (*path, key))
+        items = value if isinstance(value, list) else []
+        for label, item in zip(_item_labels(items), items, strict=True):
             if isinstance(item, LocatedMapping):
-                way = (*path, key) if item is value else (*path, key, label)
-                found |= written_numbers_by_path(item, way)
+                found |= written_numbers_by_path(item, (*path, key, label))
     return found
 
 

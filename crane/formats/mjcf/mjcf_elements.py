@@ -132,9 +132,8 @@ def _strut_of_loop(machine: Machine, loop: LoopSpec) -> MasslessStrut | None:
     is_apart = any(model.jointPlacements[i].translation.any() for i in joints[1:])
     first = parts[0]
     is_turned = is_crank and (any(first.rpy) or tuple(first.axis) != (0.0, 0.0, 1.0))
-    if other_children or has_mass or is_apart or is_turned or any(first.xyz):
-        return None
-    if rod.any() != is_crank:
+    is_other = rod.any() != is_crank
+    if other_children or has_mass or is_apart or is_turned or any(first.xyz) or is_other:
         return None
     return MasslessStrut(
         parts[0 if is_crank else 2].name,

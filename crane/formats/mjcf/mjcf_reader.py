@@ -124,9 +124,8 @@ class _MjcfReader:
 
     def _unique_link_name(self, name: str) -> str:
         """Return a name that no body and no other link has."""
-        used_names = {self.mjcf.name("BODY", i) for i in range(self.model.nbody)}
-        used_names |= self.links.keys()
-        return unique_name(name, used_names)
+        bodies = (self.mjcf.name("BODY", i) for i in range(self.model.nbody))
+        return unique_name(name, {*bodies, *self.links})
 
     def _add_fixed_joint(self, link: str, parent: str, placement: pin.SE3) -> None:
         name = unique_name(f"{link}_fixed", {*self.joints, *self.names})

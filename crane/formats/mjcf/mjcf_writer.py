@@ -55,11 +55,8 @@ def write_mjcf(machine: Machine, path: str | Path) -> None:
     writer = _MjcfWriter(machine)
     with replace_file(path) as temporary_file:
         temporary_file.write_bytes(writer.build_content())
-    unsupported = [
-        f"the constant force on {x.joint}" for x in machine.forces if x.force and x.joint
-    ]
-    unsupported += writer.unsupported
-    warn_about_unsupported(machine, "MJCF", unsupported)
+    constant = [f"the constant force on {x.joint}" for x in machine.forces if x.force and x.joint]
+    warn_about_unsupported(machine, "MJCF", [*constant, *writer.unsupported])
 
 
 class _MjcfWriter:

@@ -98,9 +98,8 @@ def solid_inertia(shape: SdfElement, density: float) -> pin.Inertia:
         x, y, z = _read_sizes(solid_element, "size", 3)
         return pin.Inertia.FromBox(density * x * y * z, x, y, z)
     if tag in ("ellipsoid", "sphere"):
-        radii = _read_sizes(solid_element, "radius", 1) * 3
-        if tag == "ellipsoid":
-            radii = _read_sizes(solid_element, "radii", 3)
+        key, count = ("radii", 3) if tag == "ellipsoid" else ("radius", 1)
+        radii = _read_sizes(solid_element, key, count) * (3 // count)
         mass = density * 4 / 3 * math.pi * float(np.prod(radii))
         return pin.Inertia.FromEllipsoid(mass, *radii)
     (radius,), (length,) = (_read_sizes(solid_element, key, 1) for key in ("radius", "length"))
