@@ -196,7 +196,8 @@ def _read_loops(top: YamlSection, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
         loop = LoopSpec(
             name,
             _LOOP_TYPES[kind.lower()],
-            *(link_of_name[frame] for frame in pair),
+            link_of_name[pair[0]],
+            link_of_name[pair[1]],
             (0.0, 0.0, 1.0),
             top.source_location("closed_loop"),
         )

@@ -112,10 +112,10 @@ class MachineDraft:
         chain_of_attachment = {chain.attachment_name: chain.name for chain in chains[1:]}
         parent_joints = tree.parent_joints
         self._chain_of_link: dict[str, str] = {}
-        for link in tree.links:
-            joints = [joint.name for joint in path_to_root(parent_joints, link)]
+        for name in tree.links:
+            joints = [joint.name for joint in path_to_root(parent_joints, name)]
             begun = (chain_of_attachment[x] for x in joints if x in chain_of_attachment)
-            self._chain_of_link[link] = next(begun, chains[0].name)
+            self._chain_of_link[name] = next(begun, chains[0].name)
         robots = {chain.name: etree.Element("robot", name=chain.name) for chain in chains}
         for link in tree.links.values():
             add_link(robots[self._chain_of_link[link.name]], link)

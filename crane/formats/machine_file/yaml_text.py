@@ -34,6 +34,7 @@ def format_yaml(
         written_numbers: Numbers whose units are kept, see `written_numbers_by_path`.
     """
     in_units = with_written_units(dict(data), written_numbers)
+    plain: Any = data
     layout: Any = {"allow_unicode": True, "width": 100}
     text = str(yaml.safe_dump(in_units, sort_keys=False, default_flow_style=None, **layout))
     if not notes:
@@ -44,7 +45,7 @@ def format_yaml(
     text = str(yaml.serialize(top, **layout))
     lines, top = text.split("\n"), yaml.compose(text, yaml.SafeLoader)
     for key_path, note in notes.items():
-        node, value = _node_at(top, key_path), reduce(getitem, key_path, data)
+        node, value = _node_at(top, key_path), reduce(getitem, key_path, plain)
         in_si = f"{value:.6g} in SI units, " if is_quantity(node.value) else ""
         lines[node.end_mark.line] += f"  # {in_si}{format_one_line(note)}"
     return "\n".join(lines)
