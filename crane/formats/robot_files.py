@@ -40,8 +40,9 @@ def _expand_xacro(xml: XmlFile) -> XmlFile:
     """
     answer = _run_xacro_process(xml.file)
     if "missing" in answer:
-        hint = installation_hint("xacro")
-        raise DescriptionError(f"{xml.file.name}: is written with xacro, {hint}")
+        raise DescriptionError(
+            f"{xml.file.name}: is written with xacro, {installation_hint('xacro')}"
+        )
     if "wrong" in answer:
         location = Path(answer.get("file") or xml.file).name
         location += f":{answer['line']}" if "line" in answer else ""

@@ -11,7 +11,6 @@ from crane.common.errors import (
     CraneError,
     InputError,
     MechanismError,
-    OutputError,
     ignore_warnings,
     warn,
 )
@@ -256,9 +255,7 @@ def check_files_are_new(draft: MachineDraft, file: Path, force: bool) -> None:
         OutputError: A file exists already.
     """
     for relative_path in draft.file_paths(file.name):
-        target = file.parent / relative_path
-        if target.exists() and not force:
-            raise OutputError(f"{target}: exists already, choose another name or add --force")
+        check_file_is_writable(file.parent / relative_path, force)
 
 
 @dataclass(frozen=True)
@@ -280,8 +277,8 @@ class AddedLoops:
     def __str__(self) -> str:
         """Return a few lines about the loops."""
         lines = [str(proposal) for proposal in self.loops]
-        driven_text = ", ".join(self.active)
-        lines.append(f"{self.mobility} degrees of freedom, driven by {driven_text or 'nothing'}")
+        driven_text = ", ".join(self.active) or "nothing"
+        lines.append(f"{self.mobility} degrees of freedom, driven by {driven_text}")
         return "\n".join([*lines, f"written to {self.path}"])
 
 

@@ -303,8 +303,9 @@ def _read_network(section: YamlSection) -> dict[str, Any]:
 
     def read_named(name: str, item: YamlSection) -> Any:
         if not name or not set(name) <= _NAME_CHARACTERS:
-            kind = item.schema.title
-            raise item.error_at(None, f"a {kind} is called '{name}', use letters, digits, _")
+            raise item.error_at(
+                None, f"a {item.schema.title} is called '{name}', use letters, digits, _"
+            )
         values = _pump_values(section, item) if item.schema is PUMP else item.values()
         return read_component(item, values)
 

@@ -87,8 +87,7 @@ def _read_csv_table(path: Path) -> tuple[str, Sequence[tuple[float, float]]]:
         except IndexError:
             raise InputError(f"{path.name}:{number} has no two numbers, correct it") from None
         except UnitError as error:
-            cells = ", ".join(row)
-            raise InputError(f"{path.name}:{number} has '{cells}', {error}") from None
+            raise InputError(f"{path.name}:{number} has '{', '.join(row)}', {error}") from None
         points.append((u, value))
     return names[0], points
 

@@ -105,8 +105,7 @@ class TreeBuilder:
 
     def unknown_name_error(self, message: str, name: str = "?") -> CraneError:
         """The error about a name, unless a chain is not there or the name has been refused."""
-        is_follow_up = not self.is_complete or not name
-        return FollowUpError(message) if is_follow_up else DescriptionError(message)
+        return DescriptionError(message) if self.is_complete and name else FollowUpError(message)
 
     def check_name(self, name: str, names: Collection[str], problem: str) -> None:
         """Raise for a name that is not among some."""

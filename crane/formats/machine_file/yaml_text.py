@@ -190,9 +190,8 @@ def _construct_mapping(loader: Any, node: yaml.MappingNode) -> LocatedMapping:
             report_error(DescriptionError(f"{where}: {problem}"))
             continue
         if key in data:
-            first_line = data.locations[key][1]
-            problem = f"key '{key}' is there twice (first in line {first_line}), keep one"
-            report_error(DescriptionError(f"{where}: {problem}"))
+            problem = f"is there twice (first in line {data.locations[key][1]}), keep one"
+            report_error(DescriptionError(f"{where}: key '{key}' {problem}"))
             continue
         data[key] = loader.construct_object(value_node, deep=True)
         data.locations[key] = file, line

@@ -1,6 +1,7 @@
 """Values of a machine file, read as their schema says, every error with its file and line."""
 
 import math
+import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -326,13 +327,9 @@ class YamlValues:
         """A file, named by its path from the folder of the file that names it."""
         text = self.text(key)
         path = self._data.locations.get(key, self._location)[0].parent / text
-        try:
-            if path.is_dir():
-                raise self.error_at(key, f"'{text}' of {self.title} is a folder, give a file")
-            is_file = path.is_file()
-        except OSError:  # a name longer than any file's
-            is_file = False
-        if not is_file:
+        if os.path.isdir(path):
+            raise self.error_at(key, f"'{text}' of {self.title} is a folder, give a file")
+        if not os.path.isfile(path):  # also for invalid names
             raise self.error_at(
                 key, f"{self.title}: there is no file '{text}', give its path from this folder"
             )

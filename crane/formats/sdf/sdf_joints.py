@@ -128,12 +128,11 @@ class SdfJoints:
         self._gearboxes: list[tuple[SdfElement, tuple[str, str], list[np.ndarray], str]] = []
         self._freedom_names: dict[str, list[str]] = {}  # joint -> its coordinates
         scopes = [scope for scope in top.nested_scopes() if not scope.is_static]
-        for scope in scopes:
-            for joint in scope.joints.values():
-                self._read_joint(scope, joint)
-        for scope in scopes:
-            for joint in scope.joints.values():
-                self._read_mimic(scope, joint)
+        joints = [(scope, joint) for scope in scopes for joint in scope.joints.values()]
+        for scope, joint in joints:
+            self._read_joint(scope, joint)
+        for scope, joint in joints:
+            self._read_mimic(scope, joint)
         self._add_gear_couplings()
         coupled = {x for name, mimic, _ in self.mimics for x in (name, mimic.get("joint"))}
         self.edges = [

@@ -349,8 +349,9 @@ class UrdfShapes:
     ) -> tuple[float, ...]:
         sizes = self._xml.vector(shape, key, label, count)
         if min(sizes) <= 0:
-            given = f'{key}="{shape.get(key)}"'
-            raise self._xml.error_at(shape, f"{given} of {label} is not positive, give metres")
+            raise self._xml.error_at(
+                shape, f'{key}="{shape.get(key)}" of {label} is not positive, give metres'
+            )
         self._check_distance(shape, label, sizes)
         return sizes
 
