@@ -6,6 +6,7 @@ from contextlib import AbstractContextManager
 from dataclasses import fields
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import pinocchio as pin
@@ -249,7 +250,7 @@ def _assemble_machine(
     check_frame_elements(spec, closure)
     coordinates = closure.equations.coordinates
     lower, upper = coordinates.lower, coordinates.upper
-    described = {
+    described: dict[str, Any] = {
         name: MappingProxyType(dict(value)) if isinstance(value, Mapping) else value
         for name, value in vars(spec).items()
         if name in _DESCRIBED_FIELDS
