@@ -49,11 +49,6 @@ class DistanceCurve:
         self.length = np.linalg.norm([points.vector(q) for _, q in samples], axis=1)
         self.alternative_joints: tuple[str, ...] = ()
 
-    @property
-    def lever_arms(self) -> Array:
-        """(N,) derivatives of the distance by the coordinate: lever arms [m], or ratios."""
-        return np.array([self.points.lever_arm(q, self.joint) for _, q in self.samples])
-
     def driven_part(
         self, min_length: float, max_length: float
     ) -> "tuple[int, DistanceCurve] | None":

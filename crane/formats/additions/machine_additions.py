@@ -156,7 +156,7 @@ def add_cylinder(
             closed = load(output_folder / file.name)  # a file that does not load is not kept
         warn_about_strokes(closed, name)
     warn_about_masses(loaded, cylinder, distances.joint)
-    lever_arms = np.abs(reached_distances.lever_arms)
+    lever_arms = [abs(points.lever_arm(q, distances.joint)) for _, q in reached_distances.samples]
     strokes = np.clip(
         reached_distances.length[[0, -1]] - cylinder.retracted_length, 0, cylinder.stroke
     )
@@ -170,7 +170,7 @@ def add_cylinder(
         driven_range=(float(reached_distances.values[0]), float(reached_distances.values[-1])),
         length_range=(float(distances.length.min()), float(distances.length.max())),
         stroke_range=(float(strokes[0]), float(strokes[1])),
-        lever_arm_range=(float(lever_arms.min()), float(lever_arms.max())),
+        lever_arm_range=(min(lever_arms), max(lever_arms)),
         masses=(cylinder.barrel_inertial.mass, cylinder.rod_inertial.mass),
         notes=tuple(notes),
     )

@@ -306,13 +306,13 @@ def read_couplings(top: YamlSection, tree: TreeBuilder) -> tuple[Coupling, ...]:
     names: list[str] = []
 
     def read_coupling(item: YamlSection) -> Coupling:
-        name, joints = item.text("name"), item.section("joints")
+        name = item.text("name")
         if name in names:
             raise item.error_at("name", f"two couplings are named '{name}', rename one")
         factors = item.value_map("joints", YamlSection.number, tree.check_joint)
         powers = item.value_map("powers", _read_powers, tree.check_joint)
         coupling = Coupling(name, factors, item.number("offset"), item.source_location(), powers)
-        if joints is None or len(coupling.joints) < 2:
+        if len(coupling.joints) < 2:
             raise item.error_at(
                 "joints", f"coupling '{name}' joins less than two joints, add some"
             )
@@ -335,12 +335,10 @@ def read_drives(top: YamlSection, tree: TreeBuilder) -> tuple[Drive, ...]:
 
     def read_drive(section: YamlSection, name: str) -> Drive:
         title = f"drive '{name}'"
-        joints = section.section(name, title)
-        if joints is None or not list(joints):
+        factors = section.value_map(name, YamlSection.number, tree.check_joint, title)
+        if not factors:
             raise section.error_at(name, f"{title} moves no joint, name some")
-        for joint in joints:
-            tree.check_joint(joint, joints.source_location(joint))
-        return Drive(name, section.value_map(name, YamlSection.number, title=title))
+        return Drive(name, factors)
 
     return tuple(top.value_map("drives", read_drive).values())
 

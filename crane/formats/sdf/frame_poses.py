@@ -93,6 +93,11 @@ class SdfFramePoses:
             relative = item.base_frame
         return self.pose_in_scope(scope, relative or default, item) * placement
 
+    def pose_on_link(self, scope: ModelScope, link: SdfElement, item: SdfElement) -> pin.SE3:
+        """Return the pose of an element of a link relative to the link's frame."""
+        link_pose = self.element_pose(scope, link, link.base_frame)
+        return link_pose.actInv(self.element_pose(scope, item, link.name))
+
 
 def attached_to(frame: SdfElement) -> str:
     """Return the name that a frame is attached to."""

@@ -62,11 +62,10 @@ def _collision_inertial(
 ) -> Inertial:
     """Return the inertial of the collisions of a link, filled with their densities."""
     density = inertial_element.number("density", _DEFAULT_DENSITY)
-    link_pose = frames.element_pose(scope, link, link.base_frame)
     total_inertia = pin.Inertia.Zero()
     for child in link.element.iterfind("collision"):
         shape = link.wrap(child, f"a collision of {link.label}")
-        shape_pose = link_pose.actInv(frames.element_pose(scope, shape, link.name))
+        shape_pose = frames.pose_on_link(scope, link, shape)
         total_inertia += shape_pose.act(solid_inertia(shape, shape.number("density", density)))
     computed_inertial = inertial_from_inertia(total_inertia)
     if computed_inertial is None:
@@ -177,7 +176,6 @@ def add_shapes(
     note: NoteFunction,
 ) -> None:
     """Add visuals and collisions of a link; `note` receives shapes that URDF does not have."""
-    link_pose = frames.element_pose(scope, link, link.base_frame)
     for child in link.element:
         if child.tag not in ("visual", "collision"):
             continue
@@ -185,8 +183,7 @@ def add_shapes(
         if (geometry := _shape_element(shape, note)) is None:
             continue
         added = etree.SubElement(element, child.tag)
-        shape_pose = frames.element_pose(scope, shape, link.name)
-        add_origin(added, *xyz_rpy_from_se3(link_pose.actInv(shape_pose)))
+        add_origin(added, *xyz_rpy_from_se3(frames.pose_on_link(scope, link, shape)))
         etree.SubElement(added, "geometry").append(geometry)
         material = shape.single_child("material") if child.tag == "visual" else None
         if material is not None and (text := material.text("diffuse") or material.text("ambient")):
