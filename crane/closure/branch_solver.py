@@ -15,7 +15,7 @@ from crane.closure.continuation_diagnosis import ClosedConfiguration
 from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
 from crane.closure.newton_continuation import NewtonContinuation
-from crane.codegen import FormulaTooLongError, run_with_fallback
+from crane.codegen import FormulaTooLongError, SampleFunction, run_with_fallback
 from crane.common.errors import ClosureError, SingularConfigurationError, WrongBranchError
 from crane.common.samples import Array
 from crane.common.threads import ThreadLocal
@@ -126,8 +126,15 @@ class BranchSolver:
         return self._machine_code
 
     @cached_property
-    def _cursors(self) -> ThreadLocal[ContinuationCursor]:
-        return ThreadLocal(self.compiled_closure.new_cursor)
+    def _cursors(self) -> ThreadLocal[tuple[ContinuationCursor, SampleFunction]]:
+        """Cursors, and functions of one target that continue from them."""
+        code = self.compiled_closure
+
+        def create() -> tuple[ContinuationCursor, SampleFunction]:
+            cursor = code.new_cursor()
+            return cursor, code.sample_function(cursor)
+
+        return ThreadLocal(create)
 
     @cached_property
     def _beyond(self) -> ThreadLocal["_ChangePointBranch"]:
@@ -149,7 +156,7 @@ class BranchSolver:
         """
         nearest = self.continuation.nearest_closed_configuration
         if self.is_compiled:
-            cursor = self._cursors.value
+            cursor, _ = self._cursors.value
             if guess is not None and not self.compiled_closure.start_cursor_at(cursor, guess):
                 cursor.start_from(known := nearest(guess))
                 self._go_beyond(known)
@@ -241,7 +248,7 @@ class BranchSolver:
     def is_on_branch(self, q: Array) -> bool:
         """Whether a closed configuration (nq,) lies on the branch of home."""
         if self.is_compiled:
-            return self.compiled_closure.start_cursor_at(self._cursors.value, q)
+            return self.compiled_closure.start_cursor_at(self._cursors.value[0], q)
         try:
             found = self.continuation.nearest_closed_configuration(q)
         except WrongBranchError:

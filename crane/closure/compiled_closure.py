@@ -21,7 +21,16 @@ from crane.closure.kinematics_formulas import (
 from crane.closure.loop_equations import Cluster, LoopEquations, find_clusters
 from crane.closure.loop_formulas import LoopFormulas
 from crane.closure.predictor_formulas import PredictorFormulas
-from crane.codegen import Layout, LayoutView, Program, Scalar, Tape, max_abs, maximum
+from crane.codegen import (
+    Layout,
+    LayoutView,
+    Program,
+    SampleFunction,
+    Scalar,
+    Tape,
+    max_abs,
+    maximum,
+)
 from crane.codegen.symbolic import minimum
 from crane.common.samples import Array
 
@@ -256,6 +265,21 @@ class CompiledClosure:
             cursor.state,
             out,
             self.tolerances,
+        )
+
+    def sample_function(self, cursor: "ContinuationCursor") -> SampleFunction:
+        """The function of one target (n,) that returns q (nq,), continued from a cursor."""
+        target, q = np.zeros((1, self._n)), np.zeros(self._nq)
+        arguments = 1, self.geometry.constants, target, cursor.state, q, self.tolerances
+        return self._closure_program.python_function("follow", *arguments, inputs=target, output=q)
+
+    @cached_property
+    def gamma_function(self) -> SampleFunction:
+        """The function of one closed configuration (nq,) that returns gamma (nv, n)."""
+        q, gamma = np.zeros((1, self._nq)), np.zeros((self._nq, self._n))
+        arguments = 1, self.geometry.constants, q, gamma
+        return self._closure_program.python_function(
+            "gamma_each", *arguments, inputs=q, output=gamma
         )
 
     def close_in_place(self, q: Array) -> int:

@@ -1,5 +1,6 @@
 """Symbolic formulas, routines that call them, and their translation to machine code."""
 
+from crane.codegen.llvm.python_function import SampleFunction
 from crane.codegen.llvm.routine_builder import ArrayPointer, Routine, RoutineValue, select
 from crane.codegen.program import (
     FormulaTooLongError,
@@ -14,6 +15,7 @@ from crane.codegen.vector_layout import Layout, LayoutView
 __all__ = [
     "ArrayPointer",
     "PythonCallback",
+    "SampleFunction",
     "SymbolicExpression",
     "Layout",
     "Scalar",

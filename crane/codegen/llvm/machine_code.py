@@ -89,7 +89,11 @@ class MachineCode:
     @classmethod
     def compile_functions(cls, functions: Iterable[Formula | Routine]) -> "MachineCode":
         """Compile functions, or read their machine code from the cache."""
-        text = emit_module(functions)
+        return cls.compile_text(emit_module(functions))
+
+    @classmethod
+    def compile_text(cls, text: str) -> "MachineCode":
+        """Compile LLVM IR, or read its machine code from the cache."""
         depends = f"{compiler_settings()} {text}"
         return cls(
             entry_name(depends),
