@@ -170,14 +170,13 @@ class Program:
         """A Python function that evaluates one sample by a routine, for many fast calls.
 
         It takes up to k arrays (n,) and returns a new array of the shape of `output`; None where
-        an argument is no float64 array (n,) of finite numbers, or the routine does not return 1.
-        It holds the global interpreter lock.
+        an argument is not a float64 array (n,) of finite numbers, or the routine does not return
+        1. It holds the global interpreter lock; the routine must not call Python.
 
         Args:
             name: Name of the routine.
             arguments: See `call`.
-            inputs: (k, n) array among the arguments, or divided among them, that the routine
-                reads.
+            inputs: (k, n) that the routine reads, all or rows of it among the arguments.
             output: Array among the arguments that the routine writes.
         """
         addresses = np.array([*map(_argument_address, arguments)], dtype=np.int64)

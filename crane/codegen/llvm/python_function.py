@@ -2,11 +2,11 @@
 
     PyObject *python_function(PyObject *self, PyObject *const *arguments, Py_ssize_t count)
 
-is compiled once for all routines (calling convention METH_FASTCALL). Everything that it needs,
-addresses of Python, of NumPy and of the routine, is in the array `self`, not in the machine code,
-which is kept between processes. It creates the result, copies the arguments to the inputs of the
-routine, calls it, and copies its output. It holds the global interpreter lock; nothing between
-the first copy and the last one can release it, so that calls of one function do not mix.
+is compiled once for all routines (calling convention METH_FASTCALL). The addresses that it needs,
+of Python, NumPy and the routine, are in the array `self`, because machine code is cached between
+processes. It creates the result, copies the arguments to the inputs of the routine, calls it, and
+copies its output. From the first copy to the last it holds the global interpreter lock, so that
+calls of threads that share a function do not mix.
 """
 
 import ctypes
@@ -46,22 +46,22 @@ _FIELDS = {  # of the data of `self`
 _FASTCALL = 0x0080  # METH_FASTCALL in Python's methodobject.h
 _NPY_DOUBLE = np.dtype(np.float64).num
 _PYARRAY_NEW = 93  # index of PyArray_New in the table of NumPy's functions
-_OBJECT_SIZE = 16  # [bytes] of a PyObject, if threads need the lock to change its reference count
+_OBJECT_SIZE = 16  # [bytes] of a PyObject; larger where Python has no global interpreter lock
 _DTYPE_NUMBERS = 24  # [bytes] offset of `kind` in a PyArray_Descr
-# PyArrayObject: reference count, type, data, nd, dimensions, strides, base, descr;
-# PyArray_Descr: reference count, type, typeobj, then kind, type, byteorder and type_num
 _EXTRACTIONS = "\n".join(
-    f"  %{name} = extractvalue %Context %context, {i}" for i, name in enumerate(_FIELDS)
+    f"  %{name} = extractvalue %FunctionData %fields, {i}" for i, name in enumerate(_FIELDS)
 )
+# ArrayObject: reference count, type, data, nd, padding, dimensions, strides, base, descr;
+# Descr: reference count, type, typeobj, then kind, type, byteorder, flags and type_num
 _TEXT = f"""
 %ArrayObject = type {{ i64, ptr, ptr, i32, i32, ptr, ptr, ptr, ptr }}
 %Descr = type {{ i64, ptr, ptr, i64 }}
-%Context = type {{ {", ".join(_FIELDS.values())} }}
+%FunctionData = type {{ {", ".join(_FIELDS.values())} }}
 declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)
 define ptr @python_function(ptr %self, ptr %arguments, i64 %count) {{
   %self_data = getelementptr %ArrayObject, ptr %self, i64 0, i32 2
   %data = load ptr, ptr %self_data
-  %context = load %Context, ptr %data
+  %fields = load %FunctionData, ptr %data
 {_EXTRACTIONS}
   %fits = icmp ule i64 %count, %max_count
   br i1 %fits, label %create, label %refuse
@@ -140,7 +140,7 @@ refuse:
 """
 
 
-class _Context(ctypes.Structure):
+class _FunctionData(ctypes.Structure):
     """The data of `self`."""
 
     _fields_ = [(name, ctypes.c_int64) for name in _FIELDS]
@@ -163,7 +163,7 @@ def make_python_function(
         return lambda *_: None
     dimensions = np.array(output.shape, dtype=np.int64)
     shared_fields, method, _ = _shared_parts()
-    context = _Context(
+    data = _FunctionData(
         *shared_fields,
         _function_address(routine),
         routine_arguments.ctypes.data,
@@ -174,27 +174,25 @@ def make_python_function(
         dimensions.ctypes.data,
         output.ndim,
     )
-    context.references = routine_arguments, inputs, output, dimensions, owners
-    create = ctypes.PYFUNCTYPE(
-        ctypes.py_object, ctypes.c_void_p, ctypes.py_object, ctypes.c_void_p
-    )(("PyCFunction_NewEx", ctypes.pythonapi))
+    data.references = routine_arguments, inputs, output, dimensions, owners
+    kind = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.c_void_p, ctypes.py_object, ctypes.c_void_p)
+    create = kind(("PyCFunction_NewEx", ctypes.pythonapi))
     made: SampleFunction = create(
-        ctypes.addressof(method), np.frombuffer(context, dtype=np.int64), None
+        addressof(method), np.frombuffer(memoryview(data), np.int64), None
     )
     return made
 
 
 @functools.cache
 def _shared_parts() -> tuple[tuple[int, ...], "ctypes.Array[ctypes.c_char]", Any]:
-    """The first fields of all contexts, the PyMethodDef of all functions, and what they need."""
-    code, name = MachineCode.compile_text(_TEXT), ctypes.create_string_buffer(b"sample function")
+    """What all functions share: the first fields, the PyMethodDef, and what it refers to."""
+    code, name = MachineCode.compile_text(_TEXT), ctypes.create_string_buffer(b"python_function")
     method = ctypes.create_string_buffer(
         pack("PPiP", addressof(name), code.function_address("python_function"), _FASTCALL, 0)
     )
-    api = import_module("numpy._core._multiarray_umath")._ARRAY_API
-    table = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_void_p)(
-        ("PyCapsule_GetPointer", ctypes.pythonapi)
-    )(api, None)
+    kind = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_void_p)
+    get_pointer = kind(("PyCapsule_GetPointer", ctypes.pythonapi))
+    table = get_pointer(import_module("numpy._core._multiarray_umath")._ARRAY_API, None)
     fields = (
         id(np.ndarray),
         ctypes.c_int64.from_address(id(np.dtype(np.float64)) + _DTYPE_NUMBERS).value,
