@@ -120,7 +120,7 @@ class FormulaLoop:
         arrays = *constants, q, self._x, self.out
         self._loop = partial(program.call, "loop", len(q), address, *arrays)
         self._each = [
-            formula._program.python_function(
+            formula._program.sample_function(
                 "closed_each", 1, *constants, *rows, inputs=np.empty((0, 0)), output=rows[-1]
             )
             for rows in zip(q, self._x, self.out, strict=True)

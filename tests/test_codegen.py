@@ -15,7 +15,7 @@ import pytest
 
 from crane.codegen import Program, SymbolicExpression, Tape, max_abs, maximum
 from crane.codegen.llvm import formula_emitter as llvm_formulas
-from crane.codegen.llvm import python_function
+from crane.codegen.llvm import sample_function
 from crane.codegen.llvm.machine_code import emit_module
 from crane.codegen.symbolic import (
     LdltFactorization,
@@ -654,7 +654,7 @@ assert np.abs(second.inverse(home, rest, rest) - wanted).max() > 0.1
     assert done.returncode == 0, done.stderr
 
 
-# --- functions that Python calls directly ------------------------------------------------------
+# --- functions of one sample, which Python calls directly ---------------------------------------
 
 
 def sums():
@@ -673,7 +673,7 @@ def sums():
     program.compile()
     inputs, out = np.zeros((2, 3)), np.zeros((2, 2))
     arguments = 1, inputs[0], inputs[1], out
-    return program.python_function("one", *arguments, inputs=inputs, output=out), program, out
+    return program.sample_function("one", *arguments, inputs=inputs, output=out), program, out
 
 
 A, B = np.array([0.7, -1.9, 3.1]), np.array([0.25, -0.6, 12.0])
@@ -693,7 +693,7 @@ SAME_AS_A = {
 
 
 @pytest.mark.parametrize("name", SAME_AS_A)
-def test_a_python_function_reads_all_vectors_of_doubles(name):
+def test_a_sample_function_reads_all_vectors_of_doubles(name):
     function, _, out = sums()
     for first, second in ((SAME_AS_A[name], B), (A, SAME_AS_A[name])):
         wanted = SUMS if second is B else [[2 * A[0], 2 * A[1]], [0.0, A[1]]]
@@ -733,7 +733,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_a_python_function_leaves_everything_else(name):
+def test_a_sample_function_leaves_everything_else(name):
     function, _, _ = sums()
     bad = REFUSED[name]
     assert function(bad, B) is None and function(A, bad) is None
@@ -741,7 +741,7 @@ def test_a_python_function_leaves_everything_else(name):
     np.testing.assert_array_equal(function(A, B), SUMS)
 
 
-def test_a_python_function_keeps_the_counts_of_references():
+def test_a_sample_function_keeps_the_counts_of_references():
     function, program, _ = sums()
     given = [A, B, *REFUSED.values(), np.ndarray, A.dtype, None, function]
     calls = [(A, B)]
@@ -771,6 +771,6 @@ def test_a_python_function_keeps_the_counts_of_references():
     assert owned() is None
 
 
-def test_python_functions_do_nothing_where_they_do_not_know_the_objects(monkeypatch):
-    monkeypatch.setattr(python_function, "_OBJECT_SIZE", 32)
+def test_sample_functions_do_nothing_where_they_do_not_know_the_objects(monkeypatch):
+    monkeypatch.setattr(sample_function, "_OBJECT_SIZE", 32)
     assert sums()[0](A, B) is None

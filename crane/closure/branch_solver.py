@@ -132,7 +132,7 @@ class BranchSolver:
 
         def create() -> tuple[ContinuationCursor, SampleFunction]:
             cursor = code.new_cursor()
-            return cursor, code.sample_function(cursor)
+            return cursor, code.solution_function(cursor)
 
         return ThreadLocal(create)
 

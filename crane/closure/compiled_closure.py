@@ -267,18 +267,18 @@ class CompiledClosure:
             self.tolerances,
         )
 
-    def sample_function(self, cursor: "ContinuationCursor") -> SampleFunction:
+    def solution_function(self, cursor: "ContinuationCursor") -> SampleFunction:
         """The function of one target (n,) that returns q (nq,), continued from a cursor."""
         target, q = np.zeros((1, self._n)), np.zeros(self._nq)
         arguments = 1, self.geometry.constants, target, cursor.state, q, self.tolerances
-        return self._closure_program.python_function("follow", *arguments, inputs=target, output=q)
+        return self._closure_program.sample_function("follow", *arguments, inputs=target, output=q)
 
     @cached_property
     def gamma_function(self) -> SampleFunction:
         """The function of one closed configuration (nq,) that returns gamma (nv, n)."""
         q, gamma = np.zeros((1, self._nq)), np.zeros((self._nq, self._n))
         arguments = 1, self.geometry.constants, q, gamma
-        return self._closure_program.python_function(
+        return self._closure_program.sample_function(
             "gamma_each", *arguments, inputs=q, output=gamma
         )
 

@@ -1,7 +1,7 @@
 """Symbolic formulas, routines that call them, and their translation to machine code."""
 
-from crane.codegen.llvm.python_function import SampleFunction
 from crane.codegen.llvm.routine_builder import ArrayPointer, Routine, RoutineValue, select
+from crane.codegen.llvm.sample_function import SampleFunction
 from crane.codegen.program import (
     FormulaTooLongError,
     Program,

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from crane.codegen.llvm.machine_code import MachineCode
-from crane.codegen.llvm.python_function import SampleFunction, make_python_function
 from crane.codegen.llvm.routine_builder import Routine
+from crane.codegen.llvm.sample_function import SampleFunction, make_sample_function
 from crane.codegen.program_cache import FunctionSignature, ProgramRecord, cache_entry_name
 from crane.codegen.symbolic import Scalar, required_operations
 from crane.codegen.vector_layout import Formula, Layout
@@ -164,10 +164,10 @@ class Program:
         )
         return result
 
-    def python_function(
+    def sample_function(
         self, name: str, *arguments: "int | np.ndarray", inputs: Array, output: Array
     ) -> SampleFunction:
-        """A Python function that evaluates one sample by a routine, for many fast calls.
+        """A function of one sample in machine code that Python calls directly.
 
         It takes up to k arrays (n,) and returns a new array of the shape of `output`; None where
         an argument is not a float64 array (n,) of finite numbers, or the routine does not return
@@ -181,7 +181,7 @@ class Program:
         """
         addresses = np.array([*map(_argument_address, arguments)], dtype=np.int64)
         entry_point = self._entry_point(name, arguments)
-        return make_python_function(entry_point, addresses, inputs, output, self, arguments)
+        return make_sample_function(entry_point, addresses, inputs, output, self, arguments)
 
     def _entry_point(self, name: str, arguments: Sequence["int | np.ndarray"]) -> Any:
         expected, _ = self._signatures[name]

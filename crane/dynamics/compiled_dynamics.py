@@ -89,7 +89,7 @@ class ThreadWorkspace(NamedTuple):
         cursor: Continuation cursor.
         q: (nq,) configuration of the last sample.
         evaluate_sample: The function of q_A, v_A and x (n,), as far as the quantity depends on
-            them; see `Program.python_function`.
+            them; see `Program.sample_function`.
     """
 
     cursor: ContinuationCursor
@@ -140,7 +140,7 @@ class CompiledQuantity:
         def create_workspace() -> ThreadWorkspace:
             cursor, q = fast.new_cursor(), np.zeros(nq)
             inputs, out = np.zeros((3, n)), np.zeros(shape)
-            evaluate_sample = program.python_function(
+            evaluate_sample = program.sample_function(
                 "each", 1, fast.follow_address, *constants, inputs[0], inputs[1:], cursor.state, q,
                 out, fast.tolerances, inputs=inputs, output=out,
             )  # fmt: skip

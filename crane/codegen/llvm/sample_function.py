@@ -1,6 +1,6 @@
 """Functions of one sample in machine code that Python calls directly, without ctypes.
 
-    PyObject *python_function(PyObject *self, PyObject *const *arguments, Py_ssize_t count)
+    PyObject *sample_function(PyObject *self, PyObject *const *arguments, Py_ssize_t count)
 
 is compiled once for all routines (calling convention METH_FASTCALL). The addresses that it needs,
 of Python, NumPy and the routine, are in the array `self`, because machine code is cached between
@@ -58,7 +58,7 @@ _TEXT = f"""
 %Descr = type {{ i64, ptr, ptr, i64 }}
 %FunctionData = type {{ {", ".join(_FIELDS.values())} }}
 declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)
-define ptr @python_function(ptr %self, ptr %arguments, i64 %count) {{
+define ptr @sample_function(ptr %self, ptr %arguments, i64 %count) {{
   %self_data = getelementptr %ArrayObject, ptr %self, i64 0, i32 2
   %data = load ptr, ptr %self_data
   %fields = load %FunctionData, ptr %data
@@ -147,10 +147,10 @@ class _FunctionData(ctypes.Structure):
     references: tuple[Any, ...]  # what the addresses belong to
 
 
-def make_python_function(
+def make_sample_function(
     routine: Any, routine_arguments: NDArray[np.int64], inputs: Array, output: Array, *owners: Any
 ) -> SampleFunction:
-    """A Python function of one sample around a routine; see `Program.python_function`.
+    """A function of one sample around a routine; see `Program.sample_function`.
 
     Args:
         routine: Entry point of the routine, see `MachineCode.entry_point`.
@@ -186,9 +186,9 @@ def make_python_function(
 @functools.cache
 def _shared_parts() -> tuple[tuple[int, ...], "ctypes.Array[ctypes.c_char]", Any]:
     """What all functions share: the first fields, the PyMethodDef, and what it refers to."""
-    code, name = MachineCode.compile_text(_TEXT), ctypes.create_string_buffer(b"python_function")
+    code, name = MachineCode.compile_text(_TEXT), ctypes.create_string_buffer(b"sample_function")
     method = ctypes.create_string_buffer(
-        pack("PPiP", addressof(name), code.function_address("python_function"), _FASTCALL, 0)
+        pack("PPiP", addressof(name), code.function_address("sample_function"), _FASTCALL, 0)
     )
     kind = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_void_p)
     get_pointer = kind(("PyCapsule_GetPointer", ctypes.pythonapi))
