@@ -9,13 +9,13 @@ from functools import cached_property
 import numpy as np
 
 from crane.closure.active_joint_selection import null_space_basis
-from crane.closure.compiled_closure import CompiledClosure, ContinuationCursor
+from crane.closure.compiled_closure import CompiledClosure, ContinuationCursor, ContinuedFunction
 from crane.closure.constraint_structure import ConstraintStructure
 from crane.closure.continuation_diagnosis import ClosedConfiguration
 from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
 from crane.closure.newton_continuation import NewtonContinuation
-from crane.codegen import FormulaTooLongError, SampleFunction, run_with_fallback
+from crane.codegen import FormulaTooLongError, run_with_fallback
 from crane.common.errors import ClosureError, SingularConfigurationError, WrongBranchError
 from crane.common.samples import Array
 from crane.common.threads import ThreadLocal
@@ -95,7 +95,7 @@ class BranchSolver:
         self.home.flags.writeable = False
         self._with_machine_code = with_machine_code
         self.__dict__.pop("_machine_code", None)  # of the closure that this one is a copy of
-        for name in ("_cursors", "_beyond", "_codes_beyond"):
+        for name in ("_solvers", "_beyond", "_codes_beyond"):
             self.__dict__.pop(name, None)
 
     @cached_property
@@ -126,15 +126,8 @@ class BranchSolver:
         return self._machine_code
 
     @cached_property
-    def _cursors(self) -> ThreadLocal[tuple[ContinuationCursor, SampleFunction]]:
-        """Cursors, and functions of one target that continue from them."""
-        code = self.compiled_closure
-
-        def create() -> tuple[ContinuationCursor, SampleFunction]:
-            cursor = code.new_cursor()
-            return cursor, code.solution_function(cursor)
-
-        return ThreadLocal(create)
+    def _solvers(self) -> ThreadLocal[ContinuedFunction]:
+        return ThreadLocal(self.compiled_closure.new_solver)
 
     @cached_property
     def _beyond(self) -> ThreadLocal["_ChangePointBranch"]:
@@ -156,7 +149,7 @@ class BranchSolver:
         """
         nearest = self.continuation.nearest_closed_configuration
         if self.is_compiled:
-            cursor, _ = self._cursors.value
+            cursor = self._solvers.value.cursor
             if guess is not None and not self.compiled_closure.start_cursor_at(cursor, guess):
                 cursor.start_from(known := nearest(guess))
                 self._go_beyond(known)
@@ -248,7 +241,7 @@ class BranchSolver:
     def is_on_branch(self, q: Array) -> bool:
         """Whether a closed configuration (nq,) lies on the branch of home."""
         if self.is_compiled:
-            return self.compiled_closure.start_cursor_at(self._cursors.value[0], q)
+            return self.compiled_closure.start_cursor_at(self._solvers.value.cursor, q)
         try:
             found = self.continuation.nearest_closed_configuration(q)
         except WrongBranchError:

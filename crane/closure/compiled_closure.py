@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -21,16 +22,8 @@ from crane.closure.kinematics_formulas import (
 from crane.closure.loop_equations import Cluster, LoopEquations, find_clusters
 from crane.closure.loop_formulas import LoopFormulas
 from crane.closure.predictor_formulas import PredictorFormulas
-from crane.codegen import (
-    Layout,
-    LayoutView,
-    Program,
-    SampleFunction,
-    Scalar,
-    Tape,
-    max_abs,
-    maximum,
-)
+from crane.codegen import Layout, LayoutView, Program, Scalar, Tape, max_abs, maximum
+from crane.codegen.llvm.sample_function import SampleFunction
 from crane.codegen.symbolic import minimum
 from crane.common.samples import Array
 
@@ -56,6 +49,18 @@ class ContinuationCursor:
         """Start the next step from a closed configuration."""
         self.state[: len(configuration.q)] = configuration.q
         self.state[len(configuration.q) :] = configuration.passive_gamma[self.gamma_entries]
+
+
+class ContinuedFunction(NamedTuple):
+    """A function of one sample that closes the loops from a cursor; every thread has its own.
+
+    Attributes:
+        cursor: The cursor.
+        evaluate_sample: The function, see `Program.sample_function`.
+    """
+
+    cursor: ContinuationCursor
+    evaluate_sample: SampleFunction
 
 
 class _SharedCode:
@@ -225,6 +230,15 @@ class CompiledClosure:
         cursor.start_from(self._home)
         return cursor
 
+    def new_solver(self) -> "ContinuedFunction":
+        """The function of one target (n,) that returns q (nq,), with a new cursor."""
+        cursor, target, q = self.new_cursor(), np.zeros((1, self._n)), np.zeros(self._nq)
+        arguments = 1, self.geometry.constants, target, cursor.state, q, self.tolerances
+        return ContinuedFunction(
+            cursor,
+            self._closure_program.sample_function("follow", *arguments, inputs=target, output=q),
+        )
+
     def start_cursor_at(self, cursor: "ContinuationCursor", q: Array) -> bool:
         """Move a cursor to a configuration (nq,) that is closed to 1e-6 or better.
 
@@ -266,12 +280,6 @@ class CompiledClosure:
             out,
             self.tolerances,
         )
-
-    def solution_function(self, cursor: "ContinuationCursor") -> SampleFunction:
-        """The function of one target (n,) that returns q (nq,), continued from a cursor."""
-        target, q = np.zeros((1, self._n)), np.zeros(self._nq)
-        arguments = 1, self.geometry.constants, target, cursor.state, q, self.tolerances
-        return self._closure_program.sample_function("follow", *arguments, inputs=target, output=q)
 
     @cached_property
     def gamma_function(self) -> SampleFunction:

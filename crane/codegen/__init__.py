@@ -1,7 +1,6 @@
 """Symbolic formulas, routines that call them, and their translation to machine code."""
 
 from crane.codegen.llvm.routine_builder import ArrayPointer, Routine, RoutineValue, select
-from crane.codegen.llvm.sample_function import SampleFunction
 from crane.codegen.program import (
     FormulaTooLongError,
     Program,
@@ -15,7 +14,6 @@ from crane.codegen.vector_layout import Layout, LayoutView
 __all__ = [
     "ArrayPointer",
     "PythonCallback",
-    "SampleFunction",
     "SymbolicExpression",
     "Layout",
     "Scalar",

@@ -1,14 +1,13 @@
 """Equations of motion and their derivatives as machine code of one machine."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
-from crane.closure.compiled_closure import CompiledClosure, ContinuationCursor
+from crane.closure.compiled_closure import CompiledClosure, ContinuedFunction
 from crane.closure.gamma_derivatives import GammaDerivatives
 from crane.closure.kinematics_formulas import FormulaConstants, folding_pattern
-from crane.codegen import Program, SampleFunction, Scalar, SymbolicExpression, Tape, max_abs
+from crane.codegen import Program, Scalar, SymbolicExpression, Tape, max_abs
 from crane.codegen.differentiation import directional_derivative
 from crane.common.samples import Array
 from crane.common.threads import ThreadLocal
@@ -82,21 +81,6 @@ DERIVATIVES_OF = "derivatives of "
 _MATRICES = "mass matrix", "regressor"  # with a row per active joint
 
 
-class ThreadWorkspace(NamedTuple):
-    """What each thread has of a compiled quantity.
-
-    Attributes:
-        cursor: Continuation cursor.
-        q: (nq,) configuration of the last sample.
-        evaluate_sample: The function of q_A, v_A and x (n,), as far as the quantity depends on
-            them; see `Program.sample_function`.
-    """
-
-    cursor: ContinuationCursor
-    q: Array
-    evaluate_sample: SampleFunction
-
-
 class CompiledQuantity:
     """One quantity as machine code.
 
@@ -110,7 +94,8 @@ class CompiledQuantity:
     Attributes:
         size: Length of the result of one sample.
         solves_mass_matrix: Whether the result is not finite where the mass matrix is singular.
-        workspace: Workspace of this thread, as `value`.
+        sample_function: Its `value` is this thread's function of q_A, v_A and x (n,), as far as
+            the quantity depends on them.
 
     Raises:
         FormulaTooLongError: It would take too long to compile.
@@ -137,16 +122,18 @@ class CompiledQuantity:
         self.solves_mass_matrix = _solves_mass_matrix(quantity)
         shape = (n, self.size // n) if quantity in _MATRICES else (self.size,)
 
-        def create_workspace() -> ThreadWorkspace:
+        def create_function() -> ContinuedFunction:
             cursor, q = fast.new_cursor(), np.zeros(nq)
             inputs, out = np.zeros((3, n)), np.zeros(shape)
-            evaluate_sample = program.sample_function(
-                "each", 1, fast.follow_address, *constants, inputs[0], inputs[1:], cursor.state, q,
-                out, fast.tolerances, inputs=inputs, output=out,
-            )  # fmt: skip
-            return ThreadWorkspace(cursor, q, evaluate_sample)
+            arrays = *constants, inputs[0], inputs[1:], cursor.state, q, out, fast.tolerances
+            return ContinuedFunction(
+                cursor,
+                program.sample_function(
+                    "each", 1, fast.follow_address, *arrays, inputs=inputs, output=out
+                ),
+            )
 
-        self.workspace = ThreadLocal(create_workspace)
+        self.sample_function = ThreadLocal(create_function)
 
     def evaluate_closed(self, q: Array, inputs: Array) -> Array:
         """The quantity at closed configurations.
@@ -174,8 +161,9 @@ class CompiledQuantity:
         Returns:
             Number of evaluated samples.
         """
-        fast, (cursor, q, _) = self._compiled_closure, self.workspace.value
-        arrays = *self._constants, targets, inputs, cursor.state, q, out, fast.tolerances
+        fast, state = self._compiled_closure, self.sample_function.value.cursor.state
+        q = np.empty_like(state)  # longer than needed
+        arrays = *self._constants, targets, inputs, state, q, out, fast.tolerances
         return self._program.call("each", len(targets), fast.follow_address, *arrays)
 
 

@@ -358,10 +358,11 @@ class QuantityEvaluator(OneLineRepr):
     def _evaluate(self, quantity: str, *arguments: ArrayLike) -> Array:
         """A quantity of samples or stacks; single samples apply to every row of a stack."""
         formula = self._compiled_quantities.get(quantity)
-        if formula is not None:
-            out = formula.workspace.value.evaluate_sample(*arguments)
-            if out is not None:
-                return out
+        if (
+            formula is not None
+            and (out := formula.sample_function.value.evaluate_sample(*arguments)) is not None
+        ):
+            return out
         names, n = self.machine.active, self._mobility
         name = quantity.removesuffix(WITH_FRICTION).replace(" ", "_")
         q_a, *others = (
@@ -390,7 +391,9 @@ class QuantityEvaluator(OneLineRepr):
 
         def reach(i: int) -> None:
             sample = f" (sample {i})" if is_stack else ""
-            q = closure.continue_from_home(formula.workspace.value.cursor, targets[i], sample)
+            q = closure.continue_from_home(
+                formula.sample_function.value.cursor, targets[i], sample
+            )
             out[i] = self._evaluate_beside_change_point(formula, q, rows[i], sample)
             error = None if np.isfinite(out[i]).all() else self.singular_mass_error(q, sample)
             if error is not None and formula.solves_mass_matrix:

@@ -13,12 +13,11 @@ import ctypes
 import functools
 import sys
 from collections.abc import Callable
-from ctypes import addressof
-from importlib import import_module
 from struct import pack
 from typing import Any
 
 import numpy as np
+from numpy._core._multiarray_umath import _ARRAY_API  # type: ignore[import-not-found]
 from numpy.typing import NDArray
 
 from crane.codegen.llvm.machine_code import MachineCode
@@ -43,9 +42,8 @@ _FIELDS = {  # of the data of `self`
     "dimensions": "ptr",
     "dimension_count": "i64",
 }
-_FASTCALL = 0x0080  # METH_FASTCALL in Python's methodobject.h
-_NPY_DOUBLE = np.dtype(np.float64).num
-_PYARRAY_NEW = 93  # index of PyArray_New in the table of NumPy's functions
+# METH_FASTCALL in Python's methodobject.h, PyArray_New in the table of NumPy's functions
+_FASTCALL, _PYARRAY_NEW = 0x0080, 93
 _OBJECT_SIZE = 16  # [bytes] of a PyObject; larger where Python has no global interpreter lock
 _DTYPE_NUMBERS = 24  # [bytes] offset of `kind` in a PyArray_Descr
 _EXTRACTIONS = "\n".join(
@@ -67,7 +65,7 @@ define ptr @sample_function(ptr %self, ptr %arguments, i64 %count) {{
   br i1 %fits, label %create, label %refuse
 create:
   %nd = trunc i64 %dimension_count to i32
-  %out = call ptr %new_array(ptr %array_type, i32 %nd, ptr %dimensions, i32 {_NPY_DOUBLE},
+  %out = call ptr %new_array(ptr %array_type, i32 %nd, ptr %dimensions, i32 {np.dtype(float).num},
     ptr null, ptr null, i32 0, i32 0, ptr null)
   %failed = icmp eq ptr %out, null
   br i1 %failed, label %end, label %each_argument
@@ -140,13 +138,6 @@ refuse:
 """
 
 
-class _FunctionData(ctypes.Structure):
-    """The data of `self`."""
-
-    _fields_ = [(name, ctypes.c_int64) for name in _FIELDS]
-    references: tuple[Any, ...]  # what the addresses belong to
-
-
 def make_sample_function(
     routine: Any, routine_arguments: NDArray[np.int64], inputs: Array, output: Array, *owners: Any
 ) -> SampleFunction:
@@ -162,10 +153,10 @@ def make_sample_function(
     if sys.implementation.name != "cpython" or object.__basicsize__ != _OBJECT_SIZE:
         return lambda *_: None
     dimensions = np.array(output.shape, dtype=np.int64)
-    shared_fields, method, _ = _shared_parts()
-    data = _FunctionData(
+    shared_fields, method, _ = shared = _shared_parts()
+    fields = [
         *shared_fields,
-        _function_address(routine),
+        ctypes.cast(routine, ctypes.c_void_p).value,
         routine_arguments.ctypes.data,
         inputs.ctypes.data,
         *inputs.shape,
@@ -173,36 +164,30 @@ def make_sample_function(
         output.nbytes,
         dimensions.ctypes.data,
         output.ndim,
-    )
-    data.references = routine_arguments, inputs, output, dimensions, owners
-    kind = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.c_void_p, ctypes.py_object, ctypes.c_void_p)
-    create = kind(("PyCFunction_NewEx", ctypes.pythonapi))
-    made: SampleFunction = create(
-        addressof(method), np.frombuffer(memoryview(data), np.int64), None
-    )
-    return made
+    ]
+    kind = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.c_void_p, *[ctypes.py_object] * 2)
+    create: Callable[..., SampleFunction] = kind(("PyCFunction_NewEx", ctypes.pythonapi))
+    # the last argument becomes the attribute `__module__`, which may be anything
+    references = shared, routine_arguments, inputs, output, dimensions, owners
+    return create(ctypes.addressof(method), np.array(fields, dtype=np.int64), references)
 
 
 @functools.cache
-def _shared_parts() -> tuple[tuple[int, ...], "ctypes.Array[ctypes.c_char]", Any]:
+def _shared_parts() -> tuple[list[int | None], "ctypes.Array[ctypes.c_char]", Any]:
     """What all functions share: the first fields, the PyMethodDef, and what it refers to."""
     code, name = MachineCode.compile_text(_TEXT), ctypes.create_string_buffer(b"sample_function")
+    address = code.function_address("sample_function")
     method = ctypes.create_string_buffer(
-        pack("PPiP", addressof(name), code.function_address("sample_function"), _FASTCALL, 0)
+        pack("PPiP", ctypes.addressof(name), address, _FASTCALL, 0)
     )
     kind = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_void_p)
-    get_pointer = kind(("PyCapsule_GetPointer", ctypes.pythonapi))
-    table = get_pointer(import_module("numpy._core._multiarray_umath")._ARRAY_API, None)
-    fields = (
+    table = kind(("PyCapsule_GetPointer", ctypes.pythonapi))(_ARRAY_API, None)
+    fields = [
         id(np.ndarray),
         ctypes.c_int64.from_address(id(np.dtype(np.float64)) + _DTYPE_NUMBERS).value,
         id(None),
         ctypes.c_int64.from_address(table + 8 * _PYARRAY_NEW).value,
-        _function_address(ctypes.pythonapi.Py_IncRef),
-        _function_address(ctypes.pythonapi.Py_DecRef),
-    )
+        ctypes.cast(ctypes.pythonapi.Py_IncRef, ctypes.c_void_p).value,
+        ctypes.cast(ctypes.pythonapi.Py_DecRef, ctypes.c_void_p).value,
+    ]
     return fields, method, (code, name)
-
-
-def _function_address(function: Any) -> int:
-    return int(ctypes.cast(function, ctypes.c_void_p).value or 0)
