@@ -78,7 +78,7 @@ _ANALYTIC_DERIVATIVES: dict[str, _AnalyticDerivatives] = {
 }
 # before a quantity: its derivatives by q_A, v_A and the second argument
 DERIVATIVES_OF = "derivatives of "
-_MATRICES = "mass matrix", "regressor"  # with a row per active joint
+MATRIX_QUANTITIES = "mass matrix", "regressor"  # with a row per active joint
 
 
 class CompiledQuantity:
@@ -120,7 +120,7 @@ class CompiledQuantity:
         )
         self.size = program.formula_outputs("formula").size
         self.solves_mass_matrix = _solves_mass_matrix(quantity)
-        shape = (n, self.size // n) if quantity in _MATRICES else (self.size,)
+        shape = (n, self.size // n) if quantity in MATRIX_QUANTITIES else (self.size,)
 
         def create_function() -> ContinuedFunction:
             cursor, q = fast.new_cursor(), np.zeros(nq)

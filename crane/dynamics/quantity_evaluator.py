@@ -21,6 +21,7 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, apply_per_sample, as_samples, stack_length
 from crane.description.machine_parameters import unknown_parameter_text
 from crane.dynamics.compiled_dynamics import (
+    MATRIX_QUANTITIES,
     WITH_FRICTION,
     CompiledParameterDerivatives,
     CompiledQuantity,
@@ -379,8 +380,9 @@ class QuantityEvaluator(OneLineRepr):
         out = self._evaluate_stack(
             quantity, np.ascontiguousarray(np.broadcast_to(q_a, (count, n))), rows, q_a.ndim == 2
         )
-        shape = self.result_shape(name)
-        return out.reshape(shape if length is None else (count, *shape))
+        if quantity in MATRIX_QUANTITIES:
+            out = out.reshape(count, n, -1)
+        return out[0] if length is None else out
 
     def _evaluate_stack(self, quantity: str, targets: Array, rows: Array, is_stack: bool) -> Array:
         closure, n = self.machine.closure, self._mobility
