@@ -32,8 +32,8 @@ from crane.simulation.integration.run_notes import RunNotes
 _NEARLY_SINGULAR_MARGIN = 1e5  # on the inertia that counts as none, of what explains a halt
 _LIMIT_RELAXATION = np.array([2.0, 0.1])  # factors of the limits where no chart is better
 _MAX_RECENT_STATES = 500
-_REPEATED_INTERVALS = 2  # nodes may lie in the one before the crossing
-_MAX_SHARE = 10  # of steps that locate a crossing in an interval of outputs
+_REPEATED_STEPS = 4 * (NODES_BEFORE + STEPS_BEFORE)  # at least, before a crossing
+_MAX_SHARE = 2  # of steps that locate a crossing in an interval of outputs
 _CONFIGURATION_TOLERANCE = 1e-6  # between predicted and closed configuration, coordinate units
 # least ratios of condition numbers: at a dead centre, and of a chart that is tried after a halt
 _DEAD_CENTRE_IMPROVEMENT, _HALT_IMPROVEMENT = 10.0, 1.5
@@ -269,8 +269,9 @@ class ChartSwitchingIntegrator:
             Index of the next instant; None where instants are close already, or those before are
             unknown.
         """
-        before = min(_REPEATED_INTERVALS, len(self._recent_states))
         share = int(np.ceil(step * self._speed(state) / MAX_MOTION_PER_STEP))
+        needed = int(np.ceil(_REPEATED_STEPS / max(share, 1)))
+        before = min(max(needed, 2), len(self._recent_states))
         if share <= _MAX_SHARE or not before:
             return None
         state[:], self._integrator.offset = self._recent_states[-before], 0.0
