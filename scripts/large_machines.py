@@ -119,6 +119,10 @@ def main() -> None:
         put(options.write, MARKS, parts)
 
 
+if __name__ == "__main__":
+    main()
+
+
 COLOURS = {"chain": "#1f5fa8", "tree": "#3c8c4a", "ring": "#c8501a", "spatial ring": "#8a4fa0"}
 CALLS = {"one": ("one call of crane", "o-"), "stack": ("crane, of a stack", ":"),
          "theirs": ("pin.constraintDynamics", "^--")}  # fmt: skip
@@ -174,7 +178,3 @@ def _lines(axes: Axes, results: list[dict], kinds: dict[str, tuple[str, str]], b
         handles.append(Line2D([], [], color=INK_COLOUR, marker="o", mfc="white", ls="", ms=4,
                               label="not compiled"))  # fmt: skip
     axes.legend(handles=handles, loc="upper left", fontsize=7)
-
-
-if __name__ == "__main__":
-    main()

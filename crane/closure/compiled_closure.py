@@ -233,10 +233,10 @@ class CompiledClosure:
     def new_solver(self) -> "ContinuedFunction":
         """The function of one target (n,) that returns q (nq,), with a new cursor."""
         cursor, target, q = self.new_cursor(), np.zeros((1, self._n)), np.zeros(self._nq)
-        arguments = 1, self.geometry.constants, target, cursor.state, q, self.tolerances
+        arrays = self.geometry.constants, target, cursor.state, q, self.tolerances
         return ContinuedFunction(
             cursor,
-            self._closure_program.sample_function("follow", *arguments, inputs=target, output=q),
+            self._closure_program.sample_function("follow", 1, *arrays, inputs=target, output=q),
         )
 
     def start_cursor_at(self, cursor: "ContinuationCursor", q: Array) -> bool:
@@ -285,9 +285,8 @@ class CompiledClosure:
     def gamma_function(self) -> SampleFunction:
         """The function of one closed configuration (nq,) that returns gamma (nv, n)."""
         q, gamma = np.zeros((1, self._nq)), np.zeros((self._nq, self._n))
-        arguments = 1, self.geometry.constants, q, gamma
         return self._closure_program.sample_function(
-            "gamma_each", *arguments, inputs=q, output=gamma
+            "gamma_each", 1, self.geometry.constants, q, gamma, inputs=q, output=gamma
         )
 
     def close_in_place(self, q: Array) -> int:

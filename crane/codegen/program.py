@@ -180,8 +180,9 @@ class Program:
             output: Array among the arguments that the routine writes.
         """
         addresses = np.array([*map(_argument_address, arguments)], dtype=np.int64)
-        entry_point = self._entry_point(name, arguments)
-        return make_sample_function(entry_point, addresses, inputs, output, self, arguments)
+        return make_sample_function(
+            self._entry_point(name, arguments), addresses, inputs, output, self, arguments
+        )
 
     def _entry_point(self, name: str, arguments: Sequence["int | np.ndarray"]) -> Any:
         expected, _ = self._signatures[name]

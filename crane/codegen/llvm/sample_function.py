@@ -167,9 +167,12 @@ def make_sample_function(
     ]
     kind = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.c_void_p, *[ctypes.py_object] * 2)
     create: Callable[..., SampleFunction] = kind(("PyCFunction_NewEx", ctypes.pythonapi))
-    # the last argument becomes the attribute `__module__`, which may be anything
-    references = shared, routine_arguments, inputs, output, dimensions, owners
-    return create(ctypes.addressof(method), np.array(fields, dtype=np.int64), references)
+    return create(
+        ctypes.addressof(method),
+        np.array(fields, dtype=np.int64),
+        # these become the attribute `__module__`, which may be anything, and live as long
+        (shared, routine_arguments, inputs, output, dimensions, owners),
+    )
 
 
 @functools.cache
