@@ -15,7 +15,7 @@ from warned import without_a_word
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
-from crane.formats.checks import check
+from crane.formats import check
 
 MODELS = Path(__file__).parents[1] / "models"
 ROBOTS = Path(__file__).parents[2] / "shared/data/third_party/parallel_robots"

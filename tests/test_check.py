@@ -28,8 +28,8 @@ from crane.common.errors import SimulationError
 from crane.control.levers import LeverPhases
 from crane.description import bundled_machines, example_robots
 from crane.description.specification import Phase
-from crane.formats import write_machine
-from crane.formats.checks import CheckReport, check
+from crane.formats import check, write_machine
+from crane.formats.checks.check_report import CheckReport
 
 CHAIN_B1 = "urdf/mini_forwarder/chain_b1.urdf"
 CHAIN_B2 = "urdf/mini_forwarder/chain_b2.urdf"

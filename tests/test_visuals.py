@@ -16,8 +16,7 @@ import crane
 import crane.view.page.scene
 from crane.common.errors import CraneWarning
 from crane.dynamics.frame_jacobians import FrameJacobians
-from crane.formats import write_urdf_plus
-from crane.formats.checks import check
+from crane.formats import check, write_urdf_plus
 from crane.formats.visuals import mesh_process, urdf_shapes
 from crane.formats.visuals.urdf_shapes import (
     DEFAULT_COLOUR,
