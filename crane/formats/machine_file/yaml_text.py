@@ -198,12 +198,10 @@ def _construct_mapping(loader: Any, node: yaml.MappingNode) -> LocatedMapping:
     return data
 
 
-def _construct_integer(loader: Any, node: yaml.ScalarNode) -> int:
-    return int(loader.construct_scalar(node))
-
-
 _StrictConstructor.add_constructor("tag:yaml.org,2002:map", _construct_mapping)
-_StrictConstructor.add_constructor("tag:yaml.org,2002:int", _construct_integer)
+_StrictConstructor.add_constructor(
+    "tag:yaml.org,2002:int", lambda loader, node: int(loader.construct_scalar(node))
+)
 _FLOAT_PATTERN = rf"{NUMBER_PATTERN}|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"
 for _loader in _LOADERS:
     _loader.yaml_implicit_resolvers = {
