@@ -199,9 +199,7 @@ def _construct_mapping(loader: Any, node: yaml.MappingNode) -> LocatedMapping:
 
 
 _StrictConstructor.add_constructor("tag:yaml.org,2002:map", _construct_mapping)
-_StrictConstructor.add_constructor(
-    "tag:yaml.org,2002:int", lambda loader, node: int(loader.construct_scalar(node))
-)
+_StrictConstructor.add_constructor("tag:yaml.org,2002:int", lambda _, node: int(node.value))
 _FLOAT_PATTERN = rf"{NUMBER_PATTERN}|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"
 for _loader in _LOADERS:
     _loader.yaml_implicit_resolvers = {
