@@ -156,9 +156,6 @@ class _SdfTranslation:
         joints = SdfJoints(self._top, self._frames)
         edges = [_fix_locked_joint(edge, self._notes) for edge in joints.edges]
         edges += ground_edges(edges, self._top, self._links, self._link_poses, self._notes)
-        for edge in edges:
-            if edge.composite_joint:
-                self._link_poses[edge.child] = edge.placement
         tree = spanning_tree(edges, WORLD_NODE)
         self._add_links(edges)
         driven_joints = _driven_joints(edges, {name for name, _, _ in joints.mimics})
@@ -198,6 +195,7 @@ class _SdfTranslation:
             self._set_source_location(element, link)
         for edge in edges:
             if edge.composite_joint:
+                self._link_poses[edge.child] = edge.placement
                 link = etree.SubElement(
                     self._robot, "link", name=edge.child, between=edge.composite_joint
                 )
