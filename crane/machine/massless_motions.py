@@ -16,7 +16,6 @@ along n.
 """
 
 from collections.abc import Iterator
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -215,25 +214,3 @@ def hold_coordinates(mass: Array, held: tuple[int, ...]) -> Array:
         out[..., i, :] = out[..., :, i] = 0.0
         out[..., i, i] = 1.0
     return out
-
-
-class IdleMotionProperties:
-    """What the masses of a machine say of its coordinates; base class of `Machine`.
-
-    Attributes:
-        model: Its tree.
-        closure: Its loops.
-    """
-
-    model: pin.Model
-    closure: Closure
-
-    @cached_property
-    def held(self) -> tuple[int, ...]:
-        """Indices of active coordinates that are held for idle motions: they keep their speed."""
-        return select_held_coordinates(find_idle_motions(self.model, self.closure))
-
-    @cached_property
-    def least_inertias(self) -> Array:
-        """(nv,) inertia of each joint that counts as none [kg], [kg m2]."""
-        return least_inertias(self.model, self.closure)
