@@ -40,7 +40,7 @@ READ = {
     "geometry": {
         "parents", "is_revolute", "floating_bases", "body_rotations", "constants", "frame_bodies",
         "reference_body", "ball_joints", "series_of_body", "rotation_bodies", "massless_bodies",
-        "supporting_bodies",
+        "supporting_bodies", "partly_active_joints",
     },
 }  # fmt: skip
 

@@ -5,14 +5,18 @@ at zero, see `crane.description.rotation_vectors`.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
 
-from crane.closure.loop_equations import LoopEquations, rotation_with_z_axis
+from crane.closure.loop_equations import (
+    LoopEquations,
+    rotation_with_z_axis,
+    supporting_bodies,
+)
 from crane.codegen.symbolic import (
     Scalar,
     Tape,
@@ -25,6 +29,7 @@ from crane.codegen.symbolic import (
     max_abs,
     maximum,
     scale_vector,
+    solve_linear_system,
     subtract_vectors,
     transpose,
     where_positive,
@@ -139,6 +144,35 @@ def coordinate_rates(
     return out
 
 
+def adjust_motion(
+    geometry: "TreeGeometry",
+    q: Sequence[Scalar],
+    motion: Sequence[Scalar],
+    columns: Sequence[Sequence[Scalar]],
+    steps: Mapping[int, Scalar],
+) -> list[Scalar]:
+    """Add columns of gamma to a motion of the joints so that coordinates change as required.
+
+    Active coordinates that are parts of rotation vectors change by more than the motions of their
+    own joints.
+
+    Args:
+        geometry: Geometry of the machine.
+        q: (nb,).
+        motion: (nb,).
+        columns: (k, nb) columns of gamma.
+        steps: Changes of k coordinates, by joint.
+    """
+    steps_of_motion = coordinate_rates(geometry, q, motion)
+    rates = [coordinate_rates(geometry, q, column) for column in columns]
+    factors, _ = solve_linear_system(
+        [[rate[joint - 1] for rate in rates] for joint in steps],
+        [[step - steps_of_motion[joint - 1]] for joint, step in steps.items()],
+    )
+    additions = (scale_vector(x, column) for (x,), column in zip(factors, columns, strict=True))
+    return add_vectors(motion, *additions)
+
+
 def wrap_rotation_vector(vector: Sequence[Scalar]) -> list[Scalar]:
     """The same rotation with a vector of length pi or less, from one shorter than 2 pi."""
     length = _regularized_norm(vector)
@@ -213,11 +247,13 @@ class TreeGeometry:
 
     def supporting_bodies(self, body: int) -> list[int]:
         """A body and the bodies that carry it, except the world."""
-        found = []
-        while body:
-            found.append(body)
-            body = self.parents[body]
-        return found
+        return supporting_bodies(self.parents, body)
+
+    def partly_active_joints(self, active_joints: Collection[int]) -> list[int]:
+        """Active joints of rotation vectors of which only some are active."""
+        vectors = [{body, body + 1, body + 2} for body in self.rotation_bodies]
+        parts = [sorted(vector.intersection(active_joints)) for vector in vectors]
+        return [joint for part in parts if len(part) < 3 for joint in part]
 
 
 def tree_geometry(equations: LoopEquations) -> TreeGeometry:

@@ -48,11 +48,13 @@ class Program:
     Attributes:
         functions: By name, in the order in which they were added; empty if loaded from the cache.
         max_formula_length: Number of operations of the longest formula.
+        dependent_programs: Programs that call its functions, by what they depend on.
     """
 
     def __init__(self) -> None:
         self.functions: dict[str, Formula | Routine] = {}
         self.max_formula_length = 0
+        self.dependent_programs: dict[tuple, Program] = {}
         self._signatures: dict[str, FunctionSignature] = {}
         self._machine_code: Any = None
 

@@ -215,6 +215,13 @@ def body_of(parent_joints: Mapping[str, Joint], link: str) -> str:
     return link
 
 
+def joints_to_root(parent_joints: Mapping[str, Joint], link: str) -> Iterator[Joint]:
+    """Yield the joints that carry a link, its own one first, see `Tree.parent_joints`."""
+    while link in parent_joints:
+        yield parent_joints[link]
+        link = parent_joints[link].parent
+
+
 def with_rotor_inertias(tree: Tree, rotor_inertias: Mapping[str, float]) -> Tree:
     """Return the tree with rotor inertias [kg m2], [kg] by joint."""
     return tree.with_parts(

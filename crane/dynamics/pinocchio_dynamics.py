@@ -10,7 +10,7 @@ import pinocchio as pin
 from crane.common.errors import SingularMassMatrixError
 from crane.common.samples import Array, solve_linear
 from crane.common.threads import ThreadLocal
-from crane.dynamics.frame_jacobians import frame_placement, point_jacobian
+from crane.dynamics.frame_jacobians import frame_jacobian
 from crane.dynamics.joint_forces import REST_VELOCITY, JointForces
 from crane.machine.machine import Machine
 from crane.machine.massless_motions import (
@@ -93,7 +93,7 @@ class PinocchioDynamics:
         self._coordinates, self._carrier_bodies = machine.coordinates, motion_parents
         self._held, self._tree = machine.held, machine.tree
         self._least_inertias = machine.least_inertias
-        self._tip = None if machine.tip is None else frame_placement(machine, machine.tip)
+        self._tip = None if machine.tip is None else machine.frame(machine.tip)
 
     @cached_property
     def _workspace(self) -> ThreadLocal[tuple[pin.Data, list[_Subtree]]]:
@@ -210,10 +210,9 @@ class PinocchioDynamics:
         ]
         out.append(gamma.T @ self._joint_forces.passive_forces(q, state.v))
         if self._tip is not None:
-            joint, place = self._tip[0], self._tip[1].translation
             pin.computeJointJacobians(model, data, self._coordinates.configuration(q))
-            out.append(data.oMi[joint].act(place))
-            out.append(point_jacobian(model, data, joint, place)[:3] @ gamma)
+            out.append(pin.updateFramePlacement(model, data, self._tip).translation)
+            out.append(frame_jacobian(model, data, self._tip)[:3] @ gamma)
         return np.concatenate([np.ravel(part) for part in out])
 
     def _accelerations_with_stick_slip(

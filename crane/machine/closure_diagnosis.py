@@ -24,6 +24,7 @@ from crane.closure.constraint_tolerances import FILE_PRECISION
 from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
 from crane.common.samples import Array
+from crane.description.kinematic_tree import joints_to_root
 from crane.description.machine_parameters import tree_parameters, value_at
 from crane.description.specification import LoopSpec, MachineSpec
 from crane.machine.drive_selection import specified_active_joints
@@ -196,15 +197,12 @@ def _parameters_in_loops(
 
 def _joints(spec: MachineSpec, loop: LoopSpec) -> set[str]:
     """Joints of the tree in a loop, including fixed ones."""
-    above = {joint.child: joint for joint in spec.tree.joints.values()}
-    paths = []
-    for link in (loop.predecessor, loop.successor):
-        path = set()
-        while link in above:
-            path.add(above[link].name)
-            link = above[link].parent
-        paths.append(path)
-    return paths[0] ^ paths[1]
+    above = spec.tree.parent_joints
+    one, two = (
+        {joint.name for joint in joints_to_root(above, link)}
+        for link in (loop.predecessor, loop.successor)
+    )
+    return one ^ two
 
 
 def _closing_change(

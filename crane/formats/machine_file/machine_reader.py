@@ -22,8 +22,8 @@ from crane.description.sensors import (
     TIME,
     VALVE_SIGNAL_PREFIX,
     Sensor,
-    quantity_names,
     quantity_unit,
+    quantity_units,
     signal_delay_error,
 )
 from crane.description.specification import (
@@ -376,7 +376,7 @@ def read_sensors(top: YamlSection, tree: TreeBuilder) -> dict[str, Sensor]:
     def read_sensor(name: str, item: YamlSection) -> Sensor:
         unit = quantity_unit(tree.tree, name)
         if unit is None:
-            known = suggest_names(quantity_names(tree.tree), name)
+            known = suggest_names(quantity_units(tree.tree), name)
             raise tree.unknown_name_error(
                 str(item.error_at(None, f"'{name}' is no quantity of this machine, {known}"))
             )
