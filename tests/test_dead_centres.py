@@ -220,6 +220,17 @@ def test_loops_are_followed_through_change_points(tmp_path, name):
         machine.closure.gamma(machine.closure.solve([change_point]))
 
 
+def test_guesses_beyond_a_change_point_may_have_either_rotation_vector(tmp_path):
+    """The same rotation of a ball joint, by less or by more than half a revolution."""
+    machine = singular_linkages.kite(tmp_path, "a", "spherical")
+    a, b, c = singular_linkages.kite_angles(1.5)
+    for angle in (b + 2 * np.pi, b):
+        guess = np.array([a, 0.0, angle, 0.0, c])
+        with warnings.catch_warnings(action="ignore"):
+            q = machine.closure.solve([a], guess)
+        np.testing.assert_allclose(q, [a, 0.0, b, 0.0, c], rtol=0, atol=1e-12)
+
+
 def test_a_limit_of_neighbours_or_none():
     x = 4e-3 * change_points.NEIGHBOUR_PLACES
     values = np.column_stack([np.cos(x), np.exp(3 * x), np.zeros(8)])

@@ -191,17 +191,19 @@ class Coordinates:
             q: (nv,).
             columns: Columns that may change; all by default.
         """
-        if not self.rotation_columns:
-            return q
-        out = q.copy()
-        for column in self.rotation_columns:
-            if columns is not None and not np.isin(range(column, column + 3), columns).all():
-                continue
-            r = out[column : column + 3]
-            length = float(np.linalg.norm(r))
-            if length > np.pi:
-                r *= 1 - 2 * np.pi * np.round(length / (2 * np.pi)) / length
-        return out
+        return self.unwrap_rotations(q, np.zeros(len(q)), columns)
+
+    def scaled_distances(self, first: Array, second: Array) -> Array:
+        """(nv,) distances of two configurations by coordinate, full revolutions ignored."""
+        off = (first - second) / self.units
+        turned = np.remainder(off + np.pi, 2 * np.pi) - np.pi
+        return np.abs(np.where(self.is_translation, off, turned))
+
+    def within_limits(self, q: Array, tolerance: float) -> NDArray[np.bool_]:
+        """(nv,) whether coordinates are within their limits, up to a scaled tolerance."""
+        slack = tolerance * self.units
+        inside: NDArray[np.bool_] = (q >= self.lower - slack) & (q <= self.upper + slack)
+        return inside
 
     def cardan_angles(self, q: Array) -> tuple[Array, Array]:
         """Coordinates (nv,) with Cardan angles R = R_x R_y R_z in place of rotation vectors.
@@ -213,15 +215,10 @@ class Coordinates:
         out, rates = q.copy(), np.eye(len(q))
         for column in self.rotation_columns:
             rotation = slice(column, column + 3)
-            first, second, third = out[rotation] = cardan_angles(pin.exp3(q[rotation]))
-            s, c = np.sin(third), np.cos(third)
-            # columns: axes of the three angles in the axes of the child
-            axes = [
-                [c * np.cos(second), s, 0],
-                [-s * np.cos(second), c, 0],
-                [np.sin(second), 0, 1],
-            ]
-            rates[rotation, rotation] = np.linalg.pinv(axes)
+            out[rotation] = angles = cardan_angles(pin.exp3(q[rotation]))
+            # roll, pitch and yaw of the inverse rotation are the same angles, negative
+            inverse_rates = pin.rpy.computeRpyJacobian(-np.array(angles), pin.WORLD)
+            rates[rotation, rotation] = np.linalg.pinv(inverse_rates)
         return out, rates
 
     def has_partial_rotations(self, columns: Indices) -> bool:
@@ -231,10 +228,18 @@ class Coordinates:
             for column in self.rotation_columns
         )
 
-    def unwrap_rotations(self, q: Array, nearby: Array) -> Array:
-        """The same configuration (nv,) with the rotation vectors nearest to those of another."""
+    def unwrap_rotations(self, q: Array, nearby: Array, columns: Indices | None = None) -> Array:
+        """The same configuration (nv,) with the rotation vectors nearest to those of another.
+
+        Args:
+            q: (nv,).
+            nearby: (nv,).
+            columns: Columns that may change; all by default.
+        """
         out = q.copy()
         for column in self.rotation_columns:
+            if columns is not None and not np.isin(range(column, column + 3), columns).all():
+                continue
             r, other = out[column : column + 3], nearby[column : column + 3]
             length = float(np.linalg.norm(r))
             axis = r if length else other
@@ -253,8 +258,5 @@ class Coordinates:
 
 def cardan_angles(rotation: Array) -> tuple[float, float, float]:
     """Angles a, b, c with rotation = R_x(a) R_y(b) R_z(c), of any rotation matrix (3, 3)."""
-    first = np.arctan2(-rotation[1, 2], rotation[2, 2])
-    sine, cosine = np.sin(first), np.cos(first)
-    second = np.arctan2(rotation[0, 2], cosine * rotation[2, 2] - sine * rotation[1, 2])
-    x, y = cosine * rotation[1, :2] + sine * rotation[2, :2]
-    return float(first), float(second), float(np.arctan2(x, y))
+    first, second, third = (-pin.rpy.matrixToRpy(rotation.T)).tolist()
+    return first, second, third

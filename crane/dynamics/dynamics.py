@@ -296,9 +296,7 @@ class Dynamics(QuantityEvaluator):
         Returns:
             (n, 10 nb + nr) or (N, n, 10 nb + nr), columns in the order of `parameters`.
         """
-        model = self.machine.model
-        size = 10 * (model.njoints - 1) + np.count_nonzero(model.armature)
-        return self._evaluate("regressor", (self._mobility, size), q_a, v_a, a_a, "a_a")
+        return self._evaluate("regressor", self.result_shape("regressor"), q_a, v_a, a_a, "a_a")
 
     def derivatives(
         self,

@@ -17,6 +17,7 @@ from crane.machine.massless_motions import (
     MIN_INERTIA_SHARE,
     describe_massless_motion,
     hold_coordinates,
+    is_definite,
 )
 
 
@@ -279,13 +280,10 @@ class PinocchioDynamics:
     ) -> SingularMassMatrixError | None:
         """The error where M_A, without held coordinates, is singular as in `LdltFactorization`."""
         active = self._closure.active
-        least = self._least_inertias[active] + MIN_INERTIA_SHARE * np.diag(mass)
-        try:
-            factor = np.linalg.cholesky(np.delete(np.delete(mass, self._held, 0), self._held, 1))
-            if (np.diag(factor) ** 2 > margin * np.delete(least, self._held)).all():
-                return None
-        except np.linalg.LinAlgError:
-            pass
+        least = margin * (self._least_inertias[active] + MIN_INERTIA_SHARE * np.diag(mass))
+        moving = np.delete(np.arange(len(mass)), self._held)
+        if is_definite(mass[np.ix_(moving, moving)], least[moving]):
+            return None
         place = self._coordinates.format_values(active, state.q[active])
         motion = describe_massless_motion(
             self._model, self._closure, self._tree, state.q, state.gamma, mass

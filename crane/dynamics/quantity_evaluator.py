@@ -30,7 +30,7 @@ from crane.dynamics.pinocchio_dynamics import PinocchioDynamics
 from crane.formats.machine_loading import MachineVariants
 from crane.machine.machine import Machine
 from crane.machine.machine_checks import has_mass
-from crane.machine.massless_motions import MIN_INERTIA_SHARE
+from crane.machine.massless_motions import MIN_INERTIA_SHARE, is_definite
 
 UNIT_OF_ZERO_PARAMETER = 0.1  # magnitude assumed for a parameter that is 0
 _RELATIVE_STEP = 1e-3  # step as a fraction of the parameter
@@ -212,15 +212,10 @@ class QuantityEvaluator(OneLineRepr):
 
     def check_free_block(self, q_a: ArrayLike, free_block: Array) -> None:
         """Raise the error of a singular mass matrix of the free joints (..., k, k)."""
-        try:
-            pivots = np.diagonal(np.linalg.cholesky(free_block), axis1=-2, axis2=-1) ** 2
-            least = MIN_INERTIA_SHARE * np.diagonal(free_block, axis1=-2, axis2=-1)
-            machine = self.machine
-            least = least + machine.least_inertias[machine.closure.active][~machine.is_driven]
-            is_singular = bool((pivots <= least).any())
-        except np.linalg.LinAlgError:
-            is_singular = True
-        if is_singular:
+        machine = self.machine
+        least = machine.least_inertias[machine.closure.active][~machine.is_driven]
+        rounding = MIN_INERTIA_SHARE * np.diagonal(free_block, axis1=-2, axis2=-1)
+        if not is_definite(free_block, least + rounding):
             self.check_mass_matrices(self.machine.closure.solve(np.atleast_2d(q_a)))
 
     def check_mass_matrices(self, q: Array) -> None:

@@ -15,6 +15,7 @@ coordinates of driven joints are tried like lengths.
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 from crane.closure.constraint_tolerances import FILE_PRECISION
 from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
+from crane.closure.multi_start_search import closest_approach
 from crane.common.samples import Array
 from crane.description.kinematic_tree import joints_to_root
 from crane.description.machine_parameters import tree_parameters, value_at
@@ -105,11 +107,9 @@ def diagnose_closure(spec: MachineSpec, model: pin.Model, guess: Array) -> Closu
     passive = np.setdiff1d(np.arange(model.nv), active)
     in_loops = (equations.sign != 0).any(axis=0)[passive]
     specified = np.isin(names, list(spec.home))[passive]
-    guess = _nearest(
-        equations,
-        guess,
-        passive[in_loops & ~specified],
-        lambda q, _: (*equations.evaluate_scaled(q), guess),
+    undecided = passive[in_loops & ~specified]
+    guess = closest_approach(
+        equations, guess, undecided, equations.evaluate_scaled, max_nfev=_MAX_EVALUATIONS
     )
     phi, size = equations.evaluate(guess)[0], equations.characteristic_length
     loop_rows = [
@@ -142,8 +142,8 @@ def diagnose_closure(spec: MachineSpec, model: pin.Model, guess: Array) -> Closu
     )
 
 
-# from q (nq,) and the scaled change of a parameter: phi (m,), dphi/dq, dphi/dp, all scaled
-ChangedResidual = Callable[[Array, float], tuple[Array, Array, Array]]
+# from the scaled change of a parameter and q (nq,): phi (m,), dphi/dq, dphi/dp, all scaled
+ChangedResidual = Callable[[float, Array], tuple[Array, Array, Array]]
 
 
 def _parameters_in_loops(
@@ -158,7 +158,7 @@ def _parameters_in_loops(
     size = equations.characteristic_length
 
     def length(other: LoopEquations) -> ChangedResidual:
-        def changed(q: Array, change: float) -> tuple[Array, Array, Array]:
+        def changed(change: float, q: Array) -> tuple[Array, Array, Array]:
             (phi, jacobian), (other_phi, other_jacobian) = equations.evaluate(q), other.evaluate(q)
             units = equations.residual_units
             jacobian = (
@@ -171,7 +171,7 @@ def _parameters_in_loops(
         return changed
 
     def drive(column: int) -> ChangedResidual:
-        def changed(q: Array, change: float) -> tuple[Array, Array, Array]:
+        def changed(change: float, q: Array) -> tuple[Array, Array, Array]:
             moved = q.copy()
             moved[column] += change * equations.coordinate_units[column]
             phi, jacobian = equations.evaluate_scaled(moved)
@@ -217,7 +217,7 @@ def _closing_change(
     weights = np.append(np.where(specified, 1.0, _FREE_WEIGHT), _FREE_WEIGHT)
     for _ in range(_MAX_ITERATIONS):
         q = equations.displace(guess, passive, x[:-1])
-        gap, jacobian, derivative = changed(q, float(x[-1]))
+        gap, jacobian, derivative = changed(float(x[-1]), q)
         matrix = np.column_stack([jacobian[:, passive], derivative])
         solution = np.linalg.lstsq(matrix / weights, matrix @ x - gap, rcond=1e-12)[0] / weights
         step = np.abs(solution - x).max()
@@ -240,8 +240,9 @@ def _smallest_closing_change(
     """
     q, change = guess.copy(), 0.0
     for _ in range(_MAX_CHANGES):
-        q = _nearest(equations, q, passive, changed, change)
-        phi, _, derivative = changed(q, change)
+        at_change = partial(changed, change)
+        q = closest_approach(equations, q, passive, at_change, max_nfev=_MAX_EVALUATIONS)
+        phi, _, derivative = changed(change, q)
         if np.abs(phi).max() < FILE_PRECISION:
             return change, abs(change)
         lever = float(phi @ derivative)
@@ -249,30 +250,3 @@ def _smallest_closing_change(
             return None
         change -= float(phi @ phi) / lever
     return None
-
-
-def _nearest(
-    equations: LoopEquations,
-    q: Array,
-    free: Indices,
-    changed: ChangedResidual,
-    change: float = 0.0,
-) -> Array:
-    """The configuration of least squared residuals, from one nearby."""
-    from scipy.optimize import least_squares  # slow to import, only needed for open loops
-
-    def configuration(x: Array) -> Array:
-        return equations.displace(q, free, x)
-
-    if not len(free):
-        return q
-
-    def gap(x: Array) -> Array:
-        return changed(configuration(x), change)[0]
-
-    def jacobian(x: Array) -> Array:
-        return changed(configuration(x), change)[1][:, free]
-
-    return configuration(
-        least_squares(gap, np.zeros(len(free)), jacobian, max_nfev=_MAX_EVALUATIONS).x
-    )

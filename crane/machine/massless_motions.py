@@ -207,6 +207,15 @@ def describe_massless_motion(
     )
 
 
+def is_definite(mass: Array, least: Array) -> bool:
+    """Whether all pivots of mass matrices M (..., n, n) are above the least inertias (..., n)."""
+    try:
+        pivots = np.diagonal(np.linalg.cholesky(mass), axis1=-2, axis2=-1) ** 2
+    except np.linalg.LinAlgError:
+        return False
+    return bool((pivots > least).all())
+
+
 def hold_coordinates(mass: Array, held: tuple[int, ...]) -> Array:
     """M (..., n, n) with the rows and columns of held coordinates those of the unit matrix."""
     out = mass.copy()
