@@ -29,6 +29,8 @@ class Coordinates:
         joints: (nv,) index of Pinocchio's joint of each coordinate.
         floating_base_columns: First column of each floating base.
         rotation_columns: First column of each rotation vector.
+        is_translation: (nv,) whether a coordinate is a length.
+        is_rotation_vector: (nv,) whether a coordinate is a component of a rotation vector.
         parents: (nv + 1,) parent bodies, where coordinate i moves body i + 1; the coordinates of a
             ball joint or floating base are a series; 0 is the world.
         body_of_joint: Body of each joint of Pinocchio's model in this numbering.
@@ -41,18 +43,24 @@ class Coordinates:
         self.rotation_columns: tuple[int, ...] = ()
         joint_of_coordinate: list[int] = []
         configuration_indices: list[int] = []  # in Pinocchio's q; of quaternions the vector part
+        kinds: list[str] = []  # "slide" and "turn" of single joints, "x" to "rz" of others
         for i in range(1, model.njoints):
             joint, name = model.joints[i], model.names[i]
             if joint.shortname() == FREE_FLYER:
                 self.floating_base_columns += (joint.idx_v,)
             if joint.shortname() in (FREE_FLYER, BALL):
                 self.rotation_columns += (joint.idx_v + joint.nv - 3,)
-                parts = ("x", "y", "z", "rx", "ry", "rz")[-joint.nv :]
+                parts = ["x", "y", "z", "rx", "ry", "rz"][-joint.nv :]
                 self.names += tuple(f"{name}_{part}" for part in parts)
             else:
+                parts = ["slide" if joint.shortname().startswith("JointModelP") else "turn"]
                 self.names += (name,)
+            kinds += parts
             joint_of_coordinate += [i] * joint.nv
             configuration_indices += range(joint.idx_q, joint.idx_q + joint.nv)
+        self.is_translation = np.isin(kinds, ("slide", "x", "y", "z"))
+        self.is_rotation_vector = np.isin(kinds, ("rx", "ry", "rz"))
+        self._is_composite = ~np.isin(kinds, ("slide", "turn"))
         self.joints = np.array(joint_of_coordinate, dtype=np.intp)
         last = {0: 0} | {joint: i + 1 for i, joint in enumerate(joint_of_coordinate)}
         self.body_of_joint: tuple[int, ...] = tuple(last[joint] for joint in range(model.njoints))
@@ -88,25 +96,6 @@ class Coordinates:
     def upper(self) -> Array:
         """(nv,) upper limits [m], [rad]."""
         return self._coordinate_limits(self.model.upperPositionLimit, np.inf)
-
-    @cached_property
-    def is_translation(self) -> NDArray[np.bool_]:
-        """(nv,) whether a coordinate is a length."""
-        found = np.zeros(len(self.names), dtype=bool)
-        for i in range(1, self.model.njoints):
-            joint = self.model.joints[i]
-            if joint.shortname() == FREE_FLYER:
-                found[joint.idx_v : joint.idx_v + 3] = True
-            found[joint.idx_v] |= joint.shortname().startswith("JointModelP")
-        return found
-
-    @cached_property
-    def is_rotation_vector(self) -> NDArray[np.bool_]:
-        """(nv,) whether a coordinate is a component of a rotation vector."""
-        found = np.zeros(len(self.names), dtype=bool)
-        for column in self.rotation_columns:
-            found[column : column + 3] = True
-        return found
 
     @cached_property
     def characteristic_length(self) -> float:
@@ -248,12 +237,8 @@ class Coordinates:
         return out
 
     def _coordinate_limits(self, joint_limits: Array, unlimited: float) -> Array:
-        out = np.asarray(joint_limits, dtype=np.float64)[self._configuration_indices].copy()
-        for column in self.floating_base_columns:
-            out[column : column + 3] = unlimited
-        for column in self.rotation_columns:
-            out[column : column + 3] = unlimited
-        return out
+        limits = np.asarray(joint_limits, dtype=np.float64)[self._configuration_indices]
+        return np.where(self._is_composite, unlimited, limits)
 
 
 def cardan_angles(rotation: Array) -> tuple[float, float, float]:

@@ -1,6 +1,6 @@
 """Evaluation of the quantities of a machine's dynamics, compiled or by Pinocchio."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -353,26 +353,33 @@ class QuantityEvaluator(OneLineRepr):
         formula = self._compiled_quantities.get(quantity)
         if formula is not None and (out := formula.evaluate_sample(q_a, v_a, x)) is not None:
             return out.reshape(shape) if shape else out
-        names, n = self.machine.active, self._mobility
-        q_a = as_samples(q_a, n, "q_a", names)
-        checked = [
-            as_samples(value, n, what, names)
-            for what, value in (("v_a", v_a), (x_name, x))
-            if value is not None
-        ]
-        length = stack_length((q_a, *checked))
+        given = {"q_a": q_a, "v_a": v_a, x_name: x}
+        targets, rows, length = self._stack_arguments(
+            {name: value for name, value in given.items() if value is not None}
+        )
+        out = self._evaluate_stack(quantity, targets, rows, np.ndim(q_a) == 2)
+        if shape:
+            return out.reshape(shape if length is None else (length, *shape))
+        return out[0] if length is None else out
+
+    def _stack_arguments(
+        self, arguments: Mapping[str, ArrayLike]
+    ) -> tuple[Array, Array, int | None]:
+        """q_A (N, n), the other arguments (N, 2 n), and N, None for a single sample.
+
+        Args:
+            arguments: Samples or stacks by name, q_A first.
+        """
+        n, names = self._mobility, self.machine.active
+        q_a, *others = (as_samples(x, n, name, names) for name, x in arguments.items())
+        length = stack_length((q_a, *others))
         count = 1 if length is None else length
         if count == 0:
             raise InputError("the stack is empty, give at least one sample")
         rows = np.zeros((count, 2 * n))
-        for i, array in enumerate(checked):
+        for i, array in enumerate(others):
             rows[:, i * n : (i + 1) * n] = array
-        out = self._evaluate_stack(
-            quantity, np.ascontiguousarray(np.broadcast_to(q_a, (count, n))), rows, q_a.ndim == 2
-        )
-        if shape:
-            return out.reshape(shape if length is None else (count, *shape))
-        return out[0] if length is None else out
+        return np.ascontiguousarray(np.broadcast_to(q_a, (count, n))), rows, length
 
     def _evaluate_stack(self, quantity: str, targets: Array, rows: Array, is_stack: bool) -> Array:
         closure, n = self.machine.closure, self._mobility

@@ -157,28 +157,6 @@ def _parameters_in_loops(
     joints = {joint for loop in loops for joint in _joints(spec, loop)}
     size = equations.characteristic_length
 
-    def length(other: LoopEquations) -> ChangedResidual:
-        def changed(change: float, q: Array) -> tuple[Array, Array, Array]:
-            (phi, jacobian), (other_phi, other_jacobian) = equations.evaluate(q), other.evaluate(q)
-            units = equations.residual_units
-            jacobian = (
-                (jacobian + change * (other_jacobian - jacobian))
-                / units[:, None]
-                * equations.coordinate_units
-            )
-            return (phi + change * (other_phi - phi)) / units, jacobian, (other_phi - phi) / units
-
-        return changed
-
-    def drive(column: int) -> ChangedResidual:
-        def changed(change: float, q: Array) -> tuple[Array, Array, Array]:
-            moved = q.copy()
-            moved[column] += change * equations.coordinate_units[column]
-            phi, jacobian = equations.evaluate_scaled(moved)
-            return phi, jacobian, jacobian[:, column]
-
-        return changed
-
     for name, part, path in tree_parameters(spec.tree, spec.chains):
         if path[0] != "xyz" or part.name not in joints or not (value := value_at(part, path)):
             continue
@@ -186,13 +164,39 @@ def _parameters_in_loops(
         x, y, z = (x + size * (i == path[1]) for i, x in enumerate(joint.xyz))
         joint = dataclasses.replace(joint, xyz=(x, y, z))
         moved = assemble_tree(dataclasses.replace(spec, tree=spec.tree.with_parts(joint)))
-        yield name, value, size, False, length(LoopEquations(moved, spec.loops, spec.couplings))
+        other = LoopEquations(moved, spec.loops, spec.couplings)
+        yield name, value, size, False, partial(_evaluate_with_length, equations, other)
     for column in active:
         name = equations.coordinates.names[column]
         if name in joints and name in spec.home:
             unit = float(equations.coordinate_units[column])
             is_angle = not equations.coordinates.is_translation[column]
-            yield f"home {name}", float(guess[column]), unit, is_angle, drive(column)
+            moved_drive = partial(_evaluate_with_drive, equations, column)
+            yield f"home {name}", float(guess[column]), unit, is_angle, moved_drive
+
+
+def _evaluate_with_length(
+    equations: LoopEquations, other: LoopEquations, change: float, q: Array
+) -> tuple[Array, Array, Array]:
+    """`ChangedResidual` of a length, which is one characteristic length more in `other`."""
+    (phi, jacobian), (other_phi, other_jacobian) = equations.evaluate(q), other.evaluate(q)
+    units = equations.residual_units
+    jacobian = (
+        (jacobian + change * (other_jacobian - jacobian))
+        / units[:, None]
+        * equations.coordinate_units
+    )
+    return (phi + change * (other_phi - phi)) / units, jacobian, (other_phi - phi) / units
+
+
+def _evaluate_with_drive(
+    equations: LoopEquations, column: int, change: float, q: Array
+) -> tuple[Array, Array, Array]:
+    """`ChangedResidual` of the home coordinate of a driven joint."""
+    moved = q.copy()
+    moved[column] += change * equations.coordinate_units[column]
+    phi, jacobian = equations.evaluate_scaled(moved)
+    return phi, jacobian, jacobian[:, column]
 
 
 def _joints(spec: MachineSpec, loop: LoopSpec) -> set[str]:
