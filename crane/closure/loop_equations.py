@@ -179,8 +179,7 @@ class LoopEquations:
         involved = np.vstack([self.sign, self.is_coupled])[:, columns] != 0
         group = np.arange(len(columns), dtype=np.intp)
         for row in involved:
-            connected = np.isin(group, group[row])
-            group[connected] = group[connected].min(initial=len(group))
+            _merge_groups(group, np.flatnonzero(row))
         group = np.unique(group, return_inverse=True)[1]
         return group, np.array(
             [int(group[tie][0]) if tie.any() else -1 for tie in involved], dtype=np.intp
@@ -402,26 +401,24 @@ def find_clusters(equations: LoopEquations) -> list[Cluster]:
     Joints on the path between joints that one equation ties together belong to the cluster, too.
     """
     parents = equations.coordinates.parents
-    representative = list(range(len(parents)))
-
-    def root_of(i: int) -> int:
-        while representative[i] != i:
-            i = representative[i]
-        return i
-
+    group = np.arange(len(parents), dtype=np.intp)
     for row in (*equations.sign, *equations.is_coupled):
         tied = (np.flatnonzero(row) + 1).tolist()
         if not tied:
             continue
         paths = [{0, *supporting_bodies(parents, parents[joint])} for joint in tied]
-        first, *rest = sorted({*tied, *set().union(*paths)} - paths[0].intersection(*paths[1:]))
-        for joint in rest:
-            one, two = sorted((root_of(first), root_of(joint)))
-            representative[two] = one
+        between = set().union(*paths) - paths[0].intersection(*paths[1:])
+        _merge_groups(group, np.array([*tied, *between], dtype=np.intp))
     members: dict[int, list[int]] = {}
     for i in range(1, len(parents)):
-        members.setdefault(root_of(i), []).append(i)
+        members.setdefault(int(group[i]), []).append(i)
     return [Cluster(parents[joints[0]], tuple(joints)) for joints in members.values()]
+
+
+def _merge_groups(group: Indices, members: Indices) -> None:
+    """Give members, and all others in their groups, the least group index of these."""
+    connected = np.isin(group, group[members])
+    group[connected] = group[connected].min(initial=len(group))
 
 
 def supporting_bodies(parents: Sequence[int], body: int) -> list[int]:

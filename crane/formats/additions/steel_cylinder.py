@@ -13,7 +13,15 @@ from crane.common.errors import CraneWarning, InputError, suggest_names
 from crane.common.plausible_ranges import LONGEST, implausible_value_text, suggested_units_text
 from crane.common.samples import Array, as_number
 from crane.common.unit_conversions import UnitError, parse_number
-from crane.description.kinematic_tree import Inertial, Joint, Limits, Link, Vector, to_vector
+from crane.description.kinematic_tree import (
+    Inertial,
+    Joint,
+    Limits,
+    Link,
+    Vector,
+    joints_to_root,
+    to_vector,
+)
 from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
 from crane.description.specification import LoopSpec
 from crane.formats.machine_file.machine_writer import MachineDraft, loop_data
@@ -82,13 +90,7 @@ def joints_between(
     parent_joints: Mapping[str, Joint], first_link: str, second_link: str
 ) -> list[Joint]:
     """Return the movable joints of a tree between two links, see `Tree.parent_joints`."""
-    paths_to_root = []
-    for link in (first_link, second_link):
-        path = []
-        while link in parent_joints:
-            path.append(parent_joints[link])
-            link = parent_joints[link].parent
-        paths_to_root.append(path)
+    paths_to_root = [[*joints_to_root(parent_joints, x)] for x in (first_link, second_link)]
     first, second = ({joint.name for joint in path} for path in paths_to_root)
     return [
         joint

@@ -14,6 +14,7 @@ from crane.closure.loop_equations import LoopEquations
 from crane.common.errors import ClosureError, CraneWarning, MechanismError
 from crane.common.samples import Array
 from crane.description.findings import Findings, report_error
+from crane.description.kinematic_tree import joints_to_root
 from crane.description.specification import TIP_COORDINATES, MachineSpec, Task
 from crane.formats.assembly_warnings import add_remedy, check_home, warn_about_assembly_modes
 from crane.machine.machine_assembly import assemble_tree, build_closure, home_initial_guess
@@ -236,14 +237,11 @@ def check_strokes(spec: MachineSpec, closure: Closure) -> None:
 
 def _reach(spec: MachineSpec) -> float:
     """Return the length [m] of all links from the root to the tip in line, slides extended."""
-    parent_joints = {joint.child: joint for joint in spec.tree.joints.values()}
-    link, length = spec.tip, 0.0
-    while link in parent_joints:
-        joint = parent_joints[link]
+    length = 0.0
+    for joint in joints_to_root(spec.tree.parent_joints, spec.tip or ""):
         length += float(np.linalg.norm(joint.xyz))
         if joint.kind == "prismatic":
             length += max(abs(joint.limits.lower), abs(joint.limits.upper))
-        link = joint.parent
     return length
 
 
