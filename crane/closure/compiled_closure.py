@@ -154,7 +154,7 @@ class CompiledClosure:
             geometry.parents,
             geometry.is_revolute,
             geometry.floating_bases,
-            geometry.ball_joints,
+            geometry.rotation_bodies,
             geometry.frame_bodies,
             folding_pattern(geometry.constants),
             tuple(loop.type for loop in equations.loops),

@@ -81,12 +81,6 @@ class Coordinates:
             raise InputError(f"joint '{name}' is unknown, {suggest_names(self.names, name)}")
         return self._columns_by_name[name]
 
-    @property
-    def ball_joint_columns(self) -> tuple[int, ...]:
-        """First column of each ball joint."""
-        floating = {column + 3 for column in self.floating_base_columns}
-        return tuple(column for column in self.rotation_columns if column not in floating)
-
     @cached_property
     def lower(self) -> Array:
         """(nv,) lower limits [m], [rad]."""

@@ -201,7 +201,7 @@ class TreeGeometry:
         parents: (nb + 1,) parent bodies.
         is_revolute: (nb + 1,) whether the joint is revolute.
         floating_bases: First body of each floating base.
-        ball_joints: First body of each ball joint.
+        rotation_bodies: First of the three bodies of each rotation vector.
         body_rotations: (nb + 1, 3, 3) from the axes of the body here to those of Pinocchio's
             joint.
         constants: (12 (nb + frames) + 1,) rotation and origin of every joint frame in its parent
@@ -212,7 +212,7 @@ class TreeGeometry:
     parents: tuple[int, ...]
     is_revolute: tuple[bool, ...]
     floating_bases: tuple[int, ...]
-    ball_joints: tuple[int, ...]
+    rotation_bodies: tuple[int, ...]
     body_rotations: Array
     constants: Array
     frame_bodies: tuple[int, ...]
@@ -231,14 +231,9 @@ class TreeGeometry:
     @cached_property
     def series_of_body(self) -> dict[int, tuple[int, ...]]:
         """The bodies of the series of each body of a ball joint or floating base."""
-        series = [tuple(range(i, i + 6)) for i in self.floating_bases]
-        series += [tuple(range(i, i + 3)) for i in self.ball_joints]
+        series = [tuple(range(i, i + 3)) for i in self.rotation_bodies]
+        series += [tuple(range(i, i + 6)) for i in self.floating_bases]  # instead of their last 3
         return {i: bodies for bodies in series for i in bodies}
-
-    @property
-    def rotation_bodies(self) -> list[int]:
-        """First of the three bodies of each rotation vector."""
-        return [*(i + 3 for i in self.floating_bases), *self.ball_joints]
 
     @property
     def massless_bodies(self) -> frozenset[int]:
@@ -289,7 +284,7 @@ def tree_geometry(equations: LoopEquations) -> TreeGeometry:
         parents,
         tuple(revolute),
         tuple(column + 1 for column in coordinates.floating_base_columns),
-        tuple(column + 1 for column in coordinates.ball_joint_columns),
+        tuple(column + 1 for column in coordinates.rotation_columns),
         np.array([turn.rotation for turn in rotations]),
         np.concatenate([*numbers, [1.0 / equations.characteristic_length]]),
         tuple(body_of_joint[body] for body, _ in frames),
@@ -408,7 +403,7 @@ class PositionKinematics:
             )
         rotation = matmul(self.rotation[parent], turn)
         arm = matvec(self.rotation[parent], place)
-        if i in self.geometry.ball_joints:
+        if i in self.geometry.rotation_bodies:
             return matmul(rotation, rotation_matrix(self.q[i - 1 : i + 2])), arm
         if self.geometry.is_revolute[i]:
             c, s = apply_function("cos", q), apply_function("sin", q)

@@ -389,8 +389,7 @@ class MultiStartSearch:
                 break
             q, residual, jacobian = accepted
             slow_iterations += int(residual @ residual > _SLOW_PROGRESS_RATIO * cost)
-        periodic = self._periodic.copy()
-        periodic[np.setdiff1d(np.arange(len(q)), movable)] = False
+        periodic = self._periodic & np.isin(np.arange(len(q)), movable)
         q = remove_revolutions(
             q, self.initial_guess, periodic, self._coordinates.lower, self._coordinates.upper
         )

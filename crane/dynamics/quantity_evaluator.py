@@ -165,21 +165,19 @@ class QuantityEvaluator(OneLineRepr):
         self._parameter_derivatives: dict[
             tuple[str, tuple[str, ...]], CompiledParameterDerivatives
         ] = {}
-        self.formula_constants = np.zeros(0)
+        layout = self.formula_structure.constants_layout
+        self.formula_constants = np.zeros(layout.size)
         if self.backend == "compiled":
             geometry = machine.closure.compiled_closure.geometry
-            self.formula_constants = np.ascontiguousarray(
-                dynamics_constants(machine, geometry, self.forces, machine.least_inertias)
+            self.formula_constants[:] = dynamics_constants(
+                machine, geometry, self.forces, machine.least_inertias
             )
         # constants to fold into formulas; NaN for those that change with the motion
         self.constant_pattern = self.formula_constants.copy()
         self._mode_indices = self.formula_structure.stick_slip_mode_indices
-        self._circuit_friction_indices = self.formula_structure.constants_layout[
-            "circuit_friction"
-        ]
-        if self.backend == "compiled":
-            self.constant_pattern[self._mode_indices] = np.nan
-            self.constant_pattern[self._circuit_friction_indices] = np.nan
+        self._circuit_friction_indices = layout["circuit_friction"]
+        self.constant_pattern[self._mode_indices] = np.nan
+        self.constant_pattern[self._circuit_friction_indices] = np.nan
 
     def backend_of(self, quantity: str = "forward") -> str:
         """The backend that computes a quantity of `compiled_dynamics.QUANTITIES`."""
@@ -251,11 +249,8 @@ class QuantityEvaluator(OneLineRepr):
         They only affect the quantities of the integration, `STICK_SLIP_QUANTITIES`.
         """
         self.forces.set_stick_slip_modes(slip_sign, is_held, inverse_velocity, is_moving)
-        if self.backend == "compiled":
-            self.formula_constants[self._mode_indices] = [
-                *np.column_stack([slip_sign, is_held, inverse_velocity]).ravel(),
-                is_moving,
-            ]
+        modes = np.column_stack([slip_sign, is_held, inverse_velocity])
+        self.formula_constants[self._mode_indices] = [*modes.ravel(), is_moving]
 
     def set_circuit_friction(self, circuit_friction: Array) -> None:
         """Set the circuit friction; see `JointForces.set_circuit_friction`.
@@ -263,8 +258,7 @@ class QuantityEvaluator(OneLineRepr):
         It only affects the quantities of the integration, `STICK_SLIP_QUANTITIES`.
         """
         self.forces.set_circuit_friction(circuit_friction)
-        if self.backend == "compiled":
-            self.formula_constants[self._circuit_friction_indices] = circuit_friction
+        self.formula_constants[self._circuit_friction_indices] = circuit_friction
 
     def result_shape(self, quantity: str) -> tuple[int, ...]:
         """Shape of one sample of a quantity of `derivatives`."""
