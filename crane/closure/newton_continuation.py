@@ -313,9 +313,8 @@ class NewtonContinuation(ContinuationDiagnosis):
         if corrected is None:
             return None
         correction = np.abs((corrected.q - predicted)[passive] / units[passive]).max(initial=0.0)
-        if correction > 0.02 + 0.5 * predicted_step:
-            return None
-        if not self._continues(current, corrected, float(correction)):
+        is_near = correction <= 0.02 + 0.5 * predicted_step
+        if not is_near or not self._continues(current, corrected, float(correction)):
             return None
         q = self._equations.coordinates.wrap_rotations(corrected.q, self._passive_columns)
         return replace(corrected, q=q)
