@@ -93,13 +93,8 @@ class CompiledPoint:
     def _build_program(self, program: Program) -> None:
         nq, n = self._nq, self._n
         size = program.add_formula("formula", 4, self._output_expressions(Tape())).size
-        with program.add_routine(
-            "rows", counts=("count",), arrays=("geometry", "place", "q", "v", "out")
-        ) as r:
-            with r.loop(r.count) as i:
-                rows = r.q.row_pointer(i, nq), r.v.row_pointer(i, n), r.out.row_pointer(i, size)
-                r.call("formula", r.geometry, r.place, *rows)
-            r.return_value(r.count)
+        row_lengths = {"geometry": None, "place": None, "q": nq, "v": n, "out": size}
+        program.add_formula_loop("rows", "formula", row_lengths)
 
 
 class CompiledFrame(CompiledPoint):

@@ -21,8 +21,8 @@ from crane.description.sensors import (
     TIME,
     VALVE_SIGNAL_PREFIX,
     Sensor,
-    quantity_names,
     quantity_unit,
+    quantity_units,
     signal_delay_error,
 )
 from crane.description.specification import (
@@ -157,37 +157,37 @@ def _read_machine(path: Path) -> MachineSpec:
         tasks = _read_or_default(read_tasks, tasks, top, tree, active, tip, valves, home)
         control = _read_or_default(_read_control, control, top, active)
     external_forces = _read_or_default(read_external_forces, (), top, tree)
-    spec = MachineSpec(
-        name,
-        source,
-        path,
-        chains,
-        with_rotor_inertias(tree.tree, rotor_inertias),
-        loops,
-        active,
-        home,
-        friction,
-        forces,
-        _read_or_default(read_gas_springs, (), top, tree),
-        _read_or_default(read_end_stops, (), top, tree),
-        tip,
-        tasks,
-        control,
-        hydraulics,
-        couplings,
-        locations,
-        payload,
-        free,
-        _read_or_default(read_drives, (), top, tree),
-        _read_or_default(read_ropes, (), top, tree),
-        _read_or_default(read_sensors, {}, top, tree),
-        _read_or_default(read_estimation, EstimationSettings(), top),
-        external_forces,
-        _read_or_default(_read_supports, (), top, tree, external_forces),
-        _read_or_default(_read_pins, {}, top, tree, loops),
-        gravity,
+    return MachineSpec(
+        name=name,
+        source=source,
+        path=path,
+        chains=chains,
+        tree=with_rotor_inertias(tree.tree, rotor_inertias),
+        loops=loops,
+        active=active,
+        home=home,
+        friction=friction,
+        forces=forces,
+        gas_springs=_read_or_default(read_gas_springs, (), top, tree),
+        end_stops=_read_or_default(read_end_stops, (), top, tree),
+        tip=tip,
+        tasks=tasks,
+        control=control,
+        hydraulics=hydraulics,
+        couplings=couplings,
+        source_locations=locations,
+        payload=payload,
+        free=free,
+        drives=_read_or_default(read_drives, (), top, tree),
+        ropes=_read_or_default(read_ropes, (), top, tree),
+        sensors=_read_or_default(read_sensors, {}, top, tree),
+        estimation=_read_or_default(read_estimation, EstimationSettings(), top),
+        external_forces=external_forces,
+        supports=_read_or_default(_read_supports, (), top, tree, external_forces),
+        pin_capacities=_read_or_default(_read_pins, {}, top, tree, loops),
+        gravity=gravity,
+        written_numbers=top.written_numbers(),
     )
-    return dataclasses.replace(spec, written_numbers=top.written_numbers())
 
 
 def _read_supports(
@@ -353,7 +353,7 @@ def read_sensors(top: YamlSection, tree: TreeBuilder) -> dict[str, Sensor]:
     def read_sensor(name: str, item: YamlSection) -> Sensor:
         unit = quantity_unit(tree.tree, name)
         if unit is None:
-            known = suggest_names(quantity_names(tree.tree), name)
+            known = suggest_names(quantity_units(tree.tree), name)
             raise tree.unknown_name_error(
                 str(item.error_at(None, f"'{name}' is no quantity of this machine, {known}"))
             )
