@@ -81,9 +81,9 @@ def escape_text(text: str) -> str:
 
 
 def joint_symbol(name: str) -> str:
-    """Return a joint's name as a label; q1 is set as q with index 1."""
-    if match := re.fullmatch(r"([A-Za-z])(\d+)", name):
-        return f"${match[1]}_{{{match[2]}}}$"
+    """Return a joint's name as a label: q1 as q with index 1, X_lift as X with index lift."""
+    if match := re.fullmatch(r"([A-Za-z])(\d+|_[A-Za-z]+)", name):
+        return f"${match[1]}_{{\\mathrm{{{match[2].removeprefix('_')}}}}}$"
     return escape_label(name)
 
 
