@@ -25,7 +25,7 @@ from crane.view.plots.figure_style import (
     figure_style,
 )
 
-HELD_OUT_COLOUR = "#f1efe8"
+_HELD_OUT_COLOUR = "#f1efe8"
 _MAX_PANELS = 18  # panels
 
 
@@ -40,8 +40,7 @@ def calibration_figure(calibration: Calibration) -> Figure:
     for i, sensor in enumerate(sensors):
         axes = figure.add_subplot(rows, columns, i + 1)
         unit = draw_channel(axes, sensor)
-        for start, end in mask_spans(sensor.time, np.logical_not(sensor.train_mask)):
-            axes.axvspan(start, end, color=HELD_OUT_COLOUR, zorder=-1)
+        _shade_held_out(axes, sensor)
         name = f"{sensor.recording}: {sensor.name}" if has_several_recordings else sensor.name
         axes.set_title(escape_label(f"{name} [{unit}]"), fontsize=8.5)
         if i >= len(sensors) - columns:
@@ -71,11 +70,18 @@ def draw_channel(axes: Axes, sensor: CalibrationChannel) -> str:
     return unit
 
 
-def mask_spans(time: "np.ndarray", mask: "np.ndarray") -> list[tuple[float, float]]:
-    """Return the intervals (start, end) in which a mask (N,) is true."""
-    edges = np.diff(np.concatenate([[0], mask.astype(int), [0]]))
-    starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
-    return [(float(time[a]), float(time[b])) for a, b in zip(starts, ends, strict=True)]
+def _shade_held_out(axes: Axes, channel: CalibrationChannel) -> None:
+    axes.fill_between(
+        channel.time,
+        0.0,
+        1.0,
+        where=(~channel.train_mask).tolist(),
+        step="mid",
+        transform=axes.get_xaxis_transform(),
+        color=_HELD_OUT_COLOUR,
+        linewidth=0,
+        zorder=-1,
+    )
 
 
 _MAX_DOTS = 4000  # of a picture
@@ -94,8 +100,7 @@ def channel_residual_figure(channel: CalibrationChannel, name: str) -> Figure:
     lower.plot(*envelope(channel.time, scale * residual), color=RECORDED_COLOUR, linewidth=0.7)
     lower.axhline(0.0, color=INK_COLOUR, linewidth=0.6)
     for axes in (upper, lower):
-        for start, end in mask_spans(channel.time, np.logical_not(channel.train_mask)):
-            axes.axvspan(start, end, color=HELD_OUT_COLOUR, zorder=-1)
+        _shade_held_out(axes, channel)
         axes.yaxis.set_label_coords(-0.125, 0.5)
     upper.set_ylabel(f"[{unit}]")
     lower.set(ylabel=f"residual [{residual_unit}]", xlabel="time [s]")

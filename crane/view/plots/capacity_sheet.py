@@ -3,9 +3,7 @@
 import textwrap
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
 from crane.ratings.capacity_report import (
     LoadTable,
@@ -35,7 +33,7 @@ _PAGE_WIDTH, _PAGE_HEIGHT, _PAGE_MARGIN = (
     0.45,
 )  # A4 landscape and margin [inch]
 _LINE_HEIGHT = 0.152  # between lines [inch]
-_TEXT_SIZE, _CELL_TEXT_SIZE = 7.5, 7.5  # sizes of letters [points]
+_TEXT_SIZE = 7.5  # size of letters [points]
 _FACTS_WIDTH = 3.5  # width of the facts beside the charts [inch]
 _HEADING_HEIGHT = 0.35  # height of the heading [inch]
 
@@ -135,64 +133,36 @@ def _draw_table(figure: Figure, chart: Capacity, table: LoadTable, bottom: float
         Top of the table [inch].
     """
     rows, names = table.format_rows(), slew_labels(chart)
-    slew_count = len(names)
-    first_column, available_width = _PAGE_MARGIN + 0.6, _PAGE_WIDTH - 2 * _PAGE_MARGIN - 0.6
-    width = min(available_width / len(rows[0]), 0.75)
-    size = min(_CELL_TEXT_SIZE, 72 * width / 4.6)
-    right_edges = (
-        first_column + width * (1 + np.arange(len(rows[0]))) - 0.08
-    )  # right ends of columns
-    for i, (height, row) in enumerate(zip(table.heights, rows, strict=True)):
-        y = bottom + _LINE_HEIGHT * (len(rows) - 1 - i)
-        if i % 2 == 0:
-            figure.add_artist(
-                Rectangle(
-                    (_PAGE_MARGIN / _PAGE_WIDTH, (y - 0.045) / _PAGE_HEIGHT),
-                    (first_column + width * len(row) - _PAGE_MARGIN) / _PAGE_WIDTH,
-                    _LINE_HEIGHT / _PAGE_HEIGHT,
-                    facecolor=FAINT_COLOUR,
-                    alpha=0.45,
-                    transform=figure.transFigure,
-                    linewidth=0,
-                    zorder=-1,
-                )
-            )
-        _write_text(
-            figure,
-            _PAGE_MARGIN + 0.5,
-            y,
-            f"{height:g} m",
-            size=size,
-            ha="right",
-            fontweight="bold",
+    headings = [*(f"{radius:g} m" for radius in table.radii), "farthest"]
+    labels = [f"{heading}\n{name}".strip() for heading in headings for name in names]
+    count = len(rows[0])
+    column_width = min((_PAGE_WIDTH - 2 * _PAGE_MARGIN - 0.6) / count, 0.75)
+    width, height = 0.6 + column_width * count, _LINE_HEIGHT * (len(rows) + 2)
+    axes = figure.add_axes(
+        (
+            _PAGE_MARGIN / _PAGE_WIDTH,
+            bottom / _PAGE_HEIGHT,
+            width / _PAGE_WIDTH,
+            height / _PAGE_HEIGHT,
         )
-        for x, cell in zip(right_edges, row, strict=True):
-            _write_text(figure, x, y, cell, size=size, ha="right")
-    y = bottom + _LINE_HEIGHT * len(rows)
-    if any(names):
-        for j in range(len(rows[0]) - 1):
-            _write_text(
-                figure,
-                right_edges[j],
-                y,
-                names[j % slew_count],
-                size=size,
-                ha="right",
-                colour="#555555",
-            )
-        y += _LINE_HEIGHT
-    for j, heading_text in enumerate([f"{radius:g} m" for radius in table.radii] + ["farthest"]):
-        middle = right_edges[slew_count * j : slew_count * (j + 1)].mean() - (
-            width / 2 - 0.08 if slew_count > 1 else 0.0
-        )
-        _write_text(
-            figure,
-            middle,
-            y,
-            heading_text,
-            size=size,
-            ha="center" if slew_count > 1 else "right",
-            fontweight="bold",
-        )
-    _write_text(figure, right_edges[-1], y, "at [m]", size=size, ha="right", fontweight="bold")
-    return y + _LINE_HEIGHT
+    )
+    axes.axis("off")
+    cells = axes.table(
+        cellText=[[f"{x:g} m", *row] for x, row in zip(table.heights, rows, strict=True)],
+        colLabels=["", *labels, "at [m]"],
+        cellLoc="right",
+        colLoc="right",
+        colWidths=[0.6 / width, *[column_width / width] * count],
+        bbox=(0.0, 0.0, 1.0, 1.0),
+        edges="horizontal",
+    )
+    cells.auto_set_font_size(False)
+    cells.set_fontsize(min(_TEXT_SIZE, 72 * column_width / 4.6))
+    for (row, column), cell in cells.get_celld().items():
+        cell.set(edgecolor=FAINT_COLOUR, linewidth=0.5)
+        cell.PAD = 0.04
+        if row == 0:
+            cell.set_height(2 * cell.get_height())
+        if 0 in (row, column):
+            cell.set_text_props(fontweight="bold")
+    return bottom + height

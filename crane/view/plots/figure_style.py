@@ -28,6 +28,10 @@ FIGURE_FORMATS: dict[str, dict[str, None] | None] = {  # metadata without dates
 }
 DASHED_STYLE: Any = {"color": "#e0701a", "linestyle": (0, (4, 2)), "linewidth": 1.1}
 RECORDED_COLOUR, INK_COLOUR, FAINT_COLOUR = "#1f5fa8", "#333333", "#d4d4d4"
+CURVE_COLOURS = (
+    "#1f5fa8", "#e0701a", "#2a8c4a", "#8a5fb0", "#d9b53f", "#b04a7a", "#3f8f9f", "#9a6b3f",
+    "#7a7a7a", "#6f9bca", "#c2452d", "#333333",
+)  # fmt: skip
 FIGURE_STYLE: Any = {
     "font.family": "DejaVu Sans",
     "font.size": 8.5,

@@ -14,6 +14,7 @@ from crane.recordings.recording_summary import result_title
 from crane.studies.optimization.design_optimization import Design
 from crane.studies.study_table import Study
 from crane.view.plots.figure_style import (
+    CURVE_COLOURS,
     DASHED_STYLE,
     RECORDED_COLOUR,
     add_heading,
@@ -24,7 +25,6 @@ from crane.view.plots.figure_style import (
 _MAX_PANELS = 12  # measures of one picture
 _MAX_SCATTER_ROWS = 6
 _MAX_COLUMNS = 3
-_TASK_COLORS = ("#2a9d6f", "#8a5fb0", "#c2452d", "#7f7f3f", "#3f8f9f")
 _INFEASIBLE_COLOUR = "#d9d9d9"
 
 
@@ -95,14 +95,13 @@ def _draw_curves(axes: Axes, study: Study, name: str) -> None:
     for k, task in enumerate(study.tasks):
         values = study.columns.get(f"{name} {task}")
         if values is not None:
-            color = _TASK_COLORS[k % len(_TASK_COLORS)]
             axes.plot(
                 x,
                 values[order],
                 marker=marker,
                 ms=2.5,
                 lw=1.0,
-                color=color,
+                color=CURVE_COLOURS[2 + k % 10],
                 label=escape_label(task),
             )
     measure_values = study.columns[name][order]

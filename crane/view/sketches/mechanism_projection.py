@@ -290,6 +290,11 @@ class MachineOutline(NamedTuple):
     cylinders: Array
     stationary_hull: Array
 
+    @property
+    def points(self) -> Array:
+        """(k, 2) points of all parts."""
+        return np.concatenate([*self.bodies, self.cylinders.reshape(-1, 2), self.stationary_hull])
+
 
 def machine_outline(
     machine: Machine, frame: str, section: WorkspaceSection, q: Array
