@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from crane.common.errors import InputError, check_name
 from crane.common.samples import Array, as_number
@@ -186,11 +187,7 @@ def gravity_action(machine: Machine) -> FixedUnitAction:
 
 def rotate_about_axis(vectors: Array, axis: Array, angles: Array) -> Array:
     """Rotate vectors (N, 3) by angles (N,) [rad] about a unit vector (3,)."""
-    cosine, sine = np.cos(angles)[:, None], np.sin(angles)[:, None]
-    axial_part = (vectors @ axis)[:, None] * axis
-    return np.asarray(
-        axial_part + cosine * (vectors - axial_part) + sine * np.cross(axis, vectors)
-    )
+    return np.asarray(Rotation.from_rotvec(angles[:, None] * axis).apply(np.array(vectors)))
 
 
 def slew_angles(

@@ -14,11 +14,7 @@ from crane.machine.machine import Machine
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.drive_force_limits import drive_force_limits
 from crane.ratings.limiting_factors import RatingConditions
-from crane.ratings.rating_chart import (
-    RatingChart,
-    compute_chart,
-    configuration_search,
-)
+from crane.ratings.rating_chart import RatingChart, compute_chart
 from crane.ratings.rating_rules import (
     FixedUnitAction,
     PathUnitAction,
@@ -169,7 +165,7 @@ def tool_force(
         InputError: A direction, frame or joint is unknown, nothing limits the force, or the frame
             is not moved by two to four strokes in a plane through the slewing axis.
     """
-    search = configuration_search(machine, frame)
+    search = ConfigurationSearch(machine, frame)
     action, single_joint = _direction_action(search, direction, joint)
     if working is None:
         working = machine.driven_joints if single_joint is None else [single_joint]

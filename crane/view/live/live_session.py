@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.errors import ClosureError, InputError, suggest_names
+from crane.common.errors import ClosureError, InputError, check_name
 from crane.common.samples import Array, as_number
 from crane.dynamics.dynamics import Dynamics
 from crane.machine.machine import Machine
@@ -142,8 +142,7 @@ class Session:
             InputError: The joint is unknown, or the value is not finite or out of range.
         """
         active = self.machine.active
-        if joint not in active:
-            raise InputError(f"'{joint}' is no active joint, {suggest_names(active, joint)}")
+        check_name(joint, active, f"'{joint}' is no active joint")
         index = active.index(joint)
         unit = self.machine.unit(joint)
         value = as_number(value, f"the value of {joint}", unit)
