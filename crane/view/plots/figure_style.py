@@ -96,6 +96,41 @@ def add_heading(figure: Figure, text: str) -> None:
     figure.suptitle(text, x=0.01, ha="left", fontsize=11, fontweight="bold")
 
 
+def create_time_panels(
+    count: int, max_columns: int, width: float, extra_height: float
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure of panels over time, the lowest ones with their label; sizes in inches."""
+    columns = max(min(count, max_columns), 1)
+    rows = max(-(-count // columns), 1)
+    size = (width * columns, 1.9 * rows + extra_height)
+    figure = Figure(figsize=size, layout="constrained")
+    panels = [figure.add_subplot(rows, columns, k + 1) for k in range(count)]
+    for axes in panels[-columns:]:
+        axes.set_xlabel("time [s]")
+    return figure, panels
+
+
+def create_residual_panels(title: str, unit: str, residual_unit: str) -> tuple[Figure, Axes, Axes]:
+    """Return a figure of a quantity over time, with a lower panel for its residual."""
+    figure = Figure(figsize=(5.8, 3.3))
+    grid = {"height_ratios": (2, 1), "left": 0.14, "right": 0.985, "top": 0.9, "bottom": 0.13}
+    upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={**grid, "hspace": 0.12})
+    upper.set_ylabel(unit)
+    upper.set_title(title, loc="left", fontsize=8.5)
+    upper.margins(x=0.0)
+    lower.set(ylabel=f"residual [{residual_unit}]", xlabel="time [s]")
+    for axes in (upper, lower):
+        axes.yaxis.set_label_coords(-0.125, 0.5)
+    return figure, upper, lower
+
+
+def add_residual_legend(axes: Axes, columns: int) -> None:
+    """Add the legend of `create_residual_panels` above its upper panel."""
+    axes.legend(
+        loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=columns, borderpad=0, fontsize=8
+    )
+
+
 def set_round_ticks(axes: Axes, count: int) -> None:
     """Set at most `count` intervals of round lengths on both axes."""
     for axis in (axes.xaxis, axes.yaxis):

@@ -23,6 +23,8 @@ from crane.view.plots.figure_style import (
     FAINT_COLOUR,
     INK_COLOUR,
     RECORDED_COLOUR,
+    add_residual_legend,
+    create_residual_panels,
     envelope,
     escape_label,
     figure_style,
@@ -35,9 +37,7 @@ def force_time_figure(
     comparison: ForceComparison, drive_index: int, unit: str, name: str
 ) -> Figure:
     """Return measured and modelled force of a drive over time, with the residual below."""
-    figure = Figure(figsize=(5.8, 3.3))
-    grid = {"height_ratios": (2, 1), "left": 0.14, "right": 0.985, "top": 0.9, "bottom": 0.13}
-    upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={**grid, "hspace": 0.12})
+    figure, upper, lower = create_residual_panels(name, f"force [{unit}]", unit)
     moving_mask = np.where(comparison.is_moving[:, drive_index], 1.0, np.nan)
     upper.plot(
         *envelope(comparison.time, comparison.measured[:, drive_index]),
@@ -51,19 +51,13 @@ def force_time_figure(
         **{**DASHED_STYLE, "linewidth": 0.9},
         label="model",
     )
-    upper.set_ylabel(f"force [{unit}]")
-    upper.set_title(name, loc="left", fontsize=8.5)
-    upper.legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=2, borderpad=0, fontsize=8)
+    add_residual_legend(upper, 2)
     lower.plot(
         comparison.time,
         comparison.residuals[:, drive_index] * moving_mask,
         color=INK_COLOUR,
         linewidth=0.7,
     )
-    lower.set(ylabel=f"residual [{unit}]", xlabel="time [s]")
-    upper.margins(x=0.0)
-    for axes in (upper, lower):
-        axes.yaxis.set_label_coords(-0.125, 0.5)
     return figure
 
 
@@ -184,8 +178,7 @@ def equation_sides_figure(runs: Mapping[str, EquationSides], unit: str = "m") ->
         axes.set_title(f"{title}: {error}", loc="left", fontsize=9)
         axes.margins(x=0.0)
     rows[-1].set_xlabel("time [s]")
-    handles, labels = rows[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", ncols=3)
+    figure.legend(handles=rows[0].get_lines(), loc="outside upper right", ncols=3)
     return figure
 
 

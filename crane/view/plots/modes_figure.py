@@ -19,6 +19,7 @@ from crane.view.plots.figure_style import (
     INK_COLOUR,
     RECORDED_COLOUR,
     add_heading,
+    create_time_panels,
     escape_label,
     figure_style,
 )
@@ -214,11 +215,8 @@ def sensitivities_figure(sensitivities: Sensitivities) -> Figure:
         if scale * largest > ZERO_TOLERANCE:
             panels.append((output, unit, scale * effects[:, k]))
     panels = panels[:_MAX_PANELS]
-    columns = 2 if len(panels) > 1 else 1
-    rows = max(1, -(-len(panels) // columns))
-    figure = Figure(figsize=(5.6 * columns, 1.9 * rows + 0.9), layout="constrained")
-    for k, (output, unit, values) in enumerate(panels):
-        axes = figure.add_subplot(rows, columns, k + 1)
+    figure, all_axes = create_time_panels(len(panels), 2, 5.6, 0.9)
+    for axes, (output, unit, values) in zip(all_axes, panels, strict=True):
         for i, name in enumerate(sensitivities.parameters):
             axes.plot(
                 sensitivities.recording.time,
@@ -227,11 +225,8 @@ def sensitivities_figure(sensitivities: Sensitivities) -> Figure:
                 label=escape_label(f"{name} + {sensitivities.typical_changes[i]:.3g}"),
             )
         axes.set_title(escape_label(f"{output} [{unit}]"), fontsize=8.5)
-        if k >= len(panels) - columns:
-            axes.set_xlabel("time [s]")
     if panels:
-        handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=3)
+        figure.legend(handles=all_axes[0].get_lines(), loc="outside lower center", ncols=3)
     add_heading(
         figure,
         escape_label(

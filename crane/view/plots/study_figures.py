@@ -74,15 +74,10 @@ def _draw_panels(study: Study, shown_measures: list[str]) -> Figure:
         axes.set(
             title=_column_label(study, name), xlabel=_column_label(study, study.parameters[0])
         )
-    lines = {
-        line.get_label(): line
-        for axes in figure.axes
-        for line in axes.get_lines()
-        if not str(line.get_label()).startswith("_")
-    }
-    if lines:
-        handles, labels = list(lines.values()), [str(label) for label in lines]
-        figure.legend(handles, labels, loc="outside lower center", ncols=min(len(lines), 6))
+    lines = {line.get_label(): line for axes in figure.axes for line in axes.get_lines()}
+    named = [line for label, line in lines.items() if not str(label).startswith("_")]
+    if named:
+        figure.legend(handles=named, loc="outside lower center", ncols=min(len(named), 6))
     return figure
 
 
@@ -263,12 +258,6 @@ def design_figure(result: Design) -> Figure:
             xlabel=escape_label(result.objectives[0]), ylabel=escape_label(result.objectives[1])
         )
     goal = "; ".join(result.objectives)
-    figure.suptitle(
-        escape_label(f"{result.machine.name}: {goal}"),
-        x=0.01,
-        ha="left",
-        fontsize=10,
-        fontweight="bold",
-    )
+    add_heading(figure, escape_label(f"{result.machine.name}: {goal}"))
     figure.tight_layout(rect=(0, 0, 1, 0.97))
     return figure
