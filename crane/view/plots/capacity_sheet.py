@@ -54,8 +54,8 @@ def capacity_sheet_figure(chart: Capacity) -> Figure:
     )
     _write_text(figure, _PAGE_MARGIN, _PAGE_MARGIN, table_note(chart, table), colour="#555555")
     table_top = _draw_table(figure, chart, table, _PAGE_MARGIN + 1.6 * _LINE_HEIGHT)
-    charts_right = _draw_charts(figure, chart, table_top + 0.2, top - _HEADING_HEIGHT)
-    _draw_facts(figure, chart, charts_right, top - _HEADING_HEIGHT)
+    _draw_charts(figure, chart, table_top + 0.2, top - _HEADING_HEIGHT)
+    _draw_facts(figure, chart, top - _HEADING_HEIGHT)
     return figure
 
 
@@ -73,39 +73,37 @@ def _write_text(
     figure.text(x, y, escape_text(text), fontsize=size, color=colour, **options)
 
 
-def _draw_charts(figure: Figure, chart: Capacity, bottom: float, top: float) -> float:
-    """Draw one panel per slew angle, and return the right end of the panels [inch]."""
+def _draw_charts(figure: Figure, chart: Capacity, bottom: float, top: float) -> None:
+    """Draw one panel per slew angle, in as many lines as make them largest."""
     lower, upper = drawing_extent(chart)
-    panel_count, available_width = len(chart.slews), _PAGE_WIDTH - 2 * _PAGE_MARGIN - _FACTS_WIDTH
+    count, width = len(chart.slews), _PAGE_WIDTH - 2 * _PAGE_MARGIN - _FACTS_WIDTH
     aspect = (upper - lower)[1] / (upper - lower)[0]
 
     def panel_width(lines: int) -> float:
-        columns = -(-panel_count // lines)
         return float(
-            min(available_width / columns - 0.55, ((top - bottom) / lines - 0.6) / aspect)
+            min(width / -(-count // lines) - 0.55, ((top - bottom) / lines - 0.6) / aspect)
         )
 
-    lines = max(range(1, panel_count + 1), key=panel_width)
-    columns, best_width = -(-panel_count // lines), panel_width(lines)
-    for k in range(panel_count):
-        row, column = divmod(k, columns)
-        axes = figure.add_axes(
-            (
-                (_PAGE_MARGIN + 0.5 + column * (best_width + 0.55)) / _PAGE_WIDTH,
-                (top - 0.2 - row * (top - bottom) / lines - best_width * aspect) / _PAGE_HEIGHT,
-                best_width / _PAGE_WIDTH,
-                best_width * aspect / _PAGE_HEIGHT,
-            )
-        )
+    lines = max(range(1, count + 1), key=panel_width)
+    grid = figure.add_gridspec(
+        lines,
+        -(-count // lines),
+        left=(_PAGE_MARGIN + 0.5) / _PAGE_WIDTH,
+        right=(_PAGE_MARGIN + width) / _PAGE_WIDTH,
+        bottom=(bottom + 0.4) / _PAGE_HEIGHT,
+        top=(top - 0.2) / _PAGE_HEIGHT,
+        hspace=0.25,
+    )
+    for k in range(count):
+        axes = figure.add_subplot(grid[k], anchor="NW")
         draw_capacity_panel(axes, chart, k)
-        if column:
+        if k % grid.ncols:
             axes.set_ylabel("")
-    return _PAGE_MARGIN + columns * (best_width + 0.55)
 
 
-def _draw_facts(figure: Figure, chart: Capacity, left: float, top: float) -> None:
+def _draw_facts(figure: Figure, chart: Capacity, top: float) -> None:
     """Write conditions and limiting factors, in the colours of the charts."""
-    left, y = left + 0.2, top - 0.1
+    left, y = _PAGE_WIDTH - _PAGE_MARGIN - _FACTS_WIDTH + 0.2, top - 0.1
     line_length = int((_FACTS_WIDTH - 0.2) * 72 / (0.56 * _TEXT_SIZE))
     for name, text in capacity_facts(chart):
         for i, line in enumerate(textwrap.wrap(f"{name}: {text}", line_length)):

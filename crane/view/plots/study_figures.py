@@ -125,12 +125,12 @@ def _draw_curves(axes: Axes, study: Study, name: str) -> None:
         color=DASHED_STYLE["color"],
         label="best",
     )
-    for parameter_value, value in zip(x, measure_values, strict=True):
-        if not np.isfinite(value):  # a cross at the foot
-            axes.plot(
-                [parameter_value], [0.02], "x", ms=4, color="#909090", label="not possible",
-                transform=axes.get_xaxis_transform(),
-            )  # fmt: skip
+    missing = x[~np.isfinite(measure_values)]
+    if len(missing):  # crosses at the foot
+        axes.plot(
+            missing, np.full(len(missing), 0.02), "x", ms=4, color="#909090",
+            label="not possible", transform=axes.get_xaxis_transform(),
+        )  # fmt: skip
 
 
 def _draw_map(figure: Figure, axes: Axes, study: Study, name: str) -> None:

@@ -203,7 +203,7 @@ def draw_check_valve(
     """Draw a check valve, optionally with a spring."""
     _draw_ports(canvas, pose, component, nets, paths, CHECK_HALF_LENGTH, CHECK_HALF_LENGTH)
     canvas.draw_line(pose((0, -CHECK_HALF_LENGTH), (0, -3.8)), linewidth=1.0)
-    canvas.draw_circle(pose.transform_point(0, 0.4), 3.0, gid=component)
+    canvas.draw_circle(pose((0, 0.4))[0], 3.0, gid=component)
     canvas.draw_line(pose((-4.4, 0.4), (0, -3.9), (4.4, 0.4)))
     outlet = pose((0, 3.4), (0, CHECK_HALF_LENGTH))
     if has_spring:
@@ -245,7 +245,7 @@ def draw_rupture_valve(
     """Draw a hose rupture valve."""
     _draw_ports(canvas, pose, component, nets, paths, CHECK_HALF_LENGTH + 2, 6.5)
     canvas.draw_box(*pose((-6, -6.5), (6, 6.5)), gid=component)
-    canvas.draw_circle(pose.transform_point(0, 0.5), 2.2, zorder=3.1)
+    canvas.draw_circle(pose((0, 0.5))[0], 2.2, zorder=3.1)
     canvas.draw_line(pose((-3.4, -2.4), (0, -5.6), (3.4, -2.4)))
     canvas.draw_spring(*pose((0, -1.6), (0, -5.4)), half_width=1.2)
     canvas.draw_line(pose((0, 2.7), (0, 6.5)))
