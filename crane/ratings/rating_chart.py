@@ -197,7 +197,7 @@ def compute_chart(
     values_by_factor = np.full((*shape, len(limits.factors)), np.nan)
     q_a = np.full((*shape, len(machine.active)), np.nan)
     slewing_joint, active = search.section.slewing_joint, machine.closure.active
-    angles = slew_angles(machine, conditions.frame, search.section, slew_coordinates)
+    angles = slew_angles(machine, search.section, slew_coordinates)
     for k, slew_coordinate in enumerate(slew_coordinates):
         evaluate = partial(_values_by_factor, conditions, limits, slew_coordinate, angles[k])
         best, _ = search.select_best(configurations, axes, partial(_smallest_values, evaluate))

@@ -13,7 +13,6 @@ from crane.machine.machine import Machine
 from crane.motion.kinematics import Kinematics
 from crane.motion.workspaces import Workspace
 from crane.motion.workspaces.workspace_extremes import (
-    FrameSectionCoordinates,
     Objective,
     ObjectiveConstraint,
     maximize_on_branch,
@@ -31,6 +30,37 @@ _POSITION_TOLERANCE = 1e-9  # [m]
 _ROUNDING_DIGITS = 12  # decimal places; further ones are rounding errors
 
 Optimum = tuple[float, Array] | None
+
+
+class FrameSectionCoordinates:
+    """Coordinates (u, w) of a frame in the section of a workspace, with derivatives.
+
+    Args:
+        workspace: The workspace.
+        frame: A link.
+    """
+
+    def __init__(self, workspace: Workspace, frame: str):
+        self._section, self._kinematics = workspace.section, Kinematics(workspace.machine, frame)
+
+    def coordinates(self, q: Array) -> Array:
+        """Return the coordinates (N, 2) at configurations (N, nq) [m]."""
+        return self._section.coordinates(self._kinematics.positions_at_configurations(q))
+
+    def coordinate_objective(
+        self, axis: int, sign: float = 1.0, offset: float = 0.0, scale: float = 1.0
+    ) -> Objective:
+        """Return the objective sign (x - offset) / scale of coordinate x, axis 0 or 1."""
+
+        def evaluate(q: Array) -> tuple[float, Array]:
+            position = self._kinematics.position_at_configuration(q)[None]
+            section_jacobian = self._section.section_jacobian(
+                position, self._kinematics.tree_jacobian(q)[None]
+            )
+            coordinate = float(self._section.coordinates(position)[0, axis])
+            return sign * (coordinate - offset) / scale, sign * section_jacobian[0, axis] / scale
+
+        return evaluate
 
 
 def objective_difference(first: Objective, second: Objective) -> Objective:
@@ -79,15 +109,14 @@ class DimensionFinder:
         self._limits = lower, upper = workspace.lower, workspace.upper
         self._lengths = np.where(upper > lower, upper - lower, 1.0)
         self._q = np.concatenate([x.configurations[x.is_closed] for x in workspace.patches])
-        self._lip = self._section_coordinates(workspace.frame)
+        self._lip = FrameSectionCoordinates(workspace, workspace.frame)
         self._size = workspace.machine.closure.characteristic_length
         self._positions = self._lip.coordinates(self._q)
         self._pivot = None
         if bucket_pivot is not None:
-            self._pivot = self._section_coordinates(self._machine.tree.joints[bucket_pivot].child)
-
-    def _section_coordinates(self, frame: str) -> FrameSectionCoordinates:
-        return FrameSectionCoordinates(self._workspace.section, Kinematics(self._machine, frame))
+            self._pivot = FrameSectionCoordinates(
+                workspace, self._machine.tree.joints[bucket_pivot].child
+            )
 
     def find_all(self, level_length: float) -> Iterator[Dimension]:
         """Yield the dimensions that exist, in the order of brochures.
@@ -326,7 +355,7 @@ class DimensionFinder:
         """
         q, size = self._q, self._size
         signed_pins = [
-            (self._section_coordinates(link), sign)
+            (FrameSectionCoordinates(self._workspace, link), sign)
             for link in _front_pin_links(self._machine, self._workspace.frame)
             for sign in (1.0, -1.0)
         ]

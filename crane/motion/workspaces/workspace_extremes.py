@@ -9,10 +9,9 @@ from scipy.optimize import minimize
 
 from crane.common.samples import Array
 from crane.machine.machine import Machine
-from crane.motion.kinematics import Kinematics
 from crane.motion.workspaces.workspace_patch import last_closed_configuration
 from crane.motion.workspaces.workspace_result import SingularCurve, WorkspaceExtreme
-from crane.motion.workspaces.workspace_section import WorkspaceKinematics, WorkspaceSection
+from crane.motion.workspaces.workspace_section import WorkspaceKinematics
 
 Objective = Callable[[Array], tuple[float, Array]]
 ObjectiveConstraint = tuple[str, Objective]  # "eq": value = 0, "ineq": value >= 0
@@ -24,37 +23,6 @@ _CONSTRAINT_TOLERANCE = 1e-9  # of a constraint
 # points on the path to a singular configuration, Newton steps at each
 _CONTINUATION_POINTS, _NEWTON_ITERATIONS = 8, 6
 _MAX_CHORD_DEVIATION = 0.3  # distance from the chord, per length of the path
-
-
-class FrameSectionCoordinates:
-    """Coordinates (u, w) of a frame in the section of a workspace, with derivatives.
-
-    Args:
-        section: The section.
-        kinematics: Kinematics of the frame.
-    """
-
-    def __init__(self, section: WorkspaceSection, kinematics: Kinematics):
-        self._section, self._kinematics = section, kinematics
-
-    def coordinates(self, q: Array) -> Array:
-        """Return the coordinates (N, 2) at configurations (N, nq) [m]."""
-        return self._section.coordinates(self._kinematics.positions_at_configurations(q))
-
-    def coordinate_objective(
-        self, axis: int, sign: float = 1.0, offset: float = 0.0, scale: float = 1.0
-    ) -> Objective:
-        """Return the objective sign (x - offset) / scale of coordinate x, axis 0 or 1."""
-
-        def evaluate(q: Array) -> tuple[float, Array]:
-            position = self._kinematics.position_at_configuration(q)[None]
-            section_jacobian = self._section.section_jacobian(
-                position, self._kinematics.tree_jacobian(q)[None]
-            )
-            coordinate = float(self._section.coordinates(position)[0, axis])
-            return sign * (coordinate - offset) / scale, sign * section_jacobian[0, axis] / scale
-
-        return evaluate
 
 
 def workspace_extremes(
@@ -77,22 +45,30 @@ def workspace_extremes(
     """
     curve_positions = np.concatenate([np.empty((0, 2)), *(x.section_positions for x in curves)])
     curve_q_a = [q_a for curve in curves for q_a in curve.q_a]
-    coordinates = FrameSectionCoordinates(kinematics.section, kinematics.kinematics)
     results, signs = [], ((1.0, "least"), (-1.0, "largest"))
     names = enumerate(kinematics.section.coordinate_names)
     for (axis, name), (sign, adjective) in itertools.product(names, signs):
+
+        def objective(
+            configuration: Array, axis: int = axis, sign: float = sign
+        ) -> tuple[float, Array]:
+            tips = kinematics.tip_positions(configuration[None])
+            tree = kinematics.kinematics.tree_jacobian(configuration)[None]
+            gradient = kinematics.section.section_jacobian(tips, tree)[0, axis]
+            return -sign * float(kinematics.section.coordinates(tips)[0, axis]), -sign * gradient
+
         value, configuration = maximize_on_branch(
             kinematics.machine,
             q[int((sign * section_positions[:, axis]).argmin())],
             kinematics.strokes,
             limits,
-            coordinates.coordinate_objective(axis, -sign),
+            objective,
         )
         value, q_a = -sign * value, configuration[kinematics.machine.closure.active]
-        candidates = np.array([value, *curve_positions[:, axis]])
-        k = int((sign * candidates).argmin())
+        coordinates = np.array([value, *curve_positions[:, axis]])
+        k = int((sign * coordinates).argmin())
         results.append(
-            WorkspaceExtreme(f"{adjective} {name}", float(candidates[k]), [q_a, *curve_q_a][k])
+            WorkspaceExtreme(f"{adjective} {name}", float(coordinates[k]), [q_a, *curve_q_a][k])
         )
     return tuple(results)
 
