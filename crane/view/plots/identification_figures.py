@@ -242,34 +242,30 @@ def draw_friction(axes: Axes, friction: CylinderFriction, unit: str = "m") -> No
 _MAX_POINTS = 2000  # instants that a line needs
 
 
+_MotionRow = tuple[str, Sequence[Array], Sequence[float]]  # label, lines (N,), limits
+
+
 @figure_style
 def excitation_figure(excitation: Excitation) -> Figure:
     """Return the figure of a trajectory; limits are dashed, lead times shaded."""
     machine, reference, bounds = excitation.machine, excitation.trajectory, excitation.limits
     time, q, v, _, tau = (x[:: -(-len(x) // _MAX_POINTS)] for x in excitation.motion())
-    figure, grid = _create_grid(2.4, len(machine.active))
+    columns: dict[str, list[_MotionRow]] = {}
     for i, joint in enumerate(machine.active):
         unit, scale = DISPLAY_UNITS[machine.unit(joint)]
-        force_unit, middle = FORCE_UNITS[machine.unit(joint)], bounds.stroke_middle[i]
         rows = (
-            ("stroke", unit, scale, q, middle, bounds.half_stroke[i]),
-            ("velocity", f"{unit}/s", scale, v, 0.0, bounds.velocity[i]),
-            ("force", force_unit, 1.0, tau, 0.0, bounds.force[i]),
+            (f"stroke [{unit}]", scale, q, bounds.stroke_middle[i], bounds.half_stroke[i]),
+            (f"velocity [{unit}/s]", scale, v, 0.0, bounds.velocity[i]),
+            (f"force [{FORCE_UNITS[machine.unit(joint)]}]", 1.0, tau, 0.0, bounds.force[i]),
         )
-        for axes, (name, label, factor, values, centre, limit) in zip(
-            grid[:, i], rows, strict=True
-        ):
-            lines = [(factor * values[:, i], RECORDED_COLOUR)]
-            limits = [factor * (centre - limit), factor * (centre + limit)]
-            _draw_lines(axes, time, lines, limits, f"{name} [{label}]")
-            axes.axvspan(0, reference.lead, color=FAINT_COLOUR, alpha=0.5)
-            axes.axvspan(
-                reference.duration - reference.lead,
-                reference.duration,
-                color=FAINT_COLOUR,
-                alpha=0.5,
-            )
-        grid[0, i].set_title(escape_label(joint))
+        columns[joint] = [
+            (label, [factor * x[:, i]], (factor * (centre - limit), factor * (centre + limit)))
+            for label, factor, x, centre, limit in rows
+        ]
+    figure = _motion_figure(time, columns, 2.4)
+    for axes in figure.axes:
+        for start in (0, reference.duration - reference.lead):
+            axes.axvspan(start, start + reference.lead, color=FAINT_COLOUR, alpha=0.5)
     return figure
 
 
@@ -278,45 +274,34 @@ def signals_figure(excitation: SignalExcitation) -> Figure:
     """Return the figure of valve signals: signal, stroke with dashed limits, pressures."""
     run, machine = excitation.run.columns(), excitation.machine
     bar, per_bar = display_unit("Pa", 1e5)
-    figure, grid = _create_grid(3.0, len(excitation.signals))
-    for i, joint in enumerate(excitation.signals):
+    columns: dict[str, list[_MotionRow]] = {}
+    for joint in excitation.signals:
         unit, scale = DISPLAY_UNITS[machine.unit(joint)]
         index = machine.active.index(joint)
         limits = scale * machine.lower[index], scale * machine.upper[index]
-        rows = (
-            ("signal [V]", 1.0, [f"voltage_{joint}"], ()),
-            (f"stroke [{unit}]", scale, [joint], limits),
-            (f"pressures A, B [{bar}]", per_bar, [f"pressure_{joint}_{x}" for x in "ab"], ()),
-        )
-        for axes, (label, factor, names, dashed) in zip(grid[:, i], rows, strict=True):
-            colours = zip(names, (RECORDED_COLOUR, "#2a8c4a"), strict=False)
-            lines = [(factor * run[name], colour) for name, colour in colours]
-            _draw_lines(axes, excitation.run.time, lines, dashed, label)
-        grid[0, i].set_title(escape_label(joint))
+        pressures = [per_bar * run[f"pressure_{joint}_{side}"] for side in "ab"]
+        columns[joint] = [
+            ("signal [V]", [run[f"voltage_{joint}"]], ()),
+            (f"stroke [{unit}]", [scale * run[joint]], limits),
+            (f"pressures A, B [{bar}]", pressures, ()),
+        ]
+    return _motion_figure(excitation.run.time, columns, 3.0)
+
+
+def _motion_figure(
+    time: Array, columns: Mapping[str, Sequence[_MotionRow]], panel_width: float
+) -> Figure:
+    """Return a figure with a column per joint, whose rows have finite limits dashed."""
+    figure = Figure(figsize=(panel_width * len(columns) + 0.6, 6.0), layout="constrained")
+    grid = figure.subplots(3, len(columns), sharex=True, squeeze=False)
+    for panels, (joint, rows) in zip(grid.T, columns.items(), strict=True):
+        panels[0].set_title(escape_label(joint))
+        panels[-1].set_xlabel("time [s]")
+        for axes, (label, lines, limits) in zip(panels, rows, strict=True):
+            for values, colour in zip(lines, (RECORDED_COLOUR, "#2a8c4a"), strict=False):
+                axes.plot(time, values, color=colour)
+            for limit in filter(np.isfinite, limits):
+                axes.axhline(limit, **DASHED_STYLE)
+            axes.set_ylabel(label)
+            axes.margins(x=0.0)
     return figure
-
-
-def _create_grid(panel_width: float, columns: int) -> tuple[Figure, Any]:
-    """Return a figure with three rows of panels over time."""
-    figure = Figure(figsize=(panel_width * columns + 0.6, 6.0), layout="constrained")
-    grid = figure.subplots(3, columns, sharex=True, squeeze=False)
-    for axes in grid[-1]:
-        axes.set_xlabel("time [s]")
-    return figure, grid
-
-
-def _draw_lines(
-    axes: Axes,
-    time: Array,
-    lines: Sequence[tuple[Array, str]],
-    limits: Sequence[float],
-    label: str,
-) -> None:
-    """Draw lines (N,) in their colours, and finite limits dashed."""
-    for values, colour in lines:
-        axes.plot(time, values, color=colour)
-    for limit in limits:
-        if np.isfinite(limit):
-            axes.axhline(limit, **DASHED_STYLE)
-    axes.set_ylabel(label)
-    axes.margins(x=0.0)

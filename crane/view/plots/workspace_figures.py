@@ -2,7 +2,6 @@
 
 import string
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -284,8 +283,8 @@ def working_range_figure(result: WorkingRange) -> Figure:
     for dimension in result.dimensions:
         if "level bottom" in dimension.name:
             u, w = dimension.section_position
-            style: Any = {"color": DASHED_STYLE["color"], "linewidth": 1.8, "zorder": 6}
-            axes.plot([u, u + result.level_length], [w, w], **style)
+            ends = [u, u + result.level_length]
+            axes.plot(ends, [w, w], color=DASHED_STYLE["color"], linewidth=1.8, zorder=6)
     names = reach.section.coordinate_names
     axes.set(xlim=(lower[0] - gap, right), ylim=(bottom, top), aspect="equal",
              xlabel=f"{names[0]} [m]", ylabel=f"{names[1]} [m]")  # fmt: skip
@@ -303,8 +302,10 @@ def _draw_region(axes: Axes, reach: Workspace, line_width: float) -> None:
     raster = reach.raster
     covered = raster.fill_cracks(2 if reach.is_complete else 6)
     axes.contourf(raster.u, raster.w, covered, [0.5, 1.5], colors=[_REGION_COLOUR], zorder=1)
-    style: Any = {"colors": [RECORDED_COLOUR], "linewidths": line_width, "zorder": 3}
-    axes.contour(raster.u, raster.w, covered, [0.5], **style)
+    axes.contour(
+        raster.u, raster.w, covered, [0.5], colors=[RECORDED_COLOUR], linewidths=line_width,
+        zorder=3,
+    )  # fmt: skip
 
 
 def _draw_vertical_lines(
@@ -315,13 +316,12 @@ def _draw_vertical_lines(
     Dimensions above and below ground share a line, the shortest first.
     """
     counts = {False: 0, True: 0}
-    for letter, dimension in sorted(letters.items(), key=lambda item: item[1].value):
-        if any(word in dimension.name for word in _VERTICAL_WORDS):
-            position = dimension.section_position
-            is_above = bool(position[1] > ground)
-            counts[is_above] += 1
-            u = right + gap * counts[is_above]
-            _draw_dimension_line(axes, letter, (u, ground), (u, position[1]), position)
+    for letter, dimension in _shortest_first(letters, is_vertical=True):
+        position = dimension.section_position
+        is_above = bool(position[1] > ground)
+        counts[is_above] += 1
+        u = right + gap * counts[is_above]
+        _draw_dimension_line(axes, letter, (u, ground), (u, position[1]), position)
     return right + gap * (max(counts.values()) + 0.7)
 
 
@@ -330,19 +330,28 @@ def _draw_horizontal_lines(
 ) -> tuple[float, float]:
     """Draw lines below and above the reach, and return the vertical limits of the drawing."""
     heights = {False: bottom, True: top}
-    has_lines = False
-    for letter, dimension in sorted(letters.items(), key=lambda item: item[1].value):
-        if not any(word in dimension.name for word in _VERTICAL_WORDS):
-            is_above, position = "slewing" in dimension.name, dimension.section_position
-            has_lines = True
-            heights[is_above] += gap if is_above else -gap
-            w = heights[is_above]
-            _draw_dimension_line(axes, letter, (0.0, w), (position[0], w), position)
+    lines = _shortest_first(letters, is_vertical=False)
+    for letter, dimension in lines:
+        is_above, position = "slewing" in dimension.name, dimension.section_position
+        heights[is_above] += gap if is_above else -gap
+        w = heights[is_above]
+        _draw_dimension_line(axes, letter, (0.0, w), (position[0], w), position)
     limits = heights[False] - gap, heights[True] + gap
-    if has_lines:
-        style: Any = {"color": _LINE_COLOUR, "linewidth": 0.8, "linestyle": (0, (8, 2, 1, 2))}
-        axes.plot([0, 0], limits, zorder=2, **style)
+    if lines:
+        dashes = (0, (8, 2, 1, 2))
+        axes.plot([0, 0], limits, zorder=2, color=_LINE_COLOUR, linewidth=0.8, linestyle=dashes)
     return limits
+
+
+def _shortest_first(
+    letters: Mapping[str, Dimension], is_vertical: bool
+) -> list[tuple[str, Dimension]]:
+    """Return the vertical or the horizontal dimensions with their letters."""
+    return [
+        (letter, dimension)
+        for letter, dimension in sorted(letters.items(), key=lambda item: item[1].value)
+        if any(word in dimension.name for word in _VERTICAL_WORDS) == is_vertical
+    ]
 
 
 def _draw_dimension_line(
