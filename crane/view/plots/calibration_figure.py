@@ -167,6 +167,7 @@ _MAX_COLUMNS = 3
 _MAX_POINTS = 4000  # instants that a line needs
 
 
+@figure_style
 def comparison_figure(comparison: Comparison) -> Figure:
     """Return the figure of a comparison, a panel per channel.
 
