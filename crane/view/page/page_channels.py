@@ -244,14 +244,16 @@ def page_columns(machine: Machine, recording: Recording) -> Iterator[PageColumn]
         group, label = _group_and_label(machine, name, unit)
         yield PageColumn(name, group, label, unit, values, reference(name))
         if name == "potential" and unit == units.get("kinetic") == "J":
-            kinetic, potential, total = channels["kinetic"], values, "kinetic + potential"
-            energy = compute_in_blocks(
-                lambda part, a=kinetic, b=potential: (a[part] + b[part])[:, None], len(values)
-            )
-            yield PageColumn(total, group, total, unit, energy[:, 0])
+            total = "kinetic + potential"
+            energy = _sum_blockwise(channels["kinetic"], values)
+            yield PageColumn(total, group, total, unit, energy)
     for name, values in channels.items():
         if name.startswith(REFERENCE_PREFIX) and name not in used_references:
             yield PageColumn(name, "Other", name, units[name], values)
+
+
+def _sum_blockwise(first: Array, second: Array) -> Array:
+    return compute_in_blocks(lambda part: (first[part] + second[part])[:, None], len(first))[:, 0]
 
 
 def _group_and_label(machine: Machine, name: str, unit: str) -> tuple[str, str]:

@@ -151,7 +151,7 @@ def _draw_table(figure: Figure, chart: Capacity, table: LoadTable, bottom: float
         cellLoc="right",
         colLoc="right",
         colWidths=[0.6 / width, *[column_width / width] * count],
-        bbox=(0.0, 0.0, 1.0, 1.0),
+        bbox=(0.0, 0.0, 1.0, 1.0),  # type: ignore[arg-type]
         edges="horizontal",
     )
     cells.auto_set_font_size(False)

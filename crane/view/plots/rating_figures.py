@@ -235,7 +235,8 @@ def _draw_contours(axes: Axes, chart: Capacity, k: int) -> None:
 
     axes.apply_aspect()
     style: Any = {"fmt": format_level, "fontsize": _LABEL_SIZE}
-    positions, boxes = [], []
+    positions: list[tuple[float, float]] = []
+    boxes: list[Any] = []
     for draft in axes.clabel(lines, inline=False, **style):
         box = draft.get_window_extent()
         if not box.count_overlaps(boxes):
