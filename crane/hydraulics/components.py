@@ -387,7 +387,7 @@ def _check_spool(spool: Spool | Valve, label: str) -> None:
     """Check the parameters of a spool.
 
     Raises:
-        ComponentParameterError: One is invalid.
+        CircuitParameterError: One is invalid.
     """
     dead_band = spool.dead_band
     is_percent = 1 <= abs(dead_band) < 100

@@ -8,7 +8,7 @@ import numpy as np
 
 from crane.codegen import Layout, LayoutView
 from crane.common import scratch_arrays
-from crane.common.errors import CraneError, RecordingError, format_one_line, suggest_names
+from crane.common.errors import CraneError, RecordingError, check_name, format_one_line
 from crane.common.one_line_repr import shorten_to_line
 from crane.common.samples import MAX_QUANTITY, Array
 from crane.control.control_law import Controller, ZeroForce, controller_reference
@@ -295,11 +295,7 @@ def recorded_columns(machine: Machine, table: Table, recording: Recording) -> li
     Raises:
         RecordingError: As for `simulated_columns`.
     """
-    units = recording.units | recording.channel_units
-    units |= {x + VELOCITY_SUFFIX: VELOCITY_UNITS[unit] for x, unit in recording.units.items()}
-    driven = (x for x in recording.joints if x not in recording.free)
-    units |= {x + FORCE_SUFFIX: FORCE_UNITS[recording.units[x]] for x in driven}
-    return _select_columns(machine, table, units)
+    return _select_columns(machine, table, recording.column_units())
 
 
 def _select_columns(machine: Machine, table: Table, units: Mapping[str, str]) -> list[str]:
@@ -313,10 +309,8 @@ def _select_columns(machine: Machine, table: Table, units: Mapping[str, str]) ->
             wanted = quantity_unit(machine.tree, name)
             if wanted is None:
                 link = name.removeprefix(INCLINATION_PREFIX).removesuffix(VELOCITY_SUFFIX)
-                links = machine.tree.links
-                raise RecordingError(
-                    f"column '{name}' is of no link, {suggest_names(links, link)}"
-                )
+                problem = f"column '{name}' is of no link"
+                check_name(link, machine.tree.links, problem, RecordingError)
         if wanted is not None:
             check_unit(name, unit, accepted_units(wanted))
             if not name.startswith(_INPUT_PREFIXES):

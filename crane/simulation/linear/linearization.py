@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.errors import CraneWarning, InputError, suggest_names
+from crane.common.errors import CraneWarning, InputError, check_name
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_samples
 from crane.description.machine_parameters import unknown_parameter_text
@@ -52,8 +52,6 @@ class LinearizedExternalForces:
 
     def active_forces(self, q_a: Array, v_a: Array) -> Array:
         """gamma^T J^T w (n,)."""
-        if not self._has_forces:
-            return np.zeros(len(q_a))
         q = self._closure.solve(q_a)
         gamma = self._closure.gamma(q)
         return np.asarray(
@@ -119,10 +117,8 @@ def linearize(
     """
     if not isinstance(machine, Machine):
         machine = load(machine)
-    if drive not in (None, "valves", "forces"):
-        raise InputError(
-            f"drive '{drive}' is unknown, {suggest_names(('valves', 'forces'), drive)}"
-        )
+    if drive is not None:
+        check_name(drive, ("valves", "forces"), f"drive '{drive}' is unknown")
     valves = machine.hydraulics is not None if drive is None else drive == "valves"
     if valves and machine.hydraulics is None:
         raise InputError(f"'{machine.name}' has no valves, take the drive 'forces'")
@@ -292,8 +288,7 @@ def _select_outputs(
         outputs |= {name: (row, 0.0, unit) for (name, unit), row in inputs}
     names = default_names if names is None else list(names)
     for name in names:
-        if name not in outputs:
-            raise InputError(f"output '{name}' is unknown, {suggest_names(outputs, name)}")
+        check_name(name, outputs, f"output '{name}' is unknown")
     matrix = np.array([outputs[name][0] for name in names]).reshape(len(names), -1)
     y = np.array([outputs[name][1] for name in names], dtype=np.float64)
     return matrix[:, :size], matrix[:, size:], y, {name: outputs[name][2] for name in names}
@@ -309,9 +304,6 @@ def _values_by_joint(
         return as_samples(specified, len(default), label, machine.active).astype(np.float64)
     out = default.copy()
     for joint, value in specified.items():
-        if joint not in machine.active:
-            raise InputError(
-                f"{label}: '{joint}' is no active joint, {suggest_names(machine.active, joint)}"
-            )
+        check_name(joint, machine.active, f"{label}: '{joint}' is no active joint")
         out[machine.active.index(joint)] = float(value)
     return out
