@@ -124,7 +124,9 @@ def opening_per_velocity(
     inlet, inlet_area, outlet, outlet_area = edges
     inlet_drop = np.maximum(np.minimum(drop, valve.margin or np.inf), MIN_PRESSURE_DROP)
     by_inlet = inlet_area / (inlet * np.sqrt(inlet_drop))
-    load_pressure = np.maximum(np.maximum(-force, 0.0) / outlet_area, MIN_PRESSURE_DROP)
+    load_pressure = np.maximum(
+        np.maximum(np.negative(force), 0.0) / outlet_area, MIN_PRESSURE_DROP
+    )
     by_outlet = outlet_area / (outlet * np.sqrt(load_pressure))
     return np.where(np.less(force, 0.0), np.minimum(by_inlet, by_outlet), by_inlet)
 

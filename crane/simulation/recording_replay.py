@@ -10,8 +10,8 @@ import numpy as np
 from crane.common.errors import (
     CraneWarning,
     RecordingError,
+    check_name,
     prefix_location,
-    suggest_names,
 )
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.progress import progress_reporter
@@ -259,8 +259,7 @@ def _spool_signals(machine: Machine, spools: Sequence[str], table: Table) -> dic
         spool = name.removeprefix(VALVE_SIGNAL_PREFIX)
         if spool in machine.locked_joints or spool.removesuffix("_b") in machine.locked_joints:
             continue  # the valve of a locked joint has no effect
-        if spool not in spools:
-            raise RecordingError(f"column '{name}' is of no valve, {suggest_names(spools, spool)}")
+        check_name(spool, spools, f"column '{name}' is of no valve", RecordingError)
         signals[spool] = table_column(table, name, "V")
     if not signals:
         names = ", ".join(f"'{VALVE_SIGNAL_PREFIX}{joint} [V]'" for joint in spools)
@@ -374,9 +373,5 @@ def _value_at_first_sample(time: Array, x: Array, order: int) -> float:
 
 def _fit_parabola(time: Array, x: Array, order: int) -> tuple[float, float]:
     """Value or rate of a parabola at the first instant, and its standard deviation."""
-    A = np.vander(time - time[0], 3)
-    values, *_ = np.linalg.lstsq(A, x, rcond=None)
-    std = np.sqrt(
-        (float(np.sum((x - A @ values) ** 2)) / (len(x) - 3)) * np.diag(np.linalg.pinv(A.T @ A))
-    )
-    return float(values[2 - order]), float(std[2 - order])
+    values, covariance = np.polyfit(time - time[0], x, 2, cov=True)
+    return float(values[2 - order]), float(np.sqrt(covariance[2 - order, 2 - order]))

@@ -16,8 +16,8 @@ from crane.common.errors import (
     CraneWarning,
     InputError,
     SimulationError,
+    check_name,
     is_one_line,
-    suggest_names,
 )
 from crane.common.progress import progress_reporter
 from crane.common.samples import as_number
@@ -329,14 +329,10 @@ def integrator_factory(
     Raises:
         InputError: The method is unknown or does not support the machine.
     """
-    valves, method = (
-        isinstance(control, ValveDrive),
-        requested_method or _default_method(dynamics, control),
-    )
-    if method not in ("rk4", "rosenbrock", *SCIPY_METHODS):
-        hint = suggest_names(("rk4", "rosenbrock", *SCIPY_METHODS), method)
-        raise InputError(f"method '{method}' is unknown, {hint}")
-    if isinstance(control, ValveDrive) and control.period and method != "rosenbrock":
+    drive = control if isinstance(control, ValveDrive) else None
+    method = requested_method or _default_method(dynamics, control)
+    check_name(method, ("rk4", "rosenbrock", *SCIPY_METHODS), f"method '{method}' is unknown")
+    if drive is not None and drive.period and method != "rosenbrock":
         raise InputError(
             f"method '{method}' does not call the valves' program, leave the method out"
         )
@@ -356,22 +352,21 @@ def integrator_factory(
             )
     if method == "rk4":
         return lambda chart: FixedStepIntegrator(chart, control, controller_state_count)
-    stepper_factory = (
-        _COMPILED_METHODS.get(method) if not valves or method == "rosenbrock" else None
-    )
+    stepper_factory = None
+    if drive is None or method == "rosenbrock":
+        stepper_factory = _COMPILED_METHODS.get(method)
 
     def make(chart: Chart) -> StickSlipIntegrator:
         """A compiled integrator, or one of scipy where the formulas cannot be compiled."""
-        compiled = stepper_factory is not None and chart.dynamics.backend == "compiled"
-        if compiled and isinstance(control, ControlLaw):
-            assert stepper_factory is not None
+        compiled = chart.dynamics.backend == "compiled"
+        if compiled and stepper_factory is not None and isinstance(control, ControlLaw):
             with suppress(FormulaTooLongError):
                 return ErrorControlledIntegrator(
                     chart, control, controller_state_count, partial(stepper_factory, **options)
                 )
-        if isinstance(control, ValveDrive) and control.period:
+        if drive is not None and drive.period:
             raise InputError("a program with a period runs on the compiled backend alone")
-        if requested_method is None and not valves:
+        if requested_method is None and drive is None:
             return FixedStepIntegrator(chart, control, controller_state_count)
         if chart.machine.coordinates.rotation_columns:
             raise InputError("scipy's methods do not limit rotation vectors to pi, take rk4")

@@ -8,7 +8,7 @@ import numpy as np
 from crane.codegen import Tape
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.control.control_law import ControlLaw, Controller, ControllerInputs
+from crane.control.control_law import ControlLaw, Controller
 from crane.control.valve_drive import ValveDrive
 from crane.simulation.integration.charts import (
     MAX_MOTION_PER_STEP,
@@ -25,7 +25,7 @@ from crane.simulation.integration.charts import (
     row_layout,
 )
 from crane.simulation.integration.integrators import StickSlipIntegrator
-from crane.simulation.integration.machine_formulas import raise_undetermined
+from crane.simulation.integration.machine_formulas import raise_undetermined, trace_law
 from crane.simulation.integration.python_stepper import IntegrationHaltError, StepProgress
 from crane.simulation.integration.run_notes import RunNotes
 
@@ -380,17 +380,11 @@ class ChartSwitchingIntegrator:
     @property
     def _uses_inverse_dynamics(self) -> bool:
         """Whether the controller uses inverse dynamics or gravity in coordinates of the user."""
-        control, n, tape = self._control, len(self._chart.user_columns), Tape()
+        control, k = self._control, self._row_layout.parts["controller"]
         if isinstance(control, ValveDrive) or not isinstance(control, ControlLaw):
             return False
-        columns = control.references(np.zeros(1)).shape[1]
-        sizes = n, n, self._row_layout.parts["controller"], len(control.settings), columns
-        q_a, v_a, state, settings, reference = (
-            tape.load_vector(i, 0, size) for i, size in enumerate(sizes)
-        )
-        functions = raise_undetermined, raise_undetermined
         try:
-            control.law(ControllerInputs(q_a, v_a, state, settings, reference, *functions))
+            trace_law(control, self._chart, k, Tape(), (raise_undetermined, raise_undetermined))
         except InputError:
             return True
         return False

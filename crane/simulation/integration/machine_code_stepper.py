@@ -98,9 +98,7 @@ class MachineCodeStepper:
         self.output_layout = output_layout(machine, control)
         key = (
             *method,
-            controller_formula_key(
-                control, self.controller_columns, chart, controller_state_count, fold_settings
-            ),
+            controller_formula_key(control, chart, controller_state_count, fold_settings),
             controller_state_count,
             bool(machine.supports),
             *chart.formula_key,

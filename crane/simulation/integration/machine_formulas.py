@@ -209,12 +209,42 @@ def wrap_rotations(chart: Chart, state: Sequence[Scalar]) -> list[Scalar]:
     return out
 
 
-def controller_formula_key(
+LawResult = tuple[ControllerInputs, Sequence[Scalar], Sequence[Scalar]]
+"""Inputs, forces (n,), and rates (k,) of a traced control law."""
+
+
+def trace_law(
     control: ControlLaw,
-    reference_columns: int,
     chart: Chart,
     controller_state_count: int,
-    fold_settings: bool,
+    tape: Tape,
+    functions: tuple[Callable[..., list[Scalar]], Callable[..., list[Scalar]]],
+    fold_settings: bool = False,
+) -> LawResult:
+    """Trace a control law without the machine.
+
+    Args:
+        control: The law.
+        chart: The machine in a chart.
+        controller_state_count: Number of states of the controller.
+        tape: The tape; coordinates, velocities, states, settings and references are its arguments.
+        functions: Inverse dynamics and gravity, see `ControllerInputs`.
+        fold_settings: Whether zeros and ones among the settings become part of the formulas.
+    """
+    n = len(chart.user_columns)
+    inputs = ControllerInputs(
+        tape.load_vector(0, 0, n),
+        tape.load_vector(1, 0, n),
+        tape.load_vector(2, 0, controller_state_count),
+        controller_settings(control, tape, 3, fold_settings),
+        tape.load_vector(4, 0, reference_count(control)),
+        *functions,
+    )
+    return inputs, *control.law(inputs)
+
+
+def controller_formula_key(
+    control: ControlLaw, chart: Chart, controller_state_count: int, fold_settings: bool
 ) -> Hashable:
     """Formulas of a controller as a key, so that equal ones share their machine code.
 
@@ -223,7 +253,6 @@ def controller_formula_key(
 
     Args:
         control: The controller.
-        reference_columns: Number of its references.
         chart: The machine in a chart.
         controller_state_count: Number of states of the controller.
         fold_settings: Whether zeros and ones among the settings become part of the formulas.
@@ -239,16 +268,10 @@ def controller_formula_key(
         requested_accelerations.extend([*a_a, float(friction)])
         return forces
 
-    inputs = ControllerInputs(
-        q_a=tape.load_vector(0, 0, n),
-        v_a=tape.load_vector(1, 0, n),
-        state=tape.load_vector(2, 0, controller_state_count),
-        settings=controller_settings(control, tape, 3, fold_settings),
-        reference=tape.load_vector(4, 0, reference_columns),
-        inverse=inverse,
-        gravity=lambda: tape.load_vector(6, 0, n),
+    functions = inverse, lambda: tape.load_vector(6, 0, n)
+    inputs, tau, rates = trace_law(
+        control, chart, controller_state_count, tape, functions, fold_settings
     )
-    tau, rates = control.law(inputs)
     if (len(tau), len(rates)) != (n, controller_state_count):
         raise InputError(
             f"the law of {type(control).__name__} gives {len(tau)} forces and {len(rates)} rates, "
@@ -263,7 +286,7 @@ def controller_formula_key(
         for part in (tau, rates, channels, requested_accelerations)
     ]
     # as text, in which the constant 2.0 and operation number 2 differ
-    return repr((reference_columns, len(control.settings), tape.operations, outputs))
+    return repr((len(inputs.reference), len(control.settings), tape.operations, outputs))
 
 
 def machine_program(
@@ -284,14 +307,11 @@ def machine_program(
         FormulaTooLongError: The formulas are too long to be compiled.
     """
     closure = machine.closure.compiled_closure
+    parts = (control, getattr(control, "command", control), *machine.external_forces)
+    if all(type(part).__module__.startswith("crane.") for part in parts):
+        return closure.cached_program(key, build)
     if key not in closure.programs:
-        parts: list[object] = [control, *machine.external_forces]
-        if isinstance(control, ValveDrive):
-            parts.append(control.command)
-        if all(type(part).__module__.startswith("crane.") for part in parts):
-            closure.programs[key] = closure.cached_program(key, build)
-        else:
-            closure.programs[key] = Program.from_cache(None, build)
+        closure.programs[key] = Program.from_cache(None, build)
     return closure.programs[key]
 
 

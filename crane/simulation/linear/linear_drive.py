@@ -242,9 +242,7 @@ class LinearizedDrive:
         def build(program: Program) -> None:
             program.add_formula("formula", 2, {"values": values, "slopes": derivative_values})
 
-        if key not in compiled_closure.programs:
-            compiled_closure.programs[key] = compiled_closure.cached_program(key, build)
-        return compiled_closure.programs[key]
+        return compiled_closure.cached_program(key, build)
 
     def evaluate(
         self, q_a: Array, v_a: Array, states: Array, inputs: Array

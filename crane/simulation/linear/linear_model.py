@@ -257,11 +257,12 @@ class LinearModel(Result):
         }
         values |= {name: getattr(self, name) for name in ("A", "B", "C", "D", "x", "u", "y")}
         values["rate"] = self.rate
-        with replace_file(path) as part, open(part, "wb") as file:
+        with replace_file(path) as part:
             if path.suffix == ".mat":
                 from scipy.io import savemat
 
-                savemat(file, values)
+                savemat(str(part), values, appendmat=False)
             else:
-                np.savez(file, **values)
+                with open(part, "wb") as file:
+                    np.savez(file, **values)
         return path

@@ -97,8 +97,7 @@ class RateProgram:
         self._mobility = len(machine.active)
         self._state_layout = state_layout(machine, controller_state_count)
         self.state_size = 2 * self._mobility + stiff_state_count
-        self._controller_columns = reference_count(control)
-        self._reference_columns = self._controller_columns + sum(
+        self._reference_columns = reference_count(control) + sum(
             reference_counts(machine.external_forces)
         )
         self._frames = observed_frames(machine, outputs)
@@ -112,9 +111,7 @@ class RateProgram:
             for is_variable, part in zip(variable_constants, constants, strict=False)
         )
         self._folded_constants = geometry, dynamics_constants
-        form = controller_formula_key(
-            control, self._controller_columns, chart, controller_state_count, True
-        )
+        form = controller_formula_key(control, chart, controller_state_count, True)
         key = (
             type(self).__name__,
             form,
