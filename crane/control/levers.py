@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from crane.codegen import Scalar
 from crane.common.errors import ClosureError, InputError, SimulationError, check_name
 from crane.common.one_line_repr import OneLineRepr
-from crane.common.samples import Array, as_number, as_sample
+from crane.common.samples import Array, as_sample
 from crane.control.control_law import ControllerInputs
 from crane.control.valve_commands import (
     SampledCommand,
@@ -20,6 +20,7 @@ from crane.control.valve_commands import (
     opening_per_velocity,
     require_circuit,
 )
+from crane.description.force_elements import as_nonnegative_number
 from crane.description.specification import DEFAULT_RAMP_TIME, Phase
 from crane.machine.machine import Machine
 from crane.motion.kinematics import Kinematics
@@ -81,9 +82,7 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
             for _, _, problem in phase.find_problems(circuit.joints, limits, start_positions):
                 raise InputError(problem)
             start_positions |= phase.until
-        self._ramp = as_number(ramp, "the ramp of the levers", "s")
-        if self._ramp < 0:
-            raise InputError(f"the ramp of the levers is {ramp:g} s, give at least 0")
+        self._ramp = as_nonnegative_number(ramp, "the ramp of the levers", "s")
         self._phases, self._spools = tuple(phases), tuple(circuit.spools.values())
         self._machine, self._joints = machine, circuit.joints
         self._columns = {x: int(machine.column(x)) for x in circuit.joints}

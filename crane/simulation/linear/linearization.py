@@ -24,54 +24,44 @@ from crane.simulation.linear.trim import find_trim
 _DIFFERENCE_STEP = 2e-4  # in coordinate units: nine digits remain
 
 
-class LinearizedExternalForces:
-    """External forces of a machine along its active joints at time 0.
+def external_force_derivatives(machine: Machine, q_a: Array, v_a: Array) -> tuple[Array, Array]:
+    """External forces along the active joints at time 0, and their derivatives.
 
-    Forces with states (`ExternalForce.state_count`) are left out, with a warning.
+    The derivatives are differences of fourth order. Forces with states
+    (`ExternalForce.state_count`) are left out, with a warning.
 
     Args:
         machine: The machine.
+        q_a: (n,) active coordinates.
+        v_a: (n,) active velocities.
+
+    Returns:
+        gamma^T J^T w (n,), and its derivatives (n, 2 n) by q_A and v_A.
     """
-
-    def __init__(self, machine: Machine):
-        memoryless = [force for force in machine.external_forces if not force.state_count]
-        excluded_names = [force.name for force in machine.external_forces if force.state_count]
-        if excluded_names:
-            warnings.warn(
-                f"{machine.name}: forces that remember their way have no linear model, left out: "
-                f"{', '.join(excluded_names)}",
-                CraneWarning,
-                stacklevel=3,
-            )
-        self._closure, self._has_forces = machine.closure, bool(memoryless)
-        self._forces = ExternalForces(machine, memoryless)
-        units = self._closure.units[self._closure.active]
-        self._steps = (
-            np.concatenate([units, units / self._closure.characteristic_time]) * _DIFFERENCE_STEP
+    memoryless = [force for force in machine.external_forces if not force.state_count]
+    excluded_names = [force.name for force in machine.external_forces if force.state_count]
+    if excluded_names:
+        warnings.warn(
+            f"{machine.name}: forces that remember their way have no linear model, left out: "
+            f"{', '.join(excluded_names)}",
+            CraneWarning,
+            stacklevel=3,
         )
+    closure, forces, n = machine.closure, ExternalForces(machine, memoryless), len(q_a)
 
-    def active_forces(self, q_a: Array, v_a: Array) -> Array:
-        """gamma^T J^T w (n,)."""
-        q = self._closure.solve(q_a)
-        gamma = self._closure.gamma(q)
-        return np.asarray(
-            gamma.T
-            @ self._forces.generalized_forces(0.0, q, gamma @ v_a, np.zeros(0)).generalized_forces
-        )
+    def active_forces(x: Array) -> Array:
+        q = closure.solve(x[:n])
+        gamma = closure.gamma(q)
+        applied = forces.generalized_forces(0.0, q, gamma @ x[n:], np.zeros(0))
+        return np.asarray(gamma.T @ applied.generalized_forces)
 
-    def jacobian(self, q_a: Array, v_a: Array) -> Array:
-        """Derivatives (n, 2 n) by q_A and v_A, by differences of fourth order."""
-        n, x = len(q_a), np.concatenate([q_a, v_a])
-        derivatives = np.zeros((n, 2 * n))
-        for i, step in enumerate(self._steps if self._has_forces else ()):
-            displacement = step * np.eye(2 * n)[i]
-
-            def force(steps: int, displacement: Array = displacement) -> Array:
-                displaced = x + steps * displacement
-                return self.active_forces(displaced[:n], displaced[n:])
-
-            derivatives[:, i] = (8 * (force(1) - force(-1)) - (force(2) - force(-2))) / (12 * step)
-        return derivatives
+    x, derivatives = np.concatenate([q_a, v_a]), np.zeros((n, 2 * n))
+    units = closure.units[closure.active]
+    steps = _DIFFERENCE_STEP * np.concatenate([units, units / closure.characteristic_time])
+    for i, h in enumerate(np.diag(steps) if memoryless else ()):
+        once, twice = (active_forces(x + k * h) - active_forces(x - k * h) for k in (1, 2))
+        derivatives[:, i] = (8 * once - twice) / (12 * steps[i])
+    return active_forces(x), derivatives
 
 
 def linearize(
@@ -132,8 +122,7 @@ def linearize(
     dynamics = Dynamics(machine)
     q = machine.closure.solve(q_a)
     linearized_drive = LinearizedDrive(machine, dynamics, q, valves, pressures)
-    external = LinearizedExternalForces(machine)
-    external_force = external.active_forces(q_a, v_a)
+    external_force, external_jacobian = external_force_derivatives(machine, q_a, v_a)
     drive_states, u = find_trim(dynamics, linearized_drive, q_a, v_a, external_force)
     n, k, m = len(q_a), len(drive_states), len(u)
     values, drive_jacobian = linearized_drive.evaluate(q_a, v_a, drive_states, u)
@@ -144,7 +133,7 @@ def linearize(
     a, b = np.zeros((size, size)), np.zeros((size, m))
     a[:n, n : 2 * n] = np.eye(n)
     a[n : 2 * n] = by_tau @ drive_jacobian[:n, :size]
-    a[n : 2 * n, : 2 * n] += by_tau @ external.jacobian(q_a, v_a)
+    a[n : 2 * n, : 2 * n] += by_tau @ external_jacobian
     a[n : 2 * n, :n] += dynamics_derivatives["q_a"]
     a[n : 2 * n, n : 2 * n] += dynamics_derivatives["v_a"]
     a[2 * n :] = drive_jacobian[n : n + k, :size]
