@@ -106,7 +106,7 @@ def engines_of(machine: crane.Machine) -> dict[str, Engine]:
     kinematics, free, peer = Kinematics(machine), ZeroForce(machine), ConstraintDynamics(machine)
     fast = Runner(machine, free, q_a, v_a)
     slow = PythonStepper(
-        Chart.from_dynamics(crane.Dynamics(machine, backend="pinocchio")), free, 0
+        Chart.from_dynamics(crane.Dynamics(machine, backend="pinocchio"), free, 0)
     )
     mujocos = {(name, h): MuJoCo(machine, h, name) for name in INTEGRATORS for h in STEPS}
 

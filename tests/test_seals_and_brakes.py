@@ -261,12 +261,11 @@ def test_machine_code_and_pinocchio_agree_along_a_motion(smoothing):
     machine = gripping(smooth if smoothing else ())
     drive = crane.control.ValveDrive(machine, levers(machine))
     compiled, plain = (
-        Chart.from_dynamics(Dynamics(machine, backend=backend))
+        Chart.from_dynamics(Dynamics(machine, backend=backend), drive, drive.circuit.state_count)
         for backend in ("compiled", "pinocchio")
     )
-    fast = RosenbrockStepper(compiled, drive, drive.circuit.state_count)
-    slow = PythonStepper(plain, drive, drive.circuit.state_count)
-    checked = PythonStepper(compiled, drive, drive.circuit.state_count)
+    fast = RosenbrockStepper(compiled)
+    slow, checked = PythonStepper(plain), PythonStepper(compiled)
     recording = crane.simulate(machine, drive, None, 0.8, 1e-2)
     rested, n = 0, len(machine.active)
     for i in range(0, 80, 7):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crane.codegen import Layout, LayoutView
+from crane.codegen import LayoutView
 from crane.common import scratch_arrays
 from crane.common.errors import CraneError, RecordingError, check_name, format_one_line
 from crane.common.one_line_repr import shorten_to_line
@@ -34,6 +34,7 @@ from crane.motion.trajectory import Trajectory
 from crane.recordings.recording import Recording
 from crane.recordings.sensor_kinematics import ideal_readings
 from crane.recordings.timeseries import TIME, Table, accepted_units, check_unit
+from crane.simulation.integration.charts import Chart
 
 ChannelColumn = tuple[str, Array, str]  # name, values, unit
 
@@ -44,7 +45,7 @@ class IntegrationResult(NamedTuple):
     Attributes:
         time: (N,) instants [s].
         array: (N, .) rows at these instants.
-        layout: Layout of a row, see `row_layout`.
+        chart: The machine in the coordinates of the user.
         notes: Notes for the user about the motion.
         start_text: Note about an initial state that differs from home.
         stop: The exception that stopped it, or None.
@@ -52,7 +53,7 @@ class IntegrationResult(NamedTuple):
 
     time: Array
     array: Array
-    layout: Layout
+    chart: Chart
     notes: Iterable[str]
     start_text: str = ""
     stop: BaseException | None = None
@@ -60,7 +61,7 @@ class IntegrationResult(NamedTuple):
     @property
     def rows(self) -> LayoutView:
         """The parts of the rows, (N, .) each."""
-        return self.layout.view(self.array)
+        return self.chart.row_layout.view(self.array)
 
     def first_instants(self, count: int, stop: BaseException | None) -> "IntegrationResult":
         """The first instants of the result, with the exception that stopped it there."""

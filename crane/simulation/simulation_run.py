@@ -37,7 +37,7 @@ from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import tipping_message
 from crane.simulation.integration.chart_switching import ChartSwitchingIntegrator
-from crane.simulation.integration.charts import Chart, row_layout
+from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.error_controlled_stepper import (
     DormandPrinceStepper,
     ErrorControlledStepper,
@@ -202,7 +202,7 @@ def integrate(
     method: str | None = None,
     progress: Progress | None = None,
     tolerance: float | None = None,
-    chart: Chart | None = None,
+    records_transitions: bool = False,
     ends_with_command: bool = False,
 ) -> IntegrationResult:
     """Integrate a run without computing its channels; see `simulate`.
@@ -216,7 +216,7 @@ def integrate(
         method: See `simulate`.
         progress: See `simulate`.
         tolerance: See `simulate`.
-        chart: The machine in the coordinates of the user; its stick-slip modes record transitions.
+        records_transitions: Whether the stick-slip modes of the chart record their transitions.
         ends_with_command: Whether the run ends with the command of the valves.
 
     Returns:
@@ -246,14 +246,13 @@ def integrate(
     contact_states = np.zeros(state_count(machine.external_forces))
     energies = np.zeros(2 + len(machine.external_forces))
     state = np.concatenate([configuration, v_a, contact_states, controller_state, energies])
-    count = len(controller_state)
-    make_integrator = integrator_factory(dynamics, control, count, method, tolerance)
-    chart = chart or Chart.from_dynamics(dynamics)
-    integrator = ChartSwitchingIntegrator(chart, control, count, make_integrator)
-    layout = row_layout(machine, control, count)
+    chart = Chart.from_dynamics(dynamics, control, len(controller_state))
+    if records_transitions:
+        chart.stick_slip.transitions = []
+    integrator = ChartSwitchingIntegrator(chart, integrator_factory(chart, method, tolerance))
     times = step * np.arange(step_count + 1, dtype=np.float64)
     # stored by columns, so that channels are views
-    rows = scratch_arrays.empty_array(step_count + 1, layout.size)
+    rows = scratch_arrays.empty_array(step_count + 1, chart.row_layout.size)
     released_until = 0  # instants whose memory pages are released
 
     def report(done: int) -> None:
@@ -270,7 +269,7 @@ def integrate(
         ):
             raise _CommandFinishedError
 
-    run = IntegrationResult(times, rows, layout, integrator.notes, start_text)
+    run = IntegrationResult(times, rows, chart, integrator.notes, start_text)
     try:
         with single_threaded_blas(machine.model.nv):
             integrator.run(times[:-1], state, step, rows, report)
@@ -279,7 +278,7 @@ def integrate(
         run = run.first_instants(integrator.done, None)
     except IntegrationHaltError as halt:
         finer_step, done = integrator.find_finer_step(times[:-1], rows, step), integrator.done
-        q_a = layout.view(rows[:done]).q[:, machine.closure.active]
+        q_a = chart.row_layout.view(rows[:done]).q[:, machine.closure.active]
         stop = explain_halt(
             machine, halt, times[:done], q_a, controller_reference(control, machine), finer_step
         )
@@ -311,24 +310,19 @@ def _default_method(dynamics: Dynamics, control: Controller) -> str:
 
 
 def integrator_factory(
-    dynamics: Dynamics,
-    control: Controller,
-    controller_state_count: int,
-    requested_method: str | None,
-    tolerance: float | None,
+    chart: Chart, requested_method: str | None, tolerance: float | None
 ) -> Callable[[Chart], StickSlipIntegrator]:
     """Function that creates the integrator of a method in a chart.
 
     Args:
-        dynamics: Dynamics of the machine.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
+        chart: The machine in the coordinates of the user.
         requested_method: See `simulate`.
         tolerance: See `simulate`.
 
     Raises:
         InputError: The method is unknown or does not support the machine.
     """
+    dynamics, control = chart.dynamics, chart.control
     drive = control if isinstance(control, ValveDrive) else None
     method = requested_method or _default_method(dynamics, control)
     check_name(method, ("rk4", "rosenbrock", *SCIPY_METHODS), f"method '{method}' is unknown")
@@ -351,7 +345,7 @@ def integrator_factory(
                 f"{_MAX_TOLERANCE:g}"
             )
     if method == "rk4":
-        return lambda chart: FixedStepIntegrator(chart, control, controller_state_count)
+        return FixedStepIntegrator
     stepper_factory = None
     if drive is None or method == "rosenbrock":
         stepper_factory = _COMPILED_METHODS.get(method)
@@ -361,16 +355,14 @@ def integrator_factory(
         compiled = chart.dynamics.backend == "compiled"
         if compiled and stepper_factory is not None and isinstance(control, ControlLaw):
             with suppress(FormulaTooLongError):
-                return ErrorControlledIntegrator(
-                    chart, control, controller_state_count, partial(stepper_factory, **options)
-                )
+                return ErrorControlledIntegrator(chart, partial(stepper_factory, **options))
         if drive is not None and drive.period:
             raise InputError("a program with a period runs on the compiled backend alone")
         if requested_method is None and drive is None:
-            return FixedStepIntegrator(chart, control, controller_state_count)
+            return FixedStepIntegrator(chart)
         if chart.machine.coordinates.rotation_columns:
             raise InputError("scipy's methods do not limit rotation vectors to pi, take rk4")
         name = "BDF" if method == "rosenbrock" else method
-        return ScipyIntegrator(chart, control, controller_state_count, name, **options)
+        return ScipyIntegrator(chart, name, **options)
 
     return make

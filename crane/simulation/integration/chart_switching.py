@@ -8,7 +8,7 @@ import numpy as np
 from crane.codegen import Tape
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.control.control_law import ControlLaw, Controller
+from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
 from crane.simulation.integration.charts import (
     MAX_MOTION_PER_STEP,
@@ -22,7 +22,6 @@ from crane.simulation.integration.charts import (
     correct_polynomial,
     extrapolate_states,
     relative_rank,
-    row_layout,
 )
 from crane.simulation.integration.integrators import StickSlipIntegrator
 from crane.simulation.integration.machine_formulas import raise_undetermined, trace_law
@@ -45,8 +44,6 @@ class ChartSwitchingIntegrator:
 
     Args:
         chart: The machine in the coordinates of the user.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
         make_integrator: Creates the integrator of a chart.
 
     Attributes:
@@ -54,18 +51,12 @@ class ChartSwitchingIntegrator:
         notes: Notes for the user about the motion.
     """
 
-    def __init__(
-        self,
-        chart: Chart,
-        control: Controller,
-        controller_state_count: int,
-        make_integrator: Callable[[Chart], StickSlipIntegrator],
-    ):
-        self._make_integrator, self._control = make_integrator, control
+    def __init__(self, chart: Chart, make_integrator: Callable[[Chart], StickSlipIntegrator]):
+        self._make_integrator = make_integrator
         self._chart, self._integrator = chart, make_integrator(chart)
         self._chart_limits = chart.chart_limits
         self._known_integrators = [(chart, self._integrator)]
-        self._row_layout = row_layout(chart.machine, control, controller_state_count)
+        self._row_layout = chart.row_layout
         self._segment_start = self.done = 0
         self._recent_states = np.zeros((0, self._row_layout.start_index("tau")))
         self.notes = RunNotes()
@@ -380,11 +371,11 @@ class ChartSwitchingIntegrator:
     @property
     def _uses_inverse_dynamics(self) -> bool:
         """Whether the controller uses inverse dynamics or gravity in coordinates of the user."""
-        control, k = self._control, self._row_layout.parts["controller"]
+        control = self._chart.control
         if isinstance(control, ValveDrive) or not isinstance(control, ControlLaw):
             return False
         try:
-            trace_law(control, self._chart, k, Tape(), (raise_undetermined, raise_undetermined))
+            trace_law(self._chart, Tape(), (raise_undetermined, raise_undetermined))
         except InputError:
             return True
         return False

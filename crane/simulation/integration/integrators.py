@@ -9,9 +9,9 @@ import numpy as np
 from crane.codegen import FormulaTooLongError
 from crane.common.errors import ClosureError, InputError
 from crane.common.samples import Array
-from crane.control.control_law import ControlLaw, Controller
+from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
-from crane.simulation.integration.charts import Chart, row_layout
+from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.error_controlled_stepper import (
     MAX_REFERENCE_SPACING,
     ErrorControlledStepper,
@@ -38,8 +38,6 @@ class StickSlipIntegrator(ABC):
 
     Args:
         chart: The machine in a chart.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
         compiled_method: The compiled method, or None.
 
     Attributes:
@@ -51,14 +49,8 @@ class StickSlipIntegrator(ABC):
 
     _max_transitions = _MAX_TRANSITIONS
 
-    def __init__(
-        self,
-        chart: Chart,
-        control: Controller,
-        controller_state_count: int,
-        compiled_method: MachineCodeStepper | None,
-    ):
-        self.python_stepper = PythonStepper(chart, control, controller_state_count)
+    def __init__(self, chart: Chart, compiled_method: MachineCodeStepper | None):
+        self.python_stepper = PythonStepper(chart)
         self.done = self.next_instant = 0
         self.offset = self._first = self._step = 0.0
         self._stick_slip, self._compiled_method = chart.stick_slip, compiled_method
@@ -244,18 +236,17 @@ class FixedStepIntegrator(StickSlipIntegrator):
 
     Args:
         chart: The machine in a chart.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
     """
 
-    def __init__(self, chart: Chart, control: Controller, controller_state_count: int):
+    def __init__(self, chart: Chart):
+        control = chart.control
         self._compiled_stepper: RungeKuttaStepper | None = None
         compiled = not isinstance(control, ValveDrive) and chart.dynamics.backend == "compiled"
         if compiled and chart.machine.has_traceable_forces and isinstance(control, ControlLaw):
             with suppress(FormulaTooLongError):
-                self._compiled_stepper = RungeKuttaStepper(chart, control, controller_state_count)
-        self._row_size = row_layout(chart.machine, control, controller_state_count).size
-        super().__init__(chart, control, controller_state_count, self._compiled_stepper)
+                self._compiled_stepper = RungeKuttaStepper(chart)
+        self._row_size = chart.row_layout.size
+        super().__init__(chart, self._compiled_stepper)
 
     def _advance(
         self,
@@ -350,27 +341,17 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
 
     Args:
         chart: The machine in a chart.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
         stepper_factory: Creates the compiled method.
 
     Raises:
         FormulaTooLongError: The formulas are too long to be compiled.
     """
 
-    def __init__(
-        self,
-        chart: Chart,
-        control: ControlLaw,
-        controller_state_count: int,
-        stepper_factory: Callable[..., ErrorControlledStepper],
-    ):
-        self._stepper = stepper_factory(chart, control, controller_state_count)
-        super().__init__(chart, control, controller_state_count, self._stepper)
-        self._chart, self._period_in_steps = chart, 0
-        self._sampled_drive = (
-            control if isinstance(control, ValveDrive) and control.period else None
-        )
+    def __init__(self, chart: Chart, stepper_factory: Callable[[Chart], ErrorControlledStepper]):
+        self._stepper = stepper_factory(chart)
+        super().__init__(chart, self._stepper)
+        self._chart, self._period_in_steps, drive = chart, 0, chart.control
+        self._sampled_drive = drive if isinstance(drive, ValveDrive) and drive.period else None
 
     def run(
         self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None

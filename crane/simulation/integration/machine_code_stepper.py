@@ -14,9 +14,8 @@ from crane.codegen import (
 )
 from crane.codegen.symbolic import add_vectors, scale_vector
 from crane.common.samples import Array
-from crane.control.control_law import ControlLaw
 from crane.dynamics import external_forces
-from crane.simulation.integration.charts import Chart, output_layout, state_layout
+from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.machine_formulas import (
     AT_REST_SUFFIX,
     MachineFormulas,
@@ -48,8 +47,6 @@ class MachineCodeStepper:
 
     Args:
         chart: The machine in a chart.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
         method: Further properties on which the code depends.
         fold_settings: Whether zeros and ones among the settings of the controller become part of
             the code.
@@ -71,15 +68,8 @@ class MachineCodeStepper:
 
     _step_state: Array  # the argument h of the routine `run`, see `StepLoop`
 
-    def __init__(
-        self,
-        chart: Chart,
-        control: ControlLaw,
-        controller_state_count: int,
-        method: tuple,
-        fold_settings: bool,
-    ):
-        machine = chart.machine
+    def __init__(self, chart: Chart, method: tuple, fold_settings: bool):
+        machine, control = chart.machine, chart.control
         self._chart, self._control, self._fold_settings = chart, control, fold_settings
         self.closure_code = machine.closure.compiled_closure
         self._dynamics_constants = chart.dynamics.formula_constants
@@ -94,16 +84,15 @@ class MachineCodeStepper:
             else external_forces.ExternalForceCallback(machine.external_forces)
         )
         self.has_stick_slip = bool(chart.stick_slip.columns)
-        self.state_layout = state_layout(machine, controller_state_count)
-        self.output_layout = output_layout(machine, control)
+        self.state_layout, self.output_layout = chart.state_layout, chart.output_layout
         key = (
             *method,
-            controller_formula_key(control, chart, controller_state_count, fold_settings),
-            controller_state_count,
+            controller_formula_key(chart, fold_settings),
+            chart.controller_state_count,
             bool(machine.supports),
             *chart.formula_key,
         )
-        self._program = machine_program(machine, control, key, self._build)
+        self._program = machine_program(chart, key, self._build)
 
     def _build(self, program: Program) -> None:
         raise NotImplementedError
@@ -112,9 +101,7 @@ class MachineCodeStepper:
         """The machine with its controller; references and state are the arguments 3 and 4."""
         references = tape.load_vector(3, 0, self.reference_columns)
         settings = controller_settings(self._control, tape, 2, self._fold_settings)
-        return trace_machine(
-            self._chart, self._control, tape, self.state_layout, 4, references, settings
-        )
+        return trace_machine(self._chart, tape, 4, references, settings)
 
     @property
     def event(self) -> float:
@@ -181,16 +168,14 @@ class RungeKuttaStepper(MachineCodeStepper):
 
     Args:
         chart: The machine in a chart.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
 
     Raises:
         FormulaTooLongError: The formulas are too long to be compiled.
     """
 
-    def __init__(self, chart: Chart, control: ControlLaw, controller_state_count: int):
+    def __init__(self, chart: Chart):
         self._step_state = np.zeros(3)
-        super().__init__(chart, control, controller_state_count, ("rk4",), fold_settings=False)
+        super().__init__(chart, ("rk4",), fold_settings=False)
 
     def _build(self, program: Program) -> None:
         for suffix, with_joints_at_rest in self._rest_variants:

@@ -13,13 +13,12 @@ from crane.common.errors import (
     SingularMassMatrixError,
 )
 from crane.common.samples import Array
-from crane.control.control_law import Controller
 from crane.control.valve_drive import ValveDrive
 from crane.dynamics.external_forces import ExternalForceValues
 from crane.machine.machine import Machine
 from crane.motion.limit_violations import limit_tolerances
 from crane.motion.trajectory import Trajectory
-from crane.simulation.integration.charts import Chart, state_layout
+from crane.simulation.integration.charts import Chart
 
 
 class IntegrationHaltError(SimulationError):
@@ -126,8 +125,6 @@ class PythonStepper:
 
     Args:
         chart: The machine in a chart.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
 
     Attributes:
         state_layout: Layout of the state.
@@ -136,9 +133,9 @@ class PythonStepper:
             was computed last.
     """
 
-    def __init__(self, chart: Chart, control: Controller, controller_state_count: int):
-        self._chart, self._dynamics, self._control = chart, chart.dynamics, control
-        self.state_layout = state_layout(chart.machine, controller_state_count)
+    def __init__(self, chart: Chart):
+        self._chart, self._dynamics, self._control = chart, chart.dynamics, chart.control
+        self.state_layout = chart.state_layout
         self.chart_limits, self.transition_margin = chart.chart_limits, 1.0
 
     def find_modes(self, time: float, state: Array, outputs: Array | None = None) -> None:

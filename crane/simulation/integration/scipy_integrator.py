@@ -8,7 +8,6 @@ import numpy as np
 
 from crane.common.errors import ClosureError
 from crane.common.samples import Array
-from crane.control.control_law import Controller
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.integrators import StickSlipIntegrator
 from crane.simulation.integration.python_stepper import IntegrationHaltError, StepProgress
@@ -27,22 +26,13 @@ class ScipyIntegrator(StickSlipIntegrator):
 
     Args:
         chart: The machine in a chart.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
         method: One of `SCIPY_METHODS`.
         tolerance: Error of a step, relative to the size of the state.
     """
 
-    def __init__(
-        self,
-        chart: Chart,
-        control: Controller,
-        controller_state_count: int,
-        method: str,
-        tolerance: float = SCIPY_TOLERANCE,
-    ):
+    def __init__(self, chart: Chart, method: str, tolerance: float = SCIPY_TOLERANCE):
         self._tolerance = tolerance
-        super().__init__(chart, control, controller_state_count, None)
+        super().__init__(chart, None)
         self._chart, self._closure, self._method = chart, chart.machine.closure, method
 
     def _advance(
