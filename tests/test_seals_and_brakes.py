@@ -373,7 +373,7 @@ def test_seals_press_through_dead_centres(tmp_path):
     """A crank spins while the cylinder at its slider turns back: seen from others, the same."""
     parts = {
         "cylinders": {"s": Cylinder("s", 2e-4, 2e-4, 1e-3, 1e-3, seal_friction=2e-5)},
-        "valves": {"s": Valve("s", 4e-6, 4e-6, 4e-6, 4e-6)},
+        "valves": {"s": Valve("s", c1=4e-6, c2=4e-6, c3=4e-6, c4=4e-6)},
     }
     machine = singular_linkages.slider_crank(tmp_path, "s", 0.3, 0.6)
     machine = machine.replace(

@@ -95,13 +95,10 @@ class OptionBlock:
             for field in fields(cls)
         ]  # fmt: skip
 
-    def given_options(self) -> list[str]:
-        """Names of the options that are given, as "--from"."""
-        return [
-            _option_name(field)
-            for field in fields(self)
-            if getattr(self, field.name) not in (field.default, [], ())
-        ]
+    def given_options(self) -> dict[str, object]:
+        """Values of the options that are given, by names as "--from"."""
+        values = {field: getattr(self, field.name) for field in fields(self)}
+        return {_option_name(x): y for x, y in values.items() if y not in (x.default, [], ())}
 
     def refuse(self, text: str) -> None:
         """Raise an error if any of the options is given.
@@ -112,8 +109,7 @@ class OptionBlock:
         Raises:
             InputError: About the first option that is given.
         """
-        for name in self.given_options():
-            raise InputError(f"{name} {text}")
+        refuse_options(self.given_options(), text)
 
 
 def _in_panel(annotation: Any, panel: str) -> Any:

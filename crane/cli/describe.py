@@ -6,11 +6,7 @@ from typing import Annotated
 import typer
 
 import crane
-from crane.cli.command import (
-    app,
-    command,
-    number_option,
-)
+from crane.cli.command import app, command, number_option
 from crane.cli.options import (
     AssemblyOptions,
     MachineName,

@@ -17,11 +17,7 @@ from crane.cli.options import (
     Tasks,
     UserMeasures,
 )
-from crane.cli.parsing import (
-    parameter_units,
-    parse_grids,
-    parse_ranges,
-)
+from crane.cli.parsing import parameter_units, parse_grids, parse_ranges
 from crane.cli.resumable_output import ResumableFolder
 from crane.cli.terminal import progress_bar
 

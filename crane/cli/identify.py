@@ -9,12 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import crane
-from crane.cli.command import (
-    OptionBlock,
-    command,
-    number_option,
-    refuse_options,
-)
+from crane.cli.command import OptionBlock, command, number_option, refuse_options
 from crane.cli.options import (
     Bandwidth,
     CentreOfMass,

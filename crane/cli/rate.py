@@ -10,12 +10,7 @@ from typing import Annotated, Any
 import typer
 
 import crane
-from crane.cli.command import (
-    OptionBlock,
-    command,
-    number_option,
-    refuse_options,
-)
+from crane.cli.command import OptionBlock, command, number_option, refuse_options
 from crane.cli.options import (
     Bucket,
     Configuration,

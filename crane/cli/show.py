@@ -15,10 +15,7 @@ from crane.cli.options import (
     ParameterOptions,
     RecordingOptions,
 )
-from crane.cli.parsing import (
-    joint_units,
-    parse_configuration,
-)
+from crane.cli.parsing import joint_units, parse_configuration
 from crane.cli.terminal import hide_activity_line
 from crane.common.atomic_output import portable_file_name
 from crane.common.errors import InputError, check_name

@@ -11,12 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import crane
-from crane.cli.command import (
-    OptionBlock,
-    command,
-    number_option,
-    refuse_options,
-)
+from crane.cli.command import OptionBlock, command, number_option, refuse_options
 from crane.cli.options import (
     ChangeOptions,
     Configuration,

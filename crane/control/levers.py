@@ -354,9 +354,9 @@ class TipVelocity(SampledCommand):
             opening[i] = v[i] * opening_per_velocity(valve, cylinder, v[i] > 0, force, drop)
         opening /= max(1.0, np.abs(opening).max())
         openings = dict(zip(self._circuit.joints, opening, strict=True))
-        signals = []
-        for spool in self._circuit.spools.values():
-            y = openings[spool.joint]
-            u = y * (1.0 - spool.overlap) + spool.overlap * np.tanh(y / _DEAD_BAND_SMOOTHING)
-            signals.append(spool.neutral + (spool.full - spool.neutral) * u)
-        return np.array(signals)
+        spools = self._circuit.spools.values()
+        y, overlap, neutral, full = np.array(
+            [(openings[x.joint], x.overlap, x.neutral, x.full) for x in spools]
+        ).T
+        u = y * (1.0 - overlap) + overlap * np.tanh(y / _DEAD_BAND_SMOOTHING)
+        return np.asarray(neutral + (full - neutral) * u)

@@ -94,7 +94,7 @@ def require_circuit(machine: Machine) -> Hydraulics:
     return machine.hydraulics
 
 
-def lever_signals(spool: Valve | Spool, lever: Array) -> Array:
+def lever_signals(spool: Spool, lever: Array) -> Array:
     """Signals of a spool (N,) [V] for lever positions (N,) from -1 to 1, shares of the flow.
 
     The signal jumps over the dead band at zero, as that of the electronics of such machines.

@@ -155,7 +155,7 @@ class Hydraulics:
         return tuple(self.cylinders)
 
     @property
-    def spools(self) -> dict[str, Valve | Spool]:
+    def spools(self) -> dict[str, Spool]:
         """Spools by the names of their signals: JOINT, and JOINT_b for a second spool."""
         return {name: x for valve in self.valves.values() for name, x in valve.spools.items()}
 

@@ -337,13 +337,13 @@ def read_simulation(machine: Machine, recording: Recording, names: list[str]) ->
     Args:
         machine: The simulated machine.
         recording: Its recording.
-        names: See `simulated_columns`.
+        names: See `simulated_columns`; also velocities of passive joints.
     """
     columns = recording.columns()
-    if inclinations := [name for name in names if name.startswith(INCLINATION_PREFIX)]:
+    if derived := [name for name in names if name not in columns]:
         q = np.column_stack([columns[joint] for joint in machine.joints])
         order = [recording.joints.index(joint) for joint in machine.active]
         v = np.einsum("nij,nj->ni", machine.closure.gamma(q), recording.v[:, order])
-        columns |= ideal_readings(machine, q, v, inclinations)
+        columns |= ideal_readings(machine, q, v, derived)
     values = [columns[name] for name in names]
     return np.column_stack(values) if values else np.empty((len(recording.time), 0))

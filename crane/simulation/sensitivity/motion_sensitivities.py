@@ -367,15 +367,7 @@ def gradient(
     )
     nominal_constants = directions.nominal_constants(motion.time)
     integrator = AdjointIntegrator(motion, names, nominal_constants, changes)
-    simulated, columns, values = motion.chart.machine, recording.columns(), []
-    for name in names:
-        joint = name.removesuffix(VELOCITY_SUFFIX)
-        if name not in columns and joint in simulated.joints:  # the velocity of a passive joint
-            rows = simulated.closure.gamma(motion.parts.q)[:, simulated.joints.index(joint)]
-            values.append(np.einsum("ni,ni->n", rows, motion.parts.v_a))
-        else:
-            values.append(read_simulation(simulated, recording, [name])[:, 0])
-    observed = np.column_stack(values)
+    observed = read_simulation(motion.chart.machine, recording, list(names))
     total, weights = _functional_and_weights(functional, recording.time, observed)
     gradients = integrator.integrate_backward(weights.reshape(-1, *observed.shape))
     # no parameter changes the references of the controller
