@@ -313,13 +313,16 @@ def _initial_motion(
     first = min(float(time[x.argmax()]) if x.any() else np.inf for x in has_moved)
     fit_duration = max(_START_FIT_DURATION, float(time[min(_MIN_FIT_SAMPLES, len(time)) - 1]))
     steady = time <= max(min(first, _MAX_REST_DURATION), fit_duration)
-    states = []
-    for i, joint in enumerate(machine.active):
-        has_velocity = joint + VELOCITY_SUFFIX in table.units or joint not in table.units
-        states.append(
-            _start_of_joint(time, q_a[:, i], v_a[:, i] if has_velocity else None, steady)
-        )
-    return np.array([x for x, _ in states]), np.array([v for _, v in states])
+    has_velocities = [
+        joint + VELOCITY_SUFFIX in table.units or joint not in table.units
+        for joint in machine.active
+    ]
+    states = [
+        _start_of_joint(time, x, v if has_velocity else None, steady)
+        for x, v, has_velocity in zip(q_a.T, v_a.T, has_velocities, strict=True)
+    ]
+    q_start, v_start = np.array(states).reshape(-1, 2).T
+    return q_start, v_start
 
 
 def _start_of_joint(

@@ -34,7 +34,7 @@ _MAX_TRANSITIONS = 2000  # stick-slip transitions within an output interval
 class StickSlipIntegrator(ABC):
     """Base class of integrators in one chart.
 
-    A method implements `_advance`, and `_make_step` if its steps have a given size.
+    A method implements `_advance`.
 
     Args:
         chart: The machine in a chart.
@@ -136,13 +136,6 @@ class StickSlipIntegrator(ABC):
         """
         return 0.0
 
-    def _make_step(self, time: float, state: Array, length: float) -> tuple[Array, float]:
-        """State and margin after one step of a given size.
-
-        Methods that locate events within their steps do not need it.
-        """
-        raise NotImplementedError
-
     def _outputs_and_margin(self, time: float, state: Array) -> tuple[Array, float]:
         if self._compiled_method is not None:
             return self._compiled_method.observe(time, state)
@@ -171,40 +164,6 @@ class StickSlipIntegrator(ABC):
             self._compiled_method.adopt_modes()
         self._stick_slip.record_transition(time, state)
 
-    def _advance_to_transition(
-        self, time: float, state: Array, length: float, step: float
-    ) -> float:
-        """Integrate to a stick-slip transition within a step.
-
-        Args:
-            time: [s].
-            state: State at this time, replaced by that at the transition with the new modes.
-            length: Step size [s].
-            step: Output interval [s].
-
-        Returns:
-            Time from the start of the step to the transition [s].
-
-        Raises:
-            IntegrationHaltError: There are too many transitions.
-        """
-        self._count_transition(time, state, step)
-        margin_before, (_, margin_behind) = (
-            self._outputs_and_margin(time, state)[1],
-            self._make_step(time, state, length),
-        )
-        if margin_before < -EVENT_TOLERANCE:
-            time_offset = 0.0
-        else:
-            time_offset, state[:] = locate_event(
-                lambda part: self._make_step(time, state, part),
-                margin_before,
-                length,
-                margin_behind,
-            )
-        self._find_modes(time + time_offset, state)
-        return time_offset
-
     def _count_transition(self, time: float, state: Array, step: float) -> None:
         """Count a stick-slip transition.
 
@@ -224,7 +183,7 @@ class StickSlipIntegrator(ABC):
             )
 
 
-_STEPS_PER_REPORT = 5000  # between reports of progress
+_STEPS_PER_REPORT = 1000  # between reports of progress; their rows stay in the cache
 # steps before and after a halt that are repeated with finer steps
 _STEPS_BEFORE_HALT, _STEPS_AFTER_HALT = 40, 20
 _REFINEMENT_FACTORS = (2, 8)  # of finer steps
@@ -293,7 +252,42 @@ class FixedStepIntegrator(StickSlipIntegrator):
             self._find_modes(times[0], state)
         return True
 
+    def _advance_to_transition(
+        self, time: float, state: Array, length: float, step: float
+    ) -> float:
+        """Integrate to a stick-slip transition within a step.
+
+        Args:
+            time: [s].
+            state: State at this time, replaced by that at the transition with the new modes.
+            length: Step size [s].
+            step: Output interval [s].
+
+        Returns:
+            Time from the start of the step to the transition [s].
+
+        Raises:
+            IntegrationHaltError: There are too many transitions.
+        """
+        self._count_transition(time, state, step)
+        margin_before, (_, margin_behind) = (
+            self._outputs_and_margin(time, state)[1],
+            self._make_step(time, state, length),
+        )
+        if margin_before < -EVENT_TOLERANCE:
+            time_offset = 0.0
+        else:
+            time_offset, state[:] = locate_event(
+                lambda part: self._make_step(time, state, part),
+                margin_before,
+                length,
+                margin_behind,
+            )
+        self._find_modes(time + time_offset, state)
+        return time_offset
+
     def _make_step(self, time: float, state: Array, length: float) -> tuple[Array, float]:
+        """State and margin after one step of a given size."""
         if self._compiled_stepper is not None:
             after, row = state.copy(), np.empty((1, self._row_size))
             if self._compiled_stepper.run(np.array([time]), after, length, row):

@@ -95,7 +95,7 @@ class MachineCodeStepper:
         self._program = machine_program(chart, key, self._build)
 
     def _build(self, program: Program) -> None:
-        raise NotImplementedError
+        """Add the formulas and routines."""
 
     def _trace_controlled_machine(self, tape: Tape) -> MachineFormulas:
         """The machine with its controller; references and state are the arguments 3 and 4."""
@@ -158,9 +158,6 @@ class MachineCodeStepper:
         name = "observe" + AT_REST_SUFFIX * bool(self.bounds[HELD_INDEX])
         self._program.call(name, *self._common_arguments, reference, state, out)
         return out[layout["outputs"]], float(out[layout.start_index("margin")])
-
-
-_BLOCK_STEPS = 1000  # steps of a call, whose rows stay in the cache until they are copied
 
 
 class RungeKuttaStepper(MachineCodeStepper):
@@ -244,24 +241,15 @@ class RungeKuttaStepper(MachineCodeStepper):
             or at an `event`.
         """
         self._step_state[:] = step, 0.5 * step, 0.0
-        length = min(_BLOCK_STEPS, len(times))
-        half_step_times = times[::length, None] + 0.5 * step * np.arange(2 * length + 1)
-        block_starts = range(0, len(times), length)
-        instants = half_step_times.ravel()[: 2 * len(times) + len(block_starts)]
-        references = reference_samples(self._chart.machine, self._control, instants)
-        out = np.empty((length, rows.shape[1]))
-        arguments = self._common_arguments
-        for i, first in enumerate(block_starts):
-            count = min(length, len(times) - first)
-            done = self._program.call(
-                "run", count, self.closure_code.close_address, *arguments,
-                references[i * half_step_times.shape[1] :], state, out, self._step_state,
-                self.bounds,
-            )  # fmt: skip
-            rows[first : first + done] = out[:done]
-            if done < count:
-                return first + done
-        return len(times)
+        half_steps = times[0] + 0.5 * step * np.arange(2 * len(times) + 1)
+        references = reference_samples(self._chart.machine, self._control, half_steps)
+        out = np.empty((len(times), rows.shape[1]))
+        done = self._program.call(
+            "run", len(times), self.closure_code.close_address, *self._common_arguments,
+            references, state, out, self._step_state, self.bounds,
+        )  # fmt: skip
+        rows[:done] = out[:done]
+        return done
 
     def _add_sum_formulas(self, program: Program) -> None:
         """displaced(s, k, h) = s + h k; finish(geometry, s, k1, ..., k4, h) = s + h/6 (...).
