@@ -1,6 +1,6 @@
 """Recording of a simulation: its channels, and readings of ideal sensors."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -278,29 +278,23 @@ def _point_columns(name: str, positions: Array) -> Iterator[ChannelColumn]:
 _INPUT_PREFIXES = (VALVE_SIGNAL_PREFIX, SUPPLY_PRESSURE, TANK_PRESSURE)
 
 
-def simulated_columns(machine: Machine, table: Table) -> list[str]:
+def simulated_columns(
+    machine: Machine, table: Table, recording: Recording | None = None
+) -> list[str]:
     """Columns of a measured table that a simulation of its inputs has.
 
     Joints, their velocities and forces, pressures, channels of the circuit, the tip, and
     inclinations of links, `inclination_LINK` and `inclination_LINK_velocity`.
 
+    Args:
+        machine: The machine.
+        table: The measured table.
+        recording: Recording of the simulation; None where there is none yet.
+
     Raises:
         RecordingError: A column has the unit of another quantity, or belongs to no link.
     """
-    return _select_columns(machine, table, simulated_units(machine))
-
-
-def recorded_columns(machine: Machine, table: Table, recording: Recording) -> list[str]:
-    """Columns of a measured table that the recording of a simulation has.
-
-    Raises:
-        RecordingError: As for `simulated_columns`.
-    """
-    return _select_columns(machine, table, recording.column_units())
-
-
-def _select_columns(machine: Machine, table: Table, units: Mapping[str, str]) -> list[str]:
-    """Columns, without the inputs, whose names have units, or that are inclinations."""
+    units = simulated_units(machine) if recording is None else recording.column_units()
     columns = []
     for name, unit in table.units.items():
         if name == TIME:

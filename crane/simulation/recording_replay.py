@@ -36,7 +36,7 @@ from crane.recordings.recording import VELOCITY_SUFFIX, Recording
 from crane.recordings.recording_reader import FULL_TIME_SPAN, TimeSpan, read_quantities
 from crane.recordings.sensor_discrepancy import warn_discrepancies
 from crane.recordings.timeseries import TIME, Table, table_column, time_derivative
-from crane.simulation.recorded_run import read_simulation, recorded_columns
+from crane.simulation.recorded_run import read_simulation, simulated_columns
 from crane.simulation.simulation_run import Progress, simulate
 
 _START_FIT_DURATION = 0.1  # interval of the fit of the initial state [s]
@@ -160,7 +160,7 @@ def replay(
             label=Path(path).stem,
             progress=progress,
         )
-        names = recorded_columns(machine, table, recording)
+        names = simulated_columns(machine, table, recording)
     except RecordingError as error:
         raise RecordingError(prefix_location(str(path), error)) from None
     inside = time <= recording.time[-1] * (1 + 1e-12)
