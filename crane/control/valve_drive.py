@@ -209,8 +209,8 @@ class ValveDrive(ControlLaw):
     @cached_property
     def channels(self) -> tuple[tuple[str, str], ...]:
         """Names and units of the recorded channels."""
-        rest = np.zeros(len(self.machine.active))
-        inputs = self.inputs_at(0.0, rest, rest, np.zeros(self.circuit.state_count))
+        home = self.machine.home[self.machine.closure.active]
+        inputs = self.inputs_at(0.0, home, 0.0 * home, np.zeros(self.circuit.state_count))
         return tuple((name, unit) for name, unit, _ in self._evaluate_channels(inputs))
 
     def _evaluate_channels(self, inputs: ControllerInputs) -> list[tuple[str, str, Scalar]]:

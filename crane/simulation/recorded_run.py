@@ -81,7 +81,12 @@ class InterruptedRun(KeyboardInterrupt):
 
 
 def stop_with_recording(
-    machine: Machine, control: Controller, run: IntegrationResult, task: str, end_time: float
+    machine: Machine,
+    control: Controller,
+    run: IntegrationResult,
+    stop: BaseException,
+    task: str,
+    end_time: float,
 ) -> BaseException:
     """The exception that stopped a run, with the recording up to there as its `recording`.
 
@@ -89,10 +94,10 @@ def stop_with_recording(
         machine: The machine.
         control: Its controller.
         run: Result of the integration.
+        stop: The exception.
         task: Name of the motion.
         end_time: Intended end [s].
     """
-    assert (stop := run.stop) is not None
     if not len(run.time):
         return stop
     largest_values = scratch_arrays.compute_in_blocks(

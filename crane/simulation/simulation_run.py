@@ -70,9 +70,8 @@ from crane.simulation.simulation_setup import (
 
 _MIN_TOLERANCE, _MAX_TOLERANCE = 1e-13, 1e-2
 
-StepperFactory = Callable[..., ErrorControlledStepper]
 Progress = Callable[[float], None]
-_COMPILED_METHODS: dict[str, StepperFactory] = {
+_COMPILED_METHODS: dict[str, Callable[..., ErrorControlledStepper]] = {
     "DOP853": DormandPrinceStepper,
     "Radau": RadauStepper,
     "rosenbrock": RosenbrockStepper,
@@ -184,7 +183,7 @@ def simulate(
         interrupted = isinstance(run.stop, KeyboardInterrupt) and len(run.time)
         if interrupted and (text := passed_limits_text(machine, run.time, run.rows.q)):
             warnings.warn(text, CraneWarning, stacklevel=2)
-        raise stop_with_recording(machine, control, run, label, steps * step)
+        raise stop_with_recording(machine, control, run, run.stop, label, steps * step)
     recording = record_run(machine, control, run.time, run.rows, label, start_text=run.start_text)
     every_step, is_exact = has_fixed_steps(dynamics, control, method), formulation == "exact"
     texts = run_warnings(machine, run.time, run.rows, step, every_step, is_exact)

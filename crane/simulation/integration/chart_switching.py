@@ -150,7 +150,7 @@ class ChartSwitchingIntegrator:
 
     def _switch_chart(self, time: float, state: Array, halt: IntegrationHaltError | None) -> bool:
         """Change to a better chart and transform the state; returns whether there is one."""
-        at = self._chart.state_layout.view(state)
+        at = self._chart.state_layout.view(state.copy())  # a chart keeps its configuration
         chart, nq = self._chart, self._chart.machine.model.nv
         better_chart = chart.find_better_chart(
             at.q, MIN_IMPROVEMENT if halt is None else _HALT_IMPROVEMENT

@@ -205,16 +205,12 @@ def wrap_rotations(chart: Chart, state: Sequence[Scalar]) -> list[Scalar]:
     return out
 
 
-LawResult = tuple[ControllerInputs, Sequence[Scalar], Sequence[Scalar]]
-"""Inputs, forces (n,), and rates (k,) of a traced control law."""
-
-
 def trace_law(
     chart: Chart,
     tape: Tape,
     functions: tuple[Callable[..., list[Scalar]], Callable[..., list[Scalar]]],
     fold_settings: bool = False,
-) -> LawResult:
+) -> tuple[ControllerInputs, Sequence[Scalar], Sequence[Scalar]]:
     """Trace a control law without the machine.
 
     Args:
@@ -222,6 +218,9 @@ def trace_law(
         tape: The tape; coordinates, velocities, states, settings and references are its arguments.
         functions: Inverse dynamics and gravity, see `ControllerInputs`.
         fold_settings: Whether zeros and ones among the settings become part of the formulas.
+
+    Returns:
+        Its inputs, forces (n,), and rates (k,) of its states.
     """
     n, control = len(chart.user_columns), chart.control
     inputs = ControllerInputs(

@@ -142,9 +142,11 @@ class LinearModel(Result):
         start, u = as_sample(start, k, "start", self.states), as_sample(inputs, m, "inputs")
         whole = np.zeros((k + m, k + m))
         whole[:k, :k], whole[:k, k:] = self.A, self.B
-        instants = np.asarray(times, dtype=np.float64)[:, None, None]
-        states = expm(whole * instants) @ np.concatenate([start, u])
-        return np.asarray(states @ np.hstack([self.C, self.D]).T)
+        states = [
+            expm(whole * time) @ np.concatenate([start, u])
+            for time in np.asarray(times, dtype=np.float64)
+        ]
+        return np.asarray(np.array(states) @ np.hstack([self.C, self.D]).T)
 
     def dominant_state(self, mode: Mode) -> str:
         """The state that a mode moves most: a joint, or else a pressure or spool."""
