@@ -69,6 +69,7 @@ class ValveCommand(Protocol):
             v_a: (n,) active velocities.
             pressures: (cylinders, 2) pressures in A and B [Pa].
         """
+        return
 
     def references(self, times: Array) -> Array:
         """Inputs that depend on time alone, (N, c) at times (N,) [s]; none by default."""

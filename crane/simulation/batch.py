@@ -147,8 +147,7 @@ def simulate_batch(
                 failures[futures[future]] = str(error)
             else:
                 results[futures[future]] = future.result()
-            if progress is not None:
-                progress((len(results) + len(failures)) / len(machines))
+            progress((len(results) + len(failures)) / len(machines))
     if not results:
         raise InputError(f"all {len(machines)} simulations failed, the first: {failures[0]}")
     return _stack_results(results, failures, len(machines))

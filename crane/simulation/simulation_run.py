@@ -19,7 +19,7 @@ from crane.common.errors import (
     check_name,
     is_one_line,
 )
-from crane.common.progress import progress_reporter
+from crane.common.progress import ignore_progress, progress_reporter
 from crane.common.samples import as_number
 from crane.common.threads import single_threaded_blas
 from crane.control.control_law import (
@@ -199,7 +199,7 @@ def integrate(
     step_count: int,
     step: float,
     method: str | None = None,
-    progress: Progress | None = None,
+    progress: Progress = ignore_progress,
     tolerance: float | None = None,
     records_transitions: bool = False,
     ends_with_command: bool = False,
@@ -259,8 +259,7 @@ def integrate(
         if not released_until <= done < released_until + scratch_arrays.BLOCK_SIZE:
             released_until = done
             scratch_arrays.release_pages()
-        if progress is not None:
-            progress(done / (step_count + 1))
+        progress(done / (step_count + 1))
         if (
             ends_with_command
             and done
@@ -286,8 +285,7 @@ def integrate(
         return run.first_instants(integrator.done, stop)
     else:
         run = run._replace(notes=[*run.notes, *chart.stick_slip.notes])
-        if progress is not None:
-            progress(1.0)
+        progress(1.0)
     is_exact = dynamics.formulation == "exact"
     invalid_motion = find_invalid_motion(machine, run.time, run.rows, step, is_exact)
     if invalid_motion is not None:

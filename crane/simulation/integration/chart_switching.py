@@ -7,6 +7,7 @@ import numpy as np
 
 from crane.codegen import Tape
 from crane.common.errors import InputError
+from crane.common.progress import ignore_progress
 from crane.common.samples import Array
 from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
@@ -90,7 +91,7 @@ class ChartSwitchingIntegrator:
         self._orientation, self._has_passed_dead_centre = 1.0, False
 
     def run(
-        self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None
+        self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress
     ) -> None:
         """Integrate from each time to the next; see `StickSlipIntegrator.run` for arguments.
 
@@ -146,7 +147,7 @@ class ChartSwitchingIntegrator:
         )
 
     def _progress_from(self, first: int, progress: StepProgress) -> StepProgress:
-        return None if progress is None else lambda done: progress(first + done)
+        return lambda done: progress(first + done)
 
     def _switch_chart(self, time: float, state: Array, halt: IntegrationHaltError | None) -> bool:
         """Change to a better chart and transform the state; returns whether there is one."""
@@ -293,7 +294,7 @@ class ChartSwitchingIntegrator:
         fine_rows = np.empty((count, rows.shape[1]))
         self._recent_states = self._recent_states[:0]
         try:
-            self.run(instants, state, fine_step, fine_rows)
+            self.run(instants, state, fine_step, fine_rows, ignore_progress)
         finally:
             self.done = self._segment_start = i
         rows[i:end] = fine_rows[before * share :: share]

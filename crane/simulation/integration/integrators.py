@@ -8,6 +8,7 @@ import numpy as np
 
 from crane.codegen import FormulaTooLongError
 from crane.common.errors import ClosureError, InputError
+from crane.common.progress import ignore_progress
 from crane.common.samples import Array
 from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
@@ -63,7 +64,12 @@ class StickSlipIntegrator(ABC):
             self._compiled_method.bounds[3:5] = limits
 
     def run(
-        self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None
+        self,
+        times: Array,
+        state: Array,
+        step: float,
+        rows: Array,
+        progress: StepProgress = ignore_progress,
     ) -> int:
         """Integrate from each of the times to the next, while the chart is regular.
 
@@ -89,8 +95,7 @@ class StickSlipIntegrator(ABC):
                 break
             if not self.offset < -_TIME_TOLERANCE * step:  # within rounding errors
                 self.offset = 0.0
-            if progress is not None:
-                progress(self.done)
+            progress(self.done)
         return self.next_instant
 
     @abstractmethod
@@ -348,7 +353,12 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
         self._sampled_drive = drive if isinstance(drive, ValveDrive) and drive.period else None
 
     def run(
-        self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None
+        self,
+        times: Array,
+        state: Array,
+        step: float,
+        rows: Array,
+        progress: StepProgress = ignore_progress,
     ) -> int:
         """See `StickSlipIntegrator.run`.
 

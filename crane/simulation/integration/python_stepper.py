@@ -116,7 +116,7 @@ def _passed_limit_text(
 
 _EXTRAPOLATION_TIME = 1e-3  # extrapolation of a halted motion [characteristic times]
 
-StepProgress = Callable[[int], None] | None
+StepProgress = Callable[[int], None]
 """Called with the number of finished steps."""
 
 

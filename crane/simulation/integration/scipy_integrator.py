@@ -104,8 +104,7 @@ class ScipyIntegrator(StickSlipIntegrator):
                 later, event_state = locate_event(trial, before, until - start, after)
                 until = start + later
             self._record(instants, until, dense_output, state, rows)
-            if progress is not None:
-                progress(self.next_instant)
+            progress(self.next_instant)
             if event_state is not None:
                 state[:] = event_state
                 self.python_stepper.close_loops(until, state)

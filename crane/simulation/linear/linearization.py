@@ -219,8 +219,7 @@ def linear_models(
                 )
             )
         drift_warnings += [str(warning.message) for warning in caught_warnings]
-        if progress is not None:
-            progress((i + 1) / len(combinations))
+        progress((i + 1) / len(combinations))
     if drift_warnings:
         text = f"{len(drift_warnings)} of {len(combinations)} are {drift_warnings[0]}, the first"
         warnings.warn(text, CraneWarning, stacklevel=2)

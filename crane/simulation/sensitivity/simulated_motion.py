@@ -7,6 +7,7 @@ import numpy as np
 
 from crane.closure.coordinates import Indices
 from crane.common.errors import InputError, SimulationError
+from crane.common.progress import ignore_progress
 from crane.common.samples import Array
 from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
@@ -136,7 +137,7 @@ class SimulatedMotion:
         step: float,
         method: str | None = None,
         tolerance: float | None = None,
-        progress: Callable[[float], None] | None = None,
+        progress: Callable[[float], None] = ignore_progress,
     ):
         machine = dynamics.machine
         self._step, self.has_joints_at_rest = step, False
