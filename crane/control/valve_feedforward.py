@@ -200,7 +200,7 @@ class ValveFeedforward(ValvePD):
     """Valve command by feedforward of the openings, and feedback of position and sway.
 
     With y the openings that the trajectory requires (`required_openings`), tau = 2 zeta / omega
-    the lag of the spool, and g the opening per velocity (`openings_per_velocity`) under the forces
+    the lag of the spool, and g the opening per velocity (`opening_per_velocity`) under the forces
     of the trajectory,
 
         w = y + tau y' + K_p (q_ref - q) + K_d (q_ref' - q') + g(v) K theta,
