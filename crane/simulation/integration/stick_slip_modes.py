@@ -230,9 +230,17 @@ def _independent_columns(columns: Array) -> tuple[Indices, int]:
 
     Columns are compared with their own norm: a breakaway force may be small.
     """
-    from scipy.linalg import qr  # slow to import
-
+    count = columns.shape[1]
     column_norms = np.linalg.norm(columns, axis=0)
+    # the distance of a unit column from the span of others is at least the singular value
+    if count <= len(columns) and column_norms.all():
+        least_singular_value = np.linalg.svd(columns / column_norms, compute_uv=False).min(
+            initial=1.0
+        )
+        if least_singular_value > 2.0 * _RANK_TOLERANCE:
+            return np.arange(count), count
+    from scipy.linalg import qr  # slow to call
+
     upper, order = qr(columns, mode="r", pivoting=True)
     sizes = np.abs(np.diag(upper))
     rank = int((sizes > _RANK_TOLERANCE * column_norms[order[: len(sizes)]]).sum())
