@@ -79,6 +79,7 @@ def candidates(
     own = [dynamics.forward(q[active], v[active], tau[active]) for q, v, tau in few]
     told["crane difference"] = largest_difference(own, [a[active] for a in expected])
     samples = sample_states(system, count)
+    samples = samples[::2] + samples[1::2][::-1]  # there and back, without a jump between rounds
     arrays = [np.array(values) for values in zip(*samples, strict=True)]
     q_a, v_a, tau_a = (np.ascontiguousarray(values[:, active]) for values in arrays)
     rows = list(zip(q_a, v_a, tau_a, strict=True))

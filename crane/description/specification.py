@@ -436,6 +436,7 @@ class MachineSpec:
         default_factory=dict
     )  # by joint or loop, most force [N]
     gravity: tuple[float, ...] = STANDARD_GRAVITY  # (3,) [m/s2]
+    is_complete: bool = True  # whether all elements have unique names, so that none is missing
     # numbers as they are written, by the keys and names that lead to them in the machine file
     written_numbers: Mapping[KeyPath, WrittenNumber] = field(default_factory=dict)
 

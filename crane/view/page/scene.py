@@ -17,8 +17,8 @@ from crane.formats.visuals.urdf_shapes import (
     CylinderShape,
     MeshShape,
     SphereShape,
+    UrdfShapes,
     Visual,
-    read_shapes,
 )
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
@@ -286,7 +286,7 @@ def read_visuals(machine: Machine) -> list[Visual]:
     box = BoxShape((0.15 * (distance or 1.0),) * 3)
     with open_robots(machine) as sources:
         for xml in sources:
-            drawn_visuals = read_shapes(xml, replacement=box)
+            drawn_visuals = UrdfShapes(xml, replacement=box)
             visuals += drawn_visuals.shapes["visual"]
             missing_meshes += drawn_visuals.missing_meshes
             problems += drawn_visuals.problems
