@@ -180,7 +180,7 @@ class PythonStepper:
         Raises:
             IntegrationHaltError: The loops do not close, or the configuration is singular.
         """
-        rate, tau, forces, external_values = self._state_rate(time, state)
+        rate, tau, forces, external_values = self.state_rate(time, state)
         at = self.state_layout.view(state)
         observation = self._dynamics.evaluate_closed("observation", at.q, at.v_a, forces)
         outputs = [tau, observation, external_values.outputs]
@@ -219,7 +219,7 @@ class PythonStepper:
                     ", and with steps an eighth as long, too: let method DOP853 choose them, or "
                     "look at its forces and gains",
                 )
-            rate, *_ = self._state_rate(time + share * step, state + share * step * rate)
+            rate, *_ = self.state_rate(time + share * step, state + share * step * rate)
             rate_sum = rate_sum + weight * rate
         after = state + step / 6 * rate_sum
         self.close_loops(time + step, after)
@@ -266,10 +266,14 @@ class PythonStepper:
         remedy = {"default_remedy": ""} if isinstance(error, SingularMassMatrixError) else {}
         return IntegrationHaltError(time, self.user_coordinates(state), f": {error}", **remedy)
 
-    def _state_rate(
+    def state_rate(
         self, time: float, state: Array
     ) -> tuple[Array, Array, Array, ExternalForceValues]:
-        """Rate of the state, forces of the controller, and `_applied_forces`."""
+        """Rate of the state, forces of the controller, all forces and external ones.
+
+        Raises:
+            IntegrationHaltError: The loops do not close, or the configuration is singular.
+        """
         at = self.state_layout.view(state)
         try:
             v_a = self._chart.user_velocities(at.q, at.v_a)

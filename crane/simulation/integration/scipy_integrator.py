@@ -65,7 +65,7 @@ class ScipyIntegrator(StickSlipIntegrator):
             q = view(closed).q
             with suppress(ClosureError):  # of a trial state beyond the branch
                 q[:] = closure.solve(q[closure.active])
-            return self.python_stepper.observe(time, closed)[0]
+            return self.python_stepper.state_rate(time, closed)[0]
 
         absolute_tolerances = np.full(len(state), _ABSOLUTE_TOLERANCE_SHARE * self._tolerance)
         view(absolute_tolerances).q[:] *= units
