@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import crane
-from crane.cli.command import OptionBlock, command, refuse_options
-from crane.cli.option_units import joint_units, number_option, parameter_units
+from crane.cli.command import OptionBlock, command, number_option, refuse_options
 from crane.cli.options import (
     Bandwidth,
     CentreOfMass,
@@ -33,6 +32,8 @@ from crane.cli.options import (
     Validation,
 )
 from crane.cli.parsing import (
+    joint_units,
+    parameter_units,
     parse_fits,
     parse_names,
     parse_numbers,

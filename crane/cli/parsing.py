@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import crane
-from crane.cli.option_units import UnitsOf
 from crane.common.errors import InputError, check_name
 from crane.common.number_text import parse_float
 from crane.common.unit_conversions import UnitError, is_quantity, parse_number
@@ -26,6 +25,29 @@ _GRID_FORM, _RANGE_FORM = "NAME=start:stop:count", "NAME=low~high"
 _MAX_GRID_VALUES = 10_000  # of one parameter
 _MAX_SLEW_ANGLES = 8  # that a page has room for
 _Value = TypeVar("_Value")
+UnitsOf = Callable[[str], Sequence[str]]  # SI units that a name may have
+
+
+def joint_units(machine: "crane.Machine", by_time: str = "") -> UnitsOf:
+    """SI units of the coordinates of joints, or of their rates: both of what is no joint.
+
+    Args:
+        machine: The machine.
+        by_time: As "/s" for rates, "/s2" for accelerations.
+    """
+
+    def units_of(name: str) -> Sequence[str]:
+        units = [machine.unit(name)] if name in machine.joints else ["m", "rad"]
+        return [f"{unit}{by_time}" for unit in units]
+
+    return units_of
+
+
+def parameter_units(machine: "crane.Machine") -> UnitsOf:
+    """SI unit of each parameter."""
+    from crane.description.machine_parameters import parameter_unit
+
+    return lambda name: (parameter_unit(machine.tree, name),)
 
 
 def parse_names(text: str | None) -> list[str] | None:

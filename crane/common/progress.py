@@ -102,9 +102,13 @@ class ProgressTracker:
 PROGRESS = ProgressTracker()
 
 
-def progress_reporter(progress: Callable[[float], None] | None) -> Callable[[float], None] | None:
+def ignore_progress(share: float) -> None:
+    """A function of the finished share that reports it to nobody."""
+
+
+def progress_reporter(progress: Callable[[float], None] | None) -> Callable[[float], None]:
     """The function by which the caller reports its finished share: given, or the tracker's."""
-    return PROGRESS.start_reporting(sys._getframe(1)) if progress is None else progress
+    return progress or PROGRESS.start_reporting(sys._getframe(1)) or ignore_progress
 
 
 def _is_on_stack(call: FrameType, frame: FrameType | None) -> bool:

@@ -148,7 +148,7 @@ class Recording(Result):
                 f"channels {quoted_list(self.channels)} hold an active joint, "
                 f"rename those that end in {VELOCITY_SUFFIX} and {FORCE_SUFFIX}"
             )
-        for name, unit in self._column_units().items():
+        for name, unit in self.column_units().items():
             timeseries.check_column_name(name, unit)
         for name in ("machine", "task", "controller", "machine_name", "stopped", "start"):
             text = getattr(self, name)
@@ -192,7 +192,7 @@ class Recording(Result):
     def _driven_joints(self) -> list[str]:
         return [x for x in self.joints if x not in self.free]
 
-    def _column_units(self) -> dict[str, str]:
+    def column_units(self) -> dict[str, str]:
         """Units of all columns by name.
 
         Raises:
@@ -342,7 +342,7 @@ class Recording(Result):
             OutputError: The file cannot be written.
         """
         columns = list(self.columns().values())
-        timeseries.write_columns(path, self._column_units(), columns, self._notes())
+        timeseries.write_columns(path, self.column_units(), columns, self._notes())
 
     def to_npz(self, path: str | Path) -> None:
         """Write the recording as npz, smaller than a CSV and faster to read.
@@ -351,7 +351,7 @@ class Recording(Result):
             OutputError: The file cannot be written.
         """
         columns = list(self.columns().values())
-        timeseries.write_npz(path, self._column_units(), columns, self._notes())
+        timeseries.write_npz(path, self.column_units(), columns, self._notes())
 
     def _notes(self) -> dict[str, str]:
         is_name_of_file = self.machine_name == Path(without_changes(self.machine)).stem

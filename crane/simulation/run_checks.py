@@ -3,6 +3,7 @@
 import numpy as np
 
 from crane.codegen import LayoutView
+from crane.common.one_line_repr import list_first
 from crane.common.samples import MAX_COORDINATE, Array
 from crane.common.scratch_arrays import release_pages
 from crane.description.ground_contact import Contact
@@ -95,7 +96,7 @@ def passed_limits_text(machine: Machine, time: Array, q: Array) -> str:
         key=lambda i: -largest_excess[i] / min(upper[i] - lower[i], MAX_COORDINATE * units[i])
     )
     words = []
-    for i in passed_columns[:_MAX_NAMED_JOINTS]:
+    for i in passed_columns:
         joint, first = machine.joints[i], int(np.argmax(beyond(int(i)) > slack[i]))
         limit = lower[i] if q[first, i] < lower[i] else upper[i]
         unit = machine.unit(joint)
@@ -103,15 +104,10 @@ def passed_limits_text(machine: Machine, time: Array, q: Array) -> str:
             f"'{joint}' passes its limit {limit:.4g} {unit} at t = {time[first]:.4g} s, by up to "
             f"{largest_excess[i]:.3g} {unit}"
         )
-    more = (
-        f" and {len(passed_columns) - _MAX_NAMED_JOINTS} more joints"
-        if len(passed_columns) > _MAX_NAMED_JOINTS
-        else ""
-    )
     one = len(passed_columns) == 1
     return (
-        f"{', '.join(words)}{more}: nothing stops {'it' if one else 'them'} there, give "
-        f"{'it an end stop' if one else 'them end stops'}"
+        f"{list_first(words, 'joints', _MAX_NAMED_JOINTS)}: nothing stops "
+        f"{'it' if one else 'them'} there, give {'it an end stop' if one else 'them end stops'}"
     )
 
 
@@ -295,13 +291,8 @@ def friction_chatter_text(machine: Machine, time: Array, rows: LayoutView, step:
     if count <= max(_MIN_CHATTER_SAMPLES, _MIN_CHATTER_SHARE * len(time)):
         return ""
     joints = [f"'{machine.joints[i]}'" for i in sorted(names)]
-    more = (
-        f" and {len(joints) - _MAX_NAMED_JOINTS} more joints"
-        if len(joints) > _MAX_NAMED_JOINTS
-        else ""
-    )
     return (
-        f"friction of {', '.join(joints[:_MAX_NAMED_JOINTS])}{more} chatters in {count} of "
+        f"friction of {list_first(joints, 'joints', _MAX_NAMED_JOINTS)} chatters in {count} of "
         f"{len(time)} samples, first at t = {time[first]:.4g} s: steps of {step:g} s do not "
         "follow its smoothing, leave that out, so that it sticks, or shorten the step"
     )

@@ -192,7 +192,7 @@ def study(
     ) as kept:  # fmt: skip
         rows = compute_jobs(
             measure_variant, jobs, processes, scheduler,
-            lambda done: progress and progress(done / len(jobs)), kept,
+            lambda done: progress(done / len(jobs)), kept,
         )  # fmt: skip
         reasons = tuple(reason for _, reason in rows)
         if all(reasons):

@@ -8,7 +8,6 @@ import numpy as np
 
 from crane.common.errors import ClosureError
 from crane.common.samples import Array
-from crane.control.control_law import Controller
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.integrators import StickSlipIntegrator
 from crane.simulation.integration.python_stepper import IntegrationHaltError, StepProgress
@@ -27,22 +26,13 @@ class ScipyIntegrator(StickSlipIntegrator):
 
     Args:
         chart: The machine in a chart.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
         method: One of `SCIPY_METHODS`.
         tolerance: Error of a step, relative to the size of the state.
     """
 
-    def __init__(
-        self,
-        chart: Chart,
-        control: Controller,
-        controller_state_count: int,
-        method: str,
-        tolerance: float = SCIPY_TOLERANCE,
-    ):
+    def __init__(self, chart: Chart, method: str, tolerance: float = SCIPY_TOLERANCE):
         self._tolerance = tolerance
-        super().__init__(chart, control, controller_state_count, None)
+        super().__init__(chart, None)
         self._chart, self._closure, self._method = chart, chart.machine.closure, method
 
     def _advance(
@@ -75,7 +65,7 @@ class ScipyIntegrator(StickSlipIntegrator):
             q = view(closed).q
             with suppress(ClosureError):  # of a trial state beyond the branch
                 q[:] = closure.solve(q[closure.active])
-            return self.python_stepper.observe(time, closed)[0]
+            return self.python_stepper.state_rate(time, closed)[0]
 
         absolute_tolerances = np.full(len(state), _ABSOLUTE_TOLERANCE_SHARE * self._tolerance)
         view(absolute_tolerances).q[:] *= units
@@ -114,8 +104,7 @@ class ScipyIntegrator(StickSlipIntegrator):
                 later, event_state = locate_event(trial, before, until - start, after)
                 until = start + later
             self._record(instants, until, dense_output, state, rows)
-            if progress is not None:
-                progress(self.next_instant)
+            progress(self.next_instant)
             if event_state is not None:
                 state[:] = event_state
                 self.python_stepper.close_loops(until, state)
