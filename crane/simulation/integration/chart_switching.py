@@ -32,6 +32,7 @@ _NEARLY_SINGULAR_MARGIN = 1e5  # on the inertia that counts as none, of what exp
 _LIMIT_RELAXATION = np.array([2.0, 0.1])  # factors of the limits where no chart is better
 _MAX_RECENT_STATES = 500
 _MAX_LISTED = 4  # times in a note
+_MOTION_BACK = 1e-3  # of the fastest joint, coordinate units: difference of determinants
 _REPEATED_STEPS = 4 * (NODES_BEFORE + STEPS_BEFORE)  # at least, before a crossing
 _MAX_SHARE = 2  # of steps that locate a crossing in an interval of outputs
 _CONFIGURATION_TOLERANCE = 1e-6  # between predicted and closed configuration, coordinate units
@@ -213,10 +214,10 @@ class ChartSwitchingIntegrator:
             self._recent_states,
         )
         machine, now = chart.machine, times[0] + i * step + integrator.offset
-        prediction = self._predict_crossing(now, state, times[0] + (i - 1) * step)
-        if prediction is None:
+        prediction = self._predict_crossing(state)
+        if prediction is None or np.prod(prediction) >= 3.0 * MAX_MOTION_PER_STEP:
             return None
-        crossing, speed = prediction
+        crossing, speed = now + prediction[0], prediction[1]
         share = max(1, int(np.ceil(step * speed / MAX_MOTION_PER_STEP)))
         stride = max(
             1,
@@ -279,14 +280,17 @@ class ChartSwitchingIntegrator:
             rows: See `run`.
 
         Returns:
-            Index of the next instant; None where instants are close already, or those before are
-            unknown.
+            Index of the next instant; None where there is no crossing ahead, instants are close
+            already, or those before are unknown.
         """
-        share = int(np.ceil(step * self._speed(state) / MAX_MOTION_PER_STEP))
-        needed = int(np.ceil(_REPEATED_STEPS / max(share, 1)))
-        before = min(max(needed, 2), len(self._recent_states))
-        if share <= _MAX_SHARE or not before:
+        prediction = self._predict_crossing(state)
+        if prediction is None or prediction[0] > 2.0 * step or not len(self._recent_states):
             return None
+        share = int(np.ceil(step * prediction[1] / MAX_MOTION_PER_STEP))
+        if share <= _MAX_SHARE:
+            return None
+        needed = int(np.ceil(_REPEATED_STEPS / share))
+        before = min(max(needed, 2), len(self._recent_states))
         state[:], self._integrator.offset = self._recent_states[-before], 0.0
         end = min(i + 1, len(times))
         fine_step, count = step / share, (end - i + before) * share
@@ -304,43 +308,31 @@ class ChartSwitchingIntegrator:
         self._recent_states = self._recent_states[-share:][: min(known, 1)]
         return end
 
-    def _speed(self, state: Array) -> float:
-        """Speed of the fastest joint [rad/s], [characteristic lengths per s]."""
-        at = self._chart.state_layout.view(state)
-        closure = self._chart.machine.closure
-        return float(np.abs(closure.gamma(at.q) @ at.v_a / closure.units).max())
+    def _predict_crossing(self, state: Array) -> tuple[float, float] | None:
+        """Time from a state to a branch crossing ahead, and speed of the fastest joint; else None.
 
-    def _predict_crossing(
-        self, now: float, state: Array, last_time: float
-    ) -> tuple[float, float] | None:
-        """Time of a branch crossing ahead of a state, and speed of the fastest joint; else None.
-
-        Args:
-            now: Time of the state [s].
-            state: The state.
-            last_time: Time of the last recent state [s].
+        By the least determinant of the loops at the state and a little before.
         """
         chart, closure = self._chart, self._chart.machine.closure
-        if not closure.is_compiled or not len(self._recent_states):
+        if not (closure.is_compiled and np.isfinite(state).all()):
             return None
-        at, last = (chart.state_layout.view(x) for x in (state, self._recent_states[-1]))
-        determinant, last_determinant = (
-            closure.compiled_closure.least_determinant(at.q),
-            closure.compiled_closure.least_determinant(last.q),
+        at = chart.state_layout.view(state)
+        v = closure.gamma(at.q) @ at.v_a
+        speed = float(np.abs(v / closure.units).max())
+        if not speed:
+            return None
+        time_back = _MOTION_BACK / speed
+        determinant, determinant_before = (
+            closure.compiled_closure.least_determinant(q) for q in (at.q, at.q - time_back * v)
         )
-        if not (now > last_time and 0.0 < determinant < last_determinant):
+        if not 0.0 < determinant < determinant_before:
             return None
-        time_to_crossing = determinant / (last_determinant - determinant) * (now - last_time)
-        v, speed = closure.gamma(at.q) @ at.v_a, self._speed(state)
+        time = determinant / (determinant_before - determinant) * time_back
         home = self._known_integrators[0][0].machine
-        is_singular = relative_rank(
-            chart.machine, at.q + time_to_crossing * v
-        ) < MAX_RELATIVE_RANK * relative_rank(home, home.home)
-        return (
-            (now + time_to_crossing, speed)
-            if is_singular and time_to_crossing * speed < 3.0 * MAX_MOTION_PER_STEP
-            else None
+        is_singular = relative_rank(chart.machine, at.q + time * v) < (
+            MAX_RELATIVE_RANK * relative_rank(home, home.home)
         )
+        return (time, speed) if is_singular else None
 
     def _record_crossing(
         self,
