@@ -1,23 +1,17 @@
-"""Description of an identified machine: friction laws, and URDF content."""
+"""Description of an identified machine: friction laws, bodies of locked joints, motors."""
 
 from collections.abc import Mapping
 from dataclasses import fields
-from pathlib import Path
-from typing import Any
-from xml.sax.saxutils import escape
 
 import numpy as np
-import pinocchio as pin
-from lxml import etree
 
-from crane.common.atomic_output import portable_file_name
 from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.description.force_elements import Friction
-from crane.description.kinematic_tree import Inertial
+from crane.description.kinematic_tree import Inertial, Joint, Link
 from crane.dynamics.dynamics import Dynamics
-from crane.formats.visuals.urdf_shapes import find_mesh_file
-from crane.formats.xml_file import add_inertial
+from crane.formats.machine_file.machine_writer import MachineDraft, friction_data
+from crane.formats.xml_file import add_joint, add_link
 from crane.identification.mechanics.feasible_parameters import (
     body_parameters,
     pseudo_inertia,
@@ -39,23 +33,6 @@ _SPEED_COUNT = 100  # speeds of a comparison of laws, in each direction
 _MAX_STRIBECK_SHARE = 0.3  # largest Stribeck velocity, relative to the largest speed
 _STRIBECK_GRID_SIZE = 30  # Stribeck velocities of the search
 _FLATNESS_TOLERANCE = 1e-6  # smallest eigenvalue of the scaled pseudo-inertia of a flat body
-_URDF_TEMPLATE = """<?xml version="1.0"?>
-<!-- The rotor of the motor that turns with {words}: its angle is theirs on the joints' side. -->
-<robot name="{name}">
-  <link name="{name}_stator"/>
-  <joint name="{name}" type="continuous">
-    <parent link="{name}_stator"/>
-    <child link="{name}_rotor"/>
-    <axis xyz="0 0 1"/>
-  </joint>
-  <link name="{name}_rotor">
-    <inertial>
-      <mass value="1e-6"/>
-      <inertia ixx="1e-12" ixy="0" ixz="0" iyy="1e-12" iyz="0" izz="1e-12"/>
-    </inertial>
-  </link>
-</robot>
-"""
 
 
 def friction_laws(
@@ -196,95 +173,26 @@ def divide_locked_bodies(
     return out
 
 
-def replace_inertials(
-    file: Path, bodies: Mapping[str, Array], fixed_links: set[str], origin_text: str
-) -> etree._ElementTree:
-    """Replace the inertials of a URDF, and its loops by links at their ends.
-
-    Args:
-        file: The URDF.
-        bodies: Ten parameters about the link origin, by link that a joint moves.
-        fixed_links: Links fixed to one of these, whose inertials are removed.
-        origin_text: Source of the values, for a comment.
-    """
-    tree = etree.parse(str(file), etree.XMLParser(resolve_entities=False, no_network=True))
-    robot = tree.getroot()
-    for link in robot.iterfind("link"):
-        name = link.get("name").strip()
-        inertial = link.find("inertial")
-        if name in bodies:
-            new_inertial = _inertial_element(bodies[name])
-            if inertial is None:
-                link.insert(0, new_inertial)
-            else:
-                new_inertial.tail = inertial.tail
-                link.replace(inertial, new_inertial)
-        elif name in fixed_links and inertial is not None:
-            _remove_element(inertial)
-    for mesh in robot.iter("mesh"):
-        mesh_file = find_mesh_file(mesh.get("filename", ""), file.parent)
-        if mesh_file is not None:
-            mesh.set("filename", str(mesh_file.resolve()))
-    for loop in robot.findall("loop"):
-        for end in (loop.find("predecessor"), loop.find("successor")):
-            # a link with the frame at this end, as in a sub-chain
-            name = f"{loop.get('name').strip()}_{end.tag}"
-            etree.SubElement(robot, "link", name=name)
-            joint = etree.SubElement(robot, "joint", name=f"{name}_fixed", type="fixed")
-            if (origin := end.find("origin")) is not None:
-                etree.SubElement(joint, "origin", dict(origin.attrib))
-            etree.SubElement(joint, "parent", link=end.get("link").strip())
-            etree.SubElement(joint, "child", link=name)
-        _remove_element(loop)
-    comment = etree.Comment(f" Inertials: {origin_text}. ")
-    comment.tail = robot.text or "\n"
-    robot.text = "\n  "
-    robot.insert(0, comment)
-    return tree
-
-
-def _inertial_element(body: Array) -> etree._Element:
-    """Element <inertial> of ten parameters about the link origin."""
-    inertia = pin.Inertia.FromDynamicParameters(body)
-    tensor = tuple(inertia.inertia[np.triu_indices(3)].tolist())
-    link, com = etree.Element("link"), tuple(inertia.lever.tolist())
-    add_inertial(link, Inertial(float(inertia.mass), com, (0.0, 0.0, 0.0), tensor))
-    inertial = link[0]
-    inertial.text = inertial[0].tail = inertial[1].tail = "\n      "
-    inertial[2].tail = inertial.tail = "\n    "
-    return inertial
-
-
-def _remove_element(element: etree._Element) -> None:
-    """Remove an element, but not the text after it."""
-    element.tail, tail = None, element.tail
-    parent, previous = element.getparent(), element.getprevious()
-    parent.remove(element)
-    if previous is None:
-        parent.text = (parent.text or "") + (tail or "")
-    else:
-        previous.tail = (previous.tail or "") + (tail or "")
-
-
 def joint_combinations(model: IdentificationModel) -> list[ForceDirection]:
     """Directions of a model that combine several active joints."""
     directions = [term.direction for term in model.terms if isinstance(term, DirectionalTerm)]
     return list({x.name: x for x in directions if x.factors}.values())
 
 
-def motor_chain(
-    direction: ForceDirection, parent: str
-) -> tuple[dict[str, Any], dict[str, Any], str]:
-    """Rotor of a motor that turns several joints: its chain, coupling, and URDF.
+def add_motor(
+    draft: MachineDraft, direction: ForceDirection, parent: str, law: Friction, inertia: float
+) -> None:
+    """Add the rotor of a motor that turns several joints, and its coupling with them.
 
-    Its joint has the name of the direction and carries rotor inertia and friction. Its link has a
-    mass of 1 mg, as bodies need a mass.
+    Its joint has the name of the direction and carries rotor inertia and friction. Its angle is
+    that of the motor on the joints' side. Its link has a mass of 1 mg, as bodies need a mass.
     """
-    name = direction.name
-    assert direction.factors is not None
-    chain = {"name": name, "urdf": f"motor_{portable_file_name(name)}.urdf", "parent": parent}
-    coupling_factors = {name: 1.0} | {
-        joint: -factor for joint, factor in direction.factors.items()
-    }
-    text = _URDF_TEMPLATE.format(name=escape(name), words=escape(" and ".join(direction.factors)))
-    return chain, {"name": name, "joints": coupling_factors}, text
+    name, zero = direction.name, (0.0, 0.0, 0.0)
+    rotor = Inertial(1e-6, zero, zero, (1e-12, 0.0, 0.0, 1e-12, 0.0, 1e-12))
+    robot = draft.urdf_of_link(parent)
+    add_link(robot, Link(f"{name}_rotor", "", rotor))
+    add_joint(robot, Joint(name, "revolute", parent, f"{name}_rotor", "", axis=(0.0, 0.0, 1.0)))
+    turned = {joint: -factor for joint, factor in (direction.factors or {}).items()}
+    draft.data["couplings"].append({"name": name, "joints": {name: 1.0} | turned})
+    draft.data["friction"][name] = friction_data(law)
+    draft.data["rotor_inertia"][name] = inertia

@@ -1,44 +1,37 @@
 """Writing of identified machines: machine file and URDF files with identified parameters."""
 
-import shutil
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 import pinocchio as pin
-from lxml import etree
 
-from crane.common.atomic_output import replace_folder
-from crane.common.errors import CraneError, CraneWarning, InputError, OutputError
+from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.common.samples import Array
-from crane.common.unit_conversions import KeyPath
 from crane.description.force_elements import Friction
-from crane.description.kinematic_tree import inertia_problem
-from crane.description.machine_parameters import GRAVITY_PREFIX
-from crane.description.machine_schema import END_STOP, FORCE, GAS_SPRING, LOOP, ROPE
+from crane.description.kinematic_tree import Inertial, inertia_problem, with_rotor_inertias
 from crane.description.parameter_changes import lock_joints
-from crane.description.specification import Chain, MachineSpec
+from crane.description.pinocchio_conversion import inertial_from_inertia
 from crane.dynamics.dynamics import Dynamics
-from crane.formats.machine_file.machine_reader import read_machine_spec, read_plain_data
-from crane.formats.machine_file.machine_writer import friction_data
-from crane.formats.machine_file.yaml_text import format_yaml
-from crane.formats.machine_loading import load
-from crane.formats.parallel_robots import is_parallel_robot
+from crane.formats.machine_file.machine_writer import MachineDraft
+from crane.formats.machine_loading import MachineVariants, load
 from crane.identification.mechanics.base_parameters import random_samples
 from crane.identification.mechanics.identification_result import Identification
 from crane.identification.mechanics.identified_description import (
     FRICTION_PARAMETERS,
+    add_motor,
     divide_locked_bodies,
     friction_laws,
     joint_combinations,
-    motor_chain,
-    replace_inertials,
 )
 from crane.identification.mechanics.model_terms import BODY_PARAMETERS, FrictionTerm
 from crane.machine.machine import Machine
 
+T = TypeVar("T")
 _FEASIBLE_REMEDY = "give feasible=True"
 _FORCE_TOLERANCE = 1e-9  # of the largest force, for the check of the written machine
 
@@ -51,12 +44,11 @@ def write_identified(identification: Identification, folder: str | Path) -> Path
     lock=identification.described_machine.locked_joints)`.
 
     The parameters of a body are written to the link that its joint moves; inertials of links fixed
-    to it are removed. Friction, rotor inertias and gas pressures are the identified ones, other
-    passive forces those of the machine. Friction without a law in machine files is written as the
-    nearest law at steady speeds, with a warning about the difference. A motor that turns several
-    joints becomes a rotor with a coupling. Bodies of locked joints are divided among their links
-    by the descriptions. Everything else is copied from the files of the machine; meshes are
-    referred to by their paths. The written files are loaded and compared with the identification
+    to it are removed. Friction, rotor inertias and gas pressures are the identified ones, all else
+    is that of the machine, see `write_machine`. Friction without a law in machine files is written
+    as the nearest law at steady speeds, with a warning about the difference. A motor that turns
+    several joints becomes a rotor with a coupling. Bodies of locked joints are divided among their
+    links by the descriptions. The written files are loaded and compared with the identification
     before they replace existing ones.
 
     Args:
@@ -68,9 +60,8 @@ def write_identified(identification: Identification, folder: str | Path) -> Path
         The machine file.
 
     Raises:
-        InputError: The identified machine is not valid, only base parameters are known, the
-            machine has another format or parameter changes, or a machine file cannot represent the
-            terms of the model.
+        InputError: The identified machine is not valid, only base parameters are known, or a
+            machine file cannot represent the terms of the model.
         OutputError: The folder cannot be written, or contains the files of the machine.
     """
     try:
@@ -86,44 +77,16 @@ def write_identified(identification: Identification, folder: str | Path) -> Path
 
 def _write_identified(identification: Identification, folder: str | Path) -> Path:
     machine, parameters = identification.described_machine, identification.parameters
-    check_rewritable(machine)
     if parameters is None or not identification.model.bodies:
         raise InputError("forces determine base parameters only: give prior or feasible=True")
     # warnings were reported when the machine was loaded
     with warnings.catch_warnings(action="ignore", category=CraneWarning):
-        spec = read_machine_spec(machine.path)
-        unlocked_machine = load(machine.path) if machine.locked_joints else machine
+        unlocked_machine = _unlocked_machine(machine) if machine.locked_joints else machine
     bodies = divide_locked_bodies(machine, parameters, unlocked_machine)
-    chains = spec.chains if spec.payload is None else (*spec.chains, spec.payload.chain)
-    names = _file_names(chains)
-    file = f"{machine.path.stem}.yaml"
-    originals = {machine.path, *(chain.urdf for chain in chains)}
-    for name in (file, *names.values()):
-        if (target := (Path(folder) / name).resolve()) in originals:
-            raise OutputError(
-                f"{target}: is what '{machine.name}' was read from, choose another folder"
-            )
-    origin_text = (
-        f"identified by {identification.method}{', feasible' if identification.feasible else ''}"
-    )
-    if undetermined_count := identification.marks.count("not determined"):
-        origin_text += (
-            f", {undetermined_count} of {len(identification.marks)} base parameters not determined"
-        )
     laws, deviations = friction_laws(identification.model, parameters, identification.speeds)
-    content, motor_urdfs = _machine_file_content(identification, spec, names, origin_text, laws)
-    with replace_folder(folder) as part:
-        for chain in spec.chains:
-            tree = replace_inertials(chain.urdf, bodies, _fixed_links(spec), origin_text)
-            text = etree.tostring(tree, encoding="utf-8", xml_declaration=True)
-            (part / names[chain.name]).write_bytes(text.rstrip() + b"\n")
-        if spec.payload is not None:
-            payload_chain = spec.payload.chain
-            shutil.copyfile(payload_chain.urdf, part / names[payload_chain.name])
-        for name, text in motor_urdfs.items():
-            (part / name).write_text(text, encoding="utf-8")
-        (part / file).write_text(content, encoding="utf-8")
-        _check_written_machine(identification, bodies, part / file, exact=not deviations)
+    draft = _identified_draft(identification, unlocked_machine, bodies, laws)
+    check = partial(_check_written_machine, identification, bodies, exact=not deviations)
+    file = draft.write_folder(folder, check=check)
     if deviations:
         worst = max(deviations, key=lambda name: deviations[name])
         unit = "N" if worst in machine.joints and machine.unit(worst) == "m" else "N m"
@@ -133,28 +96,72 @@ def _write_identified(identification: Identification, folder: str | Path) -> Pat
             f"{deviations[worst]:.3g} {unit} ({worst})"
         )
         warnings.warn(text, CraneWarning, stacklevel=3)
-    return Path(folder) / file
+    return file
 
 
-def check_rewritable(machine: Machine) -> None:
-    """Check that the files of a machine can be written with other parameters.
+def _unlocked_machine(machine: Machine) -> Machine:
+    """The machine without locked joints; force elements that were replaced since stay replaced."""
+    variants = MachineVariants(replace(machine, locked_joints={}))
+    locked_spec, elements = lock_joints(variants.spec, machine.locked_joints), {}
+    for kind in ("forces", "gas_springs", "ropes", "end_stops"):
+        kept = getattr(locked_spec, kind)
+        removed = (x for x in getattr(variants.spec, kind) if x not in kept)
+        elements[kind] = (*getattr(machine, kind), *removed)
+    return variants.machine({}).replace(**elements)
 
-    Raises:
-        InputError: The format is not supported, or the machine has parameter changes other than
-            its gravity.
-    """
-    if any(chain.urdf.suffix.lower() != ".urdf" for chain in machine.chains) or (
-        not (machine.path.suffix.lower() == ".urdf") and is_parallel_robot(machine.path)
-    ):
-        raise InputError(
-            f"{machine.path.name}: an identified machine needs a machine file or URDF, make "
-            f"one: crane convert {machine.command_line_arguments} FOLDER"
+
+def _identified_draft(
+    result: Identification,
+    unlocked_machine: Machine,
+    bodies: Mapping[str, Array],
+    laws: Mapping[str, Friction],
+) -> MachineDraft:
+    """The identified machine, with notes on the uncertainty of its friction and rotor inertias."""
+    tree, described = unlocked_machine.tree, result.described_machine
+    rotors = _parameters_of_kind(result, "rotor_inertia")
+    for joint, value in rotors.items():
+        if value < 0:
+            raise InputError(f"'{joint}': rotor inertia is {value:g}, give feasible=True")
+    inertials: dict[str, Inertial | None] = {
+        link: None
+        for link, first in tree.bodies_by_link().items()
+        if link != first != tree.root_link
+    }
+    for link, body in bodies.items():
+        inertials[link] = inertial_from_inertia(pin.Inertia.FromDynamicParameters(body))
+    tree = tree.with_parts(*(replace(tree.links[x], inertial=y) for x, y in inertials.items()))
+    motors = joint_combinations(result.model)
+    directions = [motor.name for motor in motors]
+    friction = {x: y for x, y in unlocked_machine.friction.items() if x in described.locked_joints}
+    scales = _parameters_of_kind(result, "gas_scale")
+    draft = MachineDraft(
+        replace(
+            unlocked_machine,
+            source=f"{_origin_text(result)}; else {described.source or described.path.name}",
+            tree=with_rotor_inertias(tree, _without(rotors, directions)),
+            friction=friction | _without(laws, directions),
+            gas_springs=tuple(
+                replace(x, pressure=x.pressure * scales.get(x.joint, 1.0))
+                for x in unlocked_machine.gas_springs
+            ),
         )
-    if not all(name.startswith(GRAVITY_PREFIX) for name in machine.parameter_changes):
-        raise InputError(
-            f"'{machine.name}' was loaded with parameter changes, identify it as its files "
-            "describe it"
-        )
+    )
+    for motor in motors:
+        law, inertia = laws.get(motor.name, Friction()), rotors.get(motor.name, 0.0)
+        add_motor(draft, motor, tree.root_link, law, inertia)
+    draft.add_notes(_uncertainty_notes(result, laws, rotors))
+    return draft
+
+
+def _without(values: Mapping[str, T], names: Sequence[str]) -> dict[str, T]:
+    return {name: value for name, value in values.items() if name not in names}
+
+
+def _origin_text(result: Identification) -> str:
+    text = f"identified by {result.method}{', feasible' if result.feasible else ''}"
+    if undetermined_count := result.marks.count("not determined"):
+        text += f", {undetermined_count} of {len(result.marks)} base parameters not determined"
+    return text
 
 
 def _infeasible_body(bodies: Mapping[str, Array]) -> str | None:
@@ -168,110 +175,20 @@ def _infeasible_body(bodies: Mapping[str, Array]) -> str | None:
     return None
 
 
-def _file_names(chains: Sequence[Chain]) -> dict[str, str]:
-    """File name of each chain; a number distinguishes equal names."""
-    taken: dict[str, str] = {}
-    for number, chain in enumerate(chains):
-        name = chain.urdf.name
-        taken[chain.name] = f"{number}_{name}" if name in taken.values() else name
-    return taken
-
-
-def _fixed_links(spec: MachineSpec) -> set[str]:
-    """Links that are fixed to one that a joint moves."""
-    parent_joints = {joint.child: joint for joint in spec.tree.joints.values()}
-    found = set()
-    for link in parent_joints:
-        at = link
-        while at in parent_joints and not parent_joints[at].is_movable:
-            at = parent_joints[at].parent
-        if at != link and at in parent_joints:
-            found.add(link)
-    return found
-
-
-def _machine_file_content(
-    result: Identification,
-    spec: MachineSpec,
-    names: Mapping[str, str],
-    origin_text: str,
-    laws: Mapping[str, Friction],
-) -> tuple[str, dict[str, str]]:
-    """Content of the machine file, and of URDF files of motors that turn several joints."""
-    machine = result.described_machine
-    if machine.path.suffix.lower() == ".urdf":
-        data: dict[str, Any] = {"name": machine.name, "chains": [{"name": spec.chains[0].name}]}
-        data["loops"] = [
-            LOOP.values_of(loop) | {"axis": [float(x) for x in loop.axis]} for loop in spec.loops
-        ]
-        data["active"] = list(spec.active if spec.active is not None else machine.active)
-        if machine.tip is not None:
-            data["tip"] = machine.tip
-    else:
-        data = read_plain_data(machine.path)
-    if machine.gravity != spec.gravity:
-        data["gravity"] = list(machine.gravity)
-    data["source"] = f"{origin_text}; else {machine.source or machine.path.name}"
-    for chain in data["chains"]:
-        chain["urdf"] = names[chain["name"]]
-    if spec.payload is not None:
-        data["payload"] = {"urdf": names[spec.payload.chain.name]}
-    motor_urdfs = {}
-    combinations = joint_combinations(result.model)
-    for direction in combinations:
-        chain, coupling, text = motor_chain(direction, spec.tree.root_link)
-        data["chains"].append(chain)
-        data["couplings"] = [*(data.get("couplings") or ()), coupling]
-        motor_urdfs[chain["urdf"]] = text
-    friction = {x: law for x, law in spec.friction.items() if x in machine.locked_joints}
-    for joint in (*machine.joints, *(x.name for x in combinations)):
-        if joint in laws or joint in spec.friction:  # without friction in the model it has none
-            friction[joint] = laws.get(joint, Friction())
-    data["friction"] = {joint: friction_data(law) for joint, law in friction.items()}
-    rotors = {joint.name: joint.rotor_inertia for joint in spec.tree.moving_joints}
-    rotors |= _parameters_of_kind(result, "rotor_inertia")
-    for joint, value in rotors.items():
-        if value < 0:
-            raise InputError(f"'{joint}': rotor inertia is {value:g}, give feasible=True")
-    data["rotor_inertia"] = {joint: value for joint, value in rotors.items() if value}
-    scales = _parameters_of_kind(result, "gas_scale")
-    moving = lock_joints(spec, machine.locked_joints) if machine.locked_joints else spec
-
-    def elements_of(kind: str) -> list[Any]:
-        """Elements of a kind, including those that locked joints removed."""
-        kept = getattr(moving, kind)
-        return [*getattr(machine, kind), *(x for x in getattr(spec, kind) if x not in kept)]
-
-    data["forces"] = [FORCE.values_of(item) for item in elements_of("forces")]
-    data["gas_springs"] = {
-        item.joint: GAS_SPRING.values_of(item)
-        | {"pressure": item.pressure * scales.get(item.joint, 1.0)}
-        for item in elements_of("gas_springs")
-    }
-    data["ropes"] = [ROPE.values_of(item) for item in elements_of("ropes")]
-    data["end_stops"] = {item.joint: END_STOP.values_of(item) for item in elements_of("end_stops")}
-    for key in ("loops", "forces", "gas_springs", "ropes", "end_stops", "rotor_inertia"):
-        if not data.get(key):
-            data.pop(key, None)
-    notes = _uncertainty_notes(result, data)
-    return format_yaml(data, notes, spec.written_numbers), motor_urdfs
-
-
-def _uncertainty_notes(result: Identification, data: Mapping[str, Any]) -> dict[KeyPath, str]:
+def _uncertainty_notes(
+    result: Identification, laws: Mapping[str, Friction], rotors: Mapping[str, float]
+) -> dict[str, str]:
     """Comments on the uncertainty of friction and rotor inertias that are base parameters."""
-    found: dict[KeyPath, str] = {}
+    found: dict[str, str] = {}
     half = 0.5 * np.diff(result.confidence_interval(), axis=1)[:, 0]
     for i, (name, group) in enumerate(zip(result.names, result.base.groups, strict=True)):
         owner, _, kind = name.rpartition(".")
-        key_path = (kind, owner) if kind == "rotor_inertia" else ("friction", owner, kind)
-        place: Any = data
-        for key in key_path[:-1]:
-            place = place.get(key, {})
-        if group == name and np.isclose(
-            place.get(key_path[-1], np.nan), result.values[i], rtol=1e-9
-        ):
+        is_rotor = kind == "rotor_inertia"
+        written = rotors[owner] if is_rotor else getattr(laws.get(owner), kind, np.nan)
+        if group == name and np.isclose(written, result.values[i], rtol=1e-9):
             mark = result.marks[i] and f", {result.marks[i]}"
-            found[key_path] = f"identified ±{half[i]:.2g}, 95 %{mark}"
+            key = name if is_rotor else f"friction.{name}"
+            found[key] = f"identified ±{half[i]:.2g}, 95 %{mark}"
     return found
 
 
