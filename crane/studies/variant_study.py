@@ -306,10 +306,9 @@ def _evaluate_expressions(machine: Machine, study_job: StudyJob) -> dict[str, fl
     functions = load_user_measures(study_job.options.user_measures)
     options = replace(study_job.options, user_measures=functions)
     evaluation = VariantEvaluation(
-        MachineVariants(machine), (), np.zeros(0), np.zeros(0), options,
-        load_positions(expressions),
-    )  # fmt: skip
-    values = [evaluation.evaluate(x) for x in expressions]
+        MachineVariants(machine), {}, options, load_positions(expressions)
+    )
+    values = [evaluation.evaluate(x).value for x in expressions]
     for text, value in zip(
         study_job.requirements, values[len(study_job.expressions) :], strict=True
     ):

@@ -121,14 +121,13 @@ class DesignProblem:
                 with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
                     evaluation = VariantEvaluation(
                         self._variants,
-                        job.parameter_names,
-                        values,
-                        job.upper - job.lower,
+                        dict(zip(job.parameter_names, values.tolist(), strict=True)),
                         self._options,
                         self._load_positions,
+                        dict(zip(job.parameter_names, job.upper - job.lower, strict=True)),
                     )
                     duals = [
-                        evaluation.evaluate_dual(x) for x in (*self.objectives, *self.requirements)
+                        evaluation.evaluate(x) for x in (*self.objectives, *self.requirements)
                     ]
                 for text, x in zip((*self.objectives, *self.requirements), duals, strict=True):
                     if not (np.isfinite(x.value) and np.isfinite(x.derivatives).all()):

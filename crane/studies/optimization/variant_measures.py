@@ -1,7 +1,7 @@
 """Measures of a variant of a machine, and their derivatives by the parameters that vary."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Any
 
@@ -29,7 +29,6 @@ from crane.studies.optimization.measure_expressions import (
     DualNumber,
     MeasureExpression,
     MeasureFunction,
-    constant,
     evaluate_user_measure,
 )
 
@@ -68,11 +67,11 @@ class VariantEvaluation:
 
     Args:
         variants: Variants of the machine.
-        parameter_names: Parameters that vary, in order.
-        values: (k,) values of these parameters.
-        ranges: (k,) ranges of these parameters, which scale the steps of differences.
+        values: Values of the parameters that vary, by name.
         options: Options of the measures.
         load_positions: All arguments of `load` that are needed, to compute them together.
+        ranges: Ranges of the k parameters by which derivatives are computed, by name; they scale
+            the steps of differences.
 
     Raises:
         CraneError: The machine cannot be assembled with these parameters.
@@ -81,82 +80,77 @@ class VariantEvaluation:
     def __init__(
         self,
         variants: MachineVariants,
-        parameter_names: Sequence[str],
-        values: Array,
-        ranges: Array,
+        values: Mapping[str, float],
         options: MeasureOptions,
         load_positions: Sequence[tuple[float, ...]] = (),
+        ranges: Mapping[str, float] | None = None,
     ):
-        self._variants, self._parameter_names = variants, list(parameter_names)
-        self._values = values
-        self._ranges, self._options, self._load_positions = ranges, options, list(load_positions)
-        self.machine = variants.machine(dict(zip(parameter_names, values.tolist(), strict=True)))
-        self._loads: dict[tuple[bool, tuple[float, ...]], DualNumber] = {}
-        self._measure, self._extreme = cache(self._compute_measure), cache(self._find_extreme)
-        self._perturbed = cache(self._create_neighbour)
+        self._variants, self._values, self._ranges = variants, dict(values), ranges or {}
+        self._options, self._load_positions = options, list(load_positions)
+        self.machine = variants.machine(self._values)
+        self._loads: dict[tuple[float, ...], DualNumber] = {}
+        self._measure, self._neighbour = (
+            cache(self._compute_measure),
+            cache(self._create_neighbour),
+        )
 
-    def evaluate(self, expression: MeasureExpression) -> float:
-        """Return the value of an expression."""
-        return _evaluate(expression, lambda *call: constant(self._measure(*call), 0), 0).value
+    def evaluate(self, expression: MeasureExpression) -> DualNumber:
+        """Return the value of an expression with its derivatives (k,)."""
 
-    def evaluate_dual(self, expression: MeasureExpression) -> DualNumber:
-        """Return the value of an expression with its derivatives."""
-        return _evaluate(expression, self._dual_measure, len(self._parameter_names))
+        def call(name: str, arguments: tuple[Any, ...]) -> DualNumber:
+            if name in DUAL_FUNCTIONS:
+                return DUAL_FUNCTIONS[name](*arguments)
+            return self._measure(name, tuple(getattr(x, "value", x) for x in arguments))
 
-    def _dual_measure(self, name: str, arguments: tuple[Any, ...]) -> DualNumber:
+        result: DualNumber = expression(lambda name: self._measure(name, ()), call, self._constant)
+        return result
+
+    def _constant(self, value: float) -> DualNumber:
+        return DualNumber(value, np.zeros(len(self._ranges)))
+
+    def _compute_measure(self, name: str, arguments: tuple[Any, ...]) -> DualNumber:
         if name == "load":
             return self._rated_load(arguments)
         if name in ("reach", "highest", "lowest", "nearest"):
-            value, q = self._extreme(name, arguments)
-            return DualNumber(value, self._extreme_derivatives(name, arguments, q))
+            return self._find_extreme(name, arguments)
         if name == "mass":
-            derivatives = np.zeros(0)
-            if self._parameter_names:
-                derivatives = self._statics.parameter_derivatives(
-                    self.machine.home[None], self._parameter_names
-                ).total_mass[0]
-            return DualNumber(self._measure(name, ()), derivatives)
+            home = self.machine.home[None]
+            mass = self._constant(float(self._statics.evaluate(home).total_mass[0]))
+            if not self._ranges:
+                return mass
+            derivatives = self._statics.parameter_derivatives(home, list(self._ranges))
+            return replace(mass, derivatives=derivatives.total_mass[0])
         if name == "number" or (name in self._variants.values and not arguments):
-            parameter = str(arguments[0]) if name == "number" else name
-            derivatives = np.array([float(parameter == other) for other in self._parameter_names])
-            return DualNumber(self._measure(name, arguments), derivatives)
-        return DualNumber(self._measure(name, arguments), self._differences(name, arguments))
+            parameter = str(arguments[0]) if arguments else name
+            derivatives = np.array([float(parameter == other) for other in self._ranges])
+            return DualNumber(self._parameter_value(parameter), derivatives)
+        value = self._measured_value(name, arguments)
+        return DualNumber(value, self._differences(name, arguments, value))
 
-    def _differences(self, name: str, arguments: tuple[Any, ...]) -> Array:
+    def _differences(self, name: str, arguments: tuple[Any, ...], nominal: float) -> Array:
         """Return central differences of a measure; one-sided if one side cannot be assembled."""
-        nominal = self._measure(name, arguments)
-        out = np.zeros(len(self._parameter_names))
-        for i, step in enumerate(_DIFFERENCE_STEP * self._ranges):
-            signed_values = []
+        out = np.zeros(len(self._ranges))
+        for i, (parameter, interval) in enumerate(self._ranges.items()):
+            step, signed_values = _DIFFERENCE_STEP * interval, []
             for sign in (1.0, -1.0):
                 try:
-                    signed_values.append(
-                        (sign, self._perturbed(i, sign * step)._measure(name, arguments))
-                    )
+                    neighbour = self._neighbour(parameter, sign * step)
+                    signed_values.append((sign, neighbour._measure(name, arguments).value))
                 except CraneError:
                     signed_values.append((0.0, nominal))
             (upper_sign, upper_value), (lower_sign, lower_value) = signed_values
             if upper_sign == lower_sign:
-                raise InputError(
-                    f"'{name}' cannot be followed as '{self._parameter_names[i]}' varies"
-                )
+                raise InputError(f"'{name}' cannot be followed as '{parameter}' varies")
             out[i] = (upper_value - lower_value) / ((upper_sign - lower_sign) * step)
         return out
 
-    def _create_neighbour(self, parameter_index: int, step: float) -> "VariantEvaluation":
-        values = self._values.copy()
-        values[parameter_index] += step
-        return VariantEvaluation(
-            self._variants, self._parameter_names, values, self._ranges, self._options,
-            self._load_positions,
-        )  # fmt: skip
+    def _create_neighbour(self, parameter: str, step: float) -> "VariantEvaluation":
+        values = self._values | {parameter: self._values[parameter] + step}
+        return VariantEvaluation(self._variants, values, self._options, self._load_positions)
 
-    def _compute_measure(self, name: str, arguments: tuple[Any, ...]) -> float:
+    def _measured_value(self, name: str, arguments: tuple[Any, ...]) -> float:
+        """Return the value of a measure without exact derivatives."""
         machine = self.machine
-        if name == "load":
-            return self._rated_load(arguments, False).value
-        if name in ("reach", "highest", "lowest", "nearest"):
-            return self._extreme(name, arguments)[0]
         if name == "net_torque":
             return torques(
                 machine, self._options.frame, radius=arguments[0], rule=self._options.rule
@@ -165,10 +159,6 @@ class VariantEvaluation:
             radius = float(np.median(self._configuration_search.section_positions[:, 0]))
             result = torques(machine, self._options.frame, rule=self._options.rule, radius=radius)
             return result.gross_torque if name == "gross_torque" else result.slewing_torque
-        if name == "mass":
-            return float(self._statics.evaluate(machine.home[None]).total_mass[0])
-        if name == "number":
-            return self._parameter_value(str(arguments[0]))
         if name in self._options.user_measures:
             return evaluate_user_measure(name, self._options.user_measures[name], machine)
         if name in task_measures(machine):
@@ -180,9 +170,7 @@ class VariantEvaluation:
         return self._parameter_value(name)
 
     def _parameter_value(self, name: str) -> float:
-        values = self._variants.values | dict(
-            zip(self._parameter_names, self._values, strict=True)
-        )
+        values = self._variants.values | self._values
         if name not in values:
             known = available_measures(self.machine, self._options.user_measures)
             check_name(name, known, f"measure '{name}' is unknown")
@@ -209,30 +197,20 @@ class VariantEvaluation:
     def _stroke_values(self) -> dict[str, float]:
         return measure_strokes(self.machine)
 
-    def _rated_load(
-        self, position: tuple[float, ...], with_derivatives: bool = True
-    ) -> DualNumber:
+    def _rated_load(self, position: tuple[float, ...]) -> DualNumber:
         """Return the rated load at a position, 0 if it is out of reach, with derivatives."""
-        if (with_derivatives, position) not in self._loads:
-            all_positions = [
-                position,
-                *(x for x in self._load_positions if (with_derivatives, x) not in self._loads),
-            ]
+        if position not in self._loads:
             by_slew: dict[tuple[float, ...], list[tuple[float, ...]]] = {}
-            for x in all_positions:
+            for x in (position, *(x for x in self._load_positions if x not in self._loads)):
                 by_slew.setdefault(x[2:], []).append(x)
             for slews, positions in by_slew.items():
-                self._compute_loads(positions, slews, with_derivatives)
-        return self._loads[with_derivatives, position]
+                self._compute_loads(positions, slews)
+        return self._loads[position]
 
     def _compute_loads(
-        self,
-        positions: Sequence[tuple[float, ...]],
-        slews: tuple[float, ...],
-        with_derivatives: bool,
+        self, positions: Sequence[tuple[float, ...]], slews: tuple[float, ...]
     ) -> None:
         radii, heights = (sorted({x[i] for x in positions}) for i in (0, 1))
-        zero = constant(0.0, len(self._parameter_names))
         try:
             chart = capacity(
                 self.machine, self._options.frame, rule=self._options.rule, radii=radii,
@@ -241,21 +219,21 @@ class VariantEvaluation:
         except InputError as error:
             if "reaches none" not in str(error):
                 raise
-            self._loads |= {(with_derivatives, place): zero for place in positions}
+            self._loads |= {place: self._constant(0.0) for place in positions}
             return
-        chart_derivatives = chart.derivatives(self._parameter_names) if with_derivatives else None
+        chart_derivatives = chart.derivatives(list(self._ranges)) if self._ranges else None
         for position in positions:
             a, b = radii.index(position[0]), heights.index(position[1])
             loads = np.nan_to_num(chart.loads[:, b, a], nan=0.0)
             s = int(loads.argmin())
             if not np.isfinite(loads[s]):
                 raise InputError(f"nothing limits the load at {position}, choose another position")
-            load_derivatives = zero.derivatives
-            if chart_derivatives is not None and loads[s] > 0:
-                load_derivatives = chart_derivatives[s, b, a]
-                if np.isnan(load_derivatives).any():  # limited by a pin
-                    load_derivatives = self._differences("load", position)
-            self._loads[with_derivatives, position] = DualNumber(float(loads[s]), load_derivatives)
+            load = self._constant(float(loads[s]))
+            if chart_derivatives is not None and load.value > 0:
+                load = replace(load, derivatives=chart_derivatives[s, b, a])
+            if np.isnan(load.derivatives).any():  # limited by a pin
+                load = replace(load, derivatives=self._differences("load", position, load.value))
+            self._loads[position] = load
 
     def _extreme_objective(
         self, name: str, arguments: tuple[Any, ...], tip: Array
@@ -274,10 +252,11 @@ class VariantEvaluation:
         length = np.linalg.norm(horizontal, axis=1)
         return -length, -horizontal / np.maximum(length, 1e-300)[:, None]
 
-    def _find_extreme(self, name: str, arguments: tuple[Any, ...]) -> tuple[float, Array]:
-        """Return the extreme reach, height or distance of the tip, and its configuration.
+    def _find_extreme(self, name: str, arguments: tuple[Any, ...]) -> DualNumber:
+        """Return the extreme reach, height or distance of the tip.
 
-        It is searched from the best configurations over all strokes, with exact derivatives.
+        It is searched from the best configurations over all strokes, with exact derivatives. Its
+        derivatives are those at its fixed configuration (envelope theorem).
         """
         search, closure = self._configuration_search, self.machine.closure
         strokes = search.moving
@@ -313,38 +292,14 @@ class VariantEvaluation:
             if result.fun < lowest_cost:
                 lowest_cost, best_configuration = float(result.fun), last_closed[0]
         sign = -1.0 if name in ("reach", "highest") else 1.0
-        return sign * lowest_cost, best_configuration
-
-    def _extreme_derivatives(self, name: str, arguments: tuple[Any, ...], q: Array) -> Array:
-        """Return the derivatives at the fixed configuration of the extreme (envelope theorem)."""
-        if not self._parameter_names:
-            return np.zeros(0)
-        tip_derivatives = self._statics.parameter_derivatives(
-            q[None], self._parameter_names
-        ).tip_positions[0]
+        extreme, q = self._constant(sign * lowest_cost), best_configuration[None]
+        if not self._ranges:
+            return extreme
         _, gradient = self._extreme_objective(
-            name, arguments, self._statics.evaluate(q[None]).tip_positions
+            name, arguments, self._statics.evaluate(q).tip_positions
         )
-        sign = -1.0 if name in ("reach", "highest") else 1.0
-        return np.asarray(sign * gradient[0] @ tip_derivatives)
-
-
-def _evaluate(
-    expression: MeasureExpression,
-    measure: Callable[[str, tuple[Any, ...]], DualNumber],
-    derivative_count: int,
-) -> DualNumber:
-    """Return an expression of measures, each a function of its name and arguments."""
-
-    def call(name: str, arguments: tuple[Any, ...]) -> DualNumber:
-        if name in DUAL_FUNCTIONS:
-            return DUAL_FUNCTIONS[name](*arguments)
-        return measure(name, tuple(getattr(x, "value", x) for x in arguments))
-
-    result: DualNumber = expression(
-        lambda name: measure(name, ()), call, lambda x: constant(x, derivative_count)
-    )
-    return result
+        derivatives = self._statics.parameter_derivatives(q, list(self._ranges))
+        return replace(extreme, derivatives=sign * gradient[0] @ derivatives.tip_positions[0])
 
 
 def available_measures(
