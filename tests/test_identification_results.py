@@ -19,7 +19,6 @@ from warned import without_a_word
 import crane
 from crane.common.errors import CraneWarning, InputError, OutputError, RecordingError
 from crane.identification.mechanics.identification_model import default_terms
-from crane.identification.mechanics.identified_description import divide_locked_bodies
 from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.identify_payload import identify_payload
 from crane.identification.mechanics.model_terms import (
@@ -27,6 +26,7 @@ from crane.identification.mechanics.model_terms import (
     body_names,
     friction_term,
 )
+from crane.identification.mechanics.write_identified import divide_locked_bodies
 from crane.identification.signals.signal_processing import Motion
 from crane.recordings.measured_recordings import read_run
 

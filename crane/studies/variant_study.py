@@ -3,7 +3,7 @@
 import itertools
 import math
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,7 @@ from crane.common.errors import (
     check_name,
     prefix_location,
 )
-from crane.common.progress import progress_reporter
+from crane.common.progress import Progress, ignore_progress, progress_reporter
 from crane.common.samples import Array, as_count, as_samples, as_seed
 from crane.description.machine_parameters import parameter_unit
 from crane.dynamics.dynamics import Dynamics
@@ -107,7 +107,7 @@ def study(
     processes: int = 1,
     scheduler: str | None = None,
     checkpoint: str | Path | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Study:
     """Measure variants of a machine: a grid of parameter values, or random draws.
 
@@ -144,7 +144,7 @@ def study(
         TerminatedWorkerError: Processes or the scheduler ended before their time.
         OutputError: The checkpoint cannot be written.
     """
-    progress = progress_reporter(progress)
+    progress = progress_reporter(progress) or ignore_progress
     check_process_count(processes)
     seed = as_seed(seed)
     base_machine, name = machine_from_files(machine)
@@ -192,7 +192,7 @@ def study(
     ) as kept:  # fmt: skip
         rows = compute_jobs(
             measure_variant, jobs, processes, scheduler,
-            lambda done: progress and progress(done / len(jobs)), kept,
+            lambda done: progress(done / len(jobs)), kept,
         )  # fmt: skip
         reasons = tuple(reason for _, reason in rows)
         if all(reasons):

@@ -10,7 +10,7 @@ import numpy as np
 
 from crane.common.checkpoint import Checkpoint
 from crane.common.errors import CraneError, InputError, RecordingError, check_name, prefix_location
-from crane.common.progress import progress_reporter
+from crane.common.progress import Progress, ignore_progress, progress_reporter
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
 from crane.description.machine_parameters import parameter_unit
@@ -38,9 +38,12 @@ from crane.identification.calibration.calibration_statistics import (
     score_tests,
     select_parameters,
 )
-from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt, Progress
+from crane.identification.calibration.levenberg_marquardt import (
+    LOG_COLUMNS,
+    LevenbergMarquardt,
+    SearchLog,
+)
 from crane.identification.calibration.recording_case import RecordingCase, recording_case
-from crane.identification.calibration.search_log import LOG_COLUMNS, SearchLog
 from crane.identification.calibration.unknowns import Unknown, build_unknowns, candidate_parameters
 from crane.machine.machine import Machine
 from crane.recordings.logs import read_log_columns
@@ -119,7 +122,7 @@ def calibrate(
         RecordingError: A recording is malformed, or has no valve signals.
         SimulationError: The simulation of a recording fails with the initial parameters.
     """
-    progress = progress_reporter(progress)
+    progress = progress_reporter(progress) or ignore_progress
     if not isinstance(machine, Machine):
         machine = load(machine)
     paths = [recordings] if isinstance(recordings, str | Path) else list(recordings)

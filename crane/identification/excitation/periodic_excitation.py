@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from crane.common.atomic_output import replace_file
 from crane.common.errors import InputError, check_name
-from crane.common.progress import progress_reporter
+from crane.common.progress import Progress, ignore_progress, progress_reporter
 from crane.common.result import Result
 from crane.common.samples import Array, as_count, as_number, as_seed
 from crane.common.threads import with_single_threaded_blas
@@ -25,7 +25,6 @@ from crane.identification.excitation.fourier_trajectory import FourierTrajectory
 from crane.identification.excitation.trajectory_optimizer import (
     COARSE_SAMPLES,
     QUANTITIES,
-    Progress,
     TrajectoryLimits,
     TrajectoryOptimizer,
     joint_values,
@@ -233,7 +232,7 @@ def excite(
     Raises:
         InputError: Arguments are out of range, or no trajectory is within the limits.
     """
-    progress = progress_reporter(progress)
+    progress = progress_reporter(progress) or ignore_progress
     check_name(criterion, CRITERIA, f"criterion '{criterion}' is unknown")
     for what, value in (("starts", starts), ("harmonics", harmonics), ("periods", periods)):
         as_count(value, f"the number of {what}")
@@ -307,7 +306,7 @@ def _force_noise(machine: Machine, noise: Mapping[str, float] | None) -> tuple[A
 
 
 def _optimize_best(
-    search: TrajectoryOptimizer, draws: Array, starts: int, progress: Progress | None
+    search: TrajectoryOptimizer, draws: Array, starts: int, progress: Progress
 ) -> Array:
     """The best vector after optimization of the best random ones (V, size)."""
     costs = search.evaluate(draws)[0]
@@ -316,8 +315,7 @@ def _optimize_best(
     for start_index, start in enumerate(draws[order]):
 
         def report(share: float, tried: int = start_index) -> None:
-            if progress is not None:
-                progress((tried + share) / len(order))
+            progress((tried + share) / len(order))
 
         found = search.optimize(start, report)
         if (cost := float(search.evaluate(found[None])[0][0])) < lowest_cost:

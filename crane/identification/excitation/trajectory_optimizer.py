@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from crane.common.errors import ClosureError, InputError, check_name
+from crane.common.progress import Progress
 from crane.common.samples import Array, as_number
 from crane.dynamics.dynamics import Dynamics
 from crane.identification.excitation.fisher_information import FisherInformation
@@ -30,7 +31,6 @@ _DIFFERENCE_STEP = 1e-6  # step of differences of scaled coefficients
 _INFEASIBLE_COST = 1e3  # cost and constraint violation if loops do not close
 _CONSTRAINT_TOLERANCE = 1e-3  # violation that the final scaling removes
 
-Progress = Callable[[float], None]
 QUANTITIES = ("stroke", "velocity", "acceleration", "force", "flow")
 _SINGULARITY_GAIN = 5.0  # ratio of gamma to that at home, near the end of the branch
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from crane.common.errors import CraneError, CraneWarning, InputError
-from crane.common.progress import progress_reporter
+from crane.common.progress import Progress, ignore_progress, progress_reporter
 from crane.common.samples import Array, as_number
 from crane.common.units import format_table
 from crane.identification.mechanics.feasible_parameters import load_convex_solver
@@ -17,7 +17,7 @@ from crane.identification.mechanics.identifiability import prior_from_names, rea
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.identify import RecordingOrMotion, identify, prepare_motions
 from crane.identification.mechanics.regression_equations import RegressionEquations
-from crane.identification.signals.signal_processing import Motion, Progress
+from crane.identification.signals.signal_processing import Motion
 from crane.machine.machine import Machine
 
 FOLD_COUNT = 5
@@ -70,10 +70,10 @@ def cross_validate(
         InputError: There are no candidates, one is not valid, or a recording is too short.
         RecordingError: A recording is not suitable.
     """
-    progress = progress_reporter(progress)
+    progress = progress_reporter(progress) or ignore_progress
     if not candidates or not all(candidates.values()):
         raise InputError("there are no candidates, give values such as bandwidth=2,5,10")
-    motions = prepare_motions(machine, recording, options.get("trust", False), None)
+    motions = prepare_motions(machine, recording, options.get("trust", False))
     if (shortest := min(len(motion.time) for motion in motions)) < FOLD_COUNT * _MIN_FOLD_SAMPLES:
         raise InputError(
             f"{shortest} samples are too few for {FOLD_COUNT} folds, give at least "
@@ -97,8 +97,7 @@ def cross_validate(
             except CraneError as error:
                 reason = str(error)
         trials.append(CrossValidationTrial(settings, errors))
-        if progress is not None:
-            progress((done + 1) / len(grid))
+        progress((done + 1) / len(grid))
     if not np.isfinite(min(trial.mean_error for trial in trials)):
         raise InputError(
             "some fold of the training data is not determined by the others for any settings, "

@@ -12,11 +12,8 @@ from crane.common.errors import CraneWarning
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.identification.mechanics.recording_rejection import reject_delay, reject_unless_trusted
-from crane.identification.mechanics.smoothed_motion import signal_delay
-from crane.identification.signals.signal_processing import (
-    Motion,
-    sampling_step,
-)
+from crane.identification.signals.signal_processing import Motion, sampling_step
+from crane.identification.signals.signal_quality import signal_delay
 from crane.recordings.recording import Recording
 
 _MAX_FORCE_FACTOR = 30.0  # largest ratio of a force to that of the model

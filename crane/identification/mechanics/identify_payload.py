@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.common.errors import InputError, RecordingError, check_name
-from crane.common.progress import progress_reporter
+from crane.common.progress import Progress, ignore_progress, progress_reporter
 from crane.common.samples import Array, as_sample
 from crane.common.threads import with_single_threaded_blas
 from crane.dynamics.dynamics import Dynamics
@@ -34,7 +34,7 @@ from crane.identification.mechanics.regression_equations import (
     RegressionEquations,
 )
 from crane.identification.mechanics.smoothed_motion import smoothed_motion
-from crane.identification.signals.signal_processing import Motion, Progress
+from crane.identification.signals.signal_processing import Motion
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 
@@ -89,7 +89,7 @@ def identify_payload(
 
     Source: Efron, Stein 1981, Annals of Statistics 9(3), the jackknife.
     """
-    progress = progress_reporter(progress)
+    progress = progress_reporter(progress) or ignore_progress
     check_name(method, METHODS, f"method '{method}' is unknown")
     if frame is None and machine.tip is None:
         raise InputError(f"'{machine.name}' has no tip, give the frame that holds the load")
@@ -166,7 +166,7 @@ class _PayloadCase:
         return IdentificationModel(bare_machine, terms, machine_forces)
 
     def estimate_body(
-        self, has_inertia: bool, trust: bool, progress: Progress | None
+        self, has_inertia: bool, trust: bool, progress: Progress
     ) -> PayloadEstimate | None:
         """Estimate a load with its moments; None if nothing determines its mass."""
         model = self.model(has_inertia, self.com)
@@ -211,7 +211,7 @@ class _PayloadCase:
             self.com is not None,
         )  # fmt: skip
 
-    def estimate_point_mass(self, progress: Progress | None) -> PayloadEstimate | None:
+    def estimate_point_mass(self, progress: Progress) -> PayloadEstimate | None:
         """Estimate a mass at a point; None if its weight loads no moving drive."""
         motion, model = low_passed_motion(self.motion), self.model(False, None)
         load = PayloadTerm(self.machine, self.frame, False, self.point)

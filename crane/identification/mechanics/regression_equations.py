@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from crane.common.errors import InputError
+from crane.common.progress import Progress, ignore_progress
 from crane.common.samples import Array
 from crane.identification.estimation.estimators import Estimate, Prior
 from crane.identification.estimation.regressor import triangular_factor, update_triangular_factor
@@ -17,7 +18,6 @@ from crane.identification.mechanics.identification_model import IdentificationMo
 from crane.identification.mechanics.model_terms import MotionSamples
 from crane.identification.signals.signal_processing import (
     Motion,
-    Progress,
     filter_kernel,
     filter_rows,
 )
@@ -117,7 +117,7 @@ class RegressionEquations:
         motions: Sequence[Motion],
         bandwidth: float,
         min_speed: Array,
-        progress: Progress | None = None,
+        progress: Progress = ignore_progress,
         values: Array | None = None,
     ):
         self.base, self.bandwidth, self.min_speed = base, bandwidth, min_speed
@@ -161,8 +161,7 @@ class RegressionEquations:
             cached_bytes = sum(one.nbytes for one in self._block_cache.values())
             if cached_bytes + W.nbytes <= _CACHE_BYTES:
                 self._block_cache[number] = W
-            if self._progress is not None:
-                self._progress((done + 1) / len(self._blocks))
+            self._progress((done + 1) / len(self._blocks))
             yield self._blocks[number].instants, W
 
     def _compute_block(self, number: int) -> Array:

@@ -1,18 +1,17 @@
 """Derivatives, filters, resampling and decimation of recorded signals."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from crane.common.errors import InputError, RecordingError, check_name
 from crane.common.one_line_repr import OneLineRepr
+from crane.common.progress import Progress, ignore_progress
 from crane.common.samples import Array, as_number
 from crane.common.scratch_arrays import empty_array, release_pages
 from crane.identification.signals.kalman_smoother import kalman_smooth
 
-Progress = Callable[[float], None]
 METHODS = ("kalman", "lowpass")
 _MIN_SAMPLES = 50  # samples
 _MAX_GAP = 5.0  # steps
@@ -78,7 +77,7 @@ def differentiate(
     q: Array,
     method: str = "kalman",
     cutoff: float | None = None,
-    progress: Progress | None = None,
+    progress: Progress = ignore_progress,
 ) -> Derivatives:
     """Velocities and accelerations from measured coordinates.
 
@@ -112,8 +111,7 @@ def differentiate(
         std_v[:, i], std_a[:, i] = std.T[1:]
         del states, std
         release_pages()
-        if progress is not None:
-            progress((i + 1) / q.shape[1])
+        progress((i + 1) / q.shape[1])
     return Derivatives(position, v, a, std_v, std_a, noise, half)
 
 

@@ -1,4 +1,4 @@
-"""Outliers, spectral lines and steady samples of recorded signals."""
+"""Outliers, spectral lines, delays and steady samples of recorded signals."""
 
 import math
 from dataclasses import dataclass
@@ -26,6 +26,8 @@ _MAD_TO_STD = 1.482602218505602
 _MAX_CHANGE = 0.02  # largest change relative to the range of a signal
 _MIN_PERIODS = 3  # least number of periods of a ringing
 _MAX_RESIDUAL_SHARE = 0.5  # largest share of the squares that a sinusoid leaves
+_CORRELATION_TOLERANCE = 0.01  # of a correlation
+_MAX_DELAY = 1.0  # [s] longest delay of the search
 
 
 def spectral_edge_frequency(x: Array, step: float, share: float = 0.995) -> float:
@@ -156,6 +158,44 @@ def _outlier_runs(x: Array, length: int, noise: float) -> np.ndarray:
             exceeds_limit[0] & exceeds_limit[-1] & exceeds_limit[k]
         )
     return found
+
+
+def signal_delay(time: Array, one: Array, other: Array) -> float:
+    """Delay [s] of the second signal (N,) with respect to the first, at most 1 s.
+
+    It is the maximum of the correlation of the overlapping parts, refined by a parabola.
+    """
+    step = sampling_step(time)
+    one, other = one - one.mean(), other - other.mean()
+    shifts = np.arange(-(reach := min(round(_MAX_DELAY / step), len(time) // 4)), reach + 1)
+    products = _products(one, other, reach)
+    first, second = (np.append(0, np.cumsum(x**2)) for x in (one, other))
+    low, high = np.maximum(shifts, 0), len(time) + np.minimum(shifts, 0)
+    energy = (first[high - shifts] - first[low - shifts]) * (second[high] - second[low])
+    correlation = products / np.sqrt(np.maximum(energy, 1e-12 * first[-1] * second[-1] + 1e-300))
+    # the shortest of equal maxima, as for periodic signals
+    best = np.flatnonzero(correlation >= correlation.max() - _CORRELATION_TOLERANCE)
+    at = int(np.clip(best[np.abs(shifts[best]).argmin()], 1, 2 * reach - 1))
+    if correlation[at - 1 : at + 2].argmax() != 1:  # not at a local maximum
+        direction = 1 if correlation[at + 1] > correlation[at] else -1
+        while 1 < at < 2 * reach - 1 and correlation[at + direction] > correlation[at]:
+            at += direction
+    before, here, after = correlation[at - 1 : at + 2]
+    curvature = before - 2 * here + after
+    shift = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
+    return float((at - reach + shift) * step)
+
+
+def _products(one: Array, other: Array, reach: int) -> Array:
+    """Sums of one_k other_k+s for the shifts s from -reach to reach, in blocks of samples."""
+    from scipy.signal import correlate
+
+    total, padded = np.zeros(2 * reach + 1), np.pad(other, reach)
+    for start in range(0, len(one), BLOCK_SIZE):
+        part = one[start : start + BLOCK_SIZE]
+        window = padded[start : start + len(part) + 2 * reach]
+        total += correlate(window, part, mode="valid", method="fft")
+    return total
 
 
 def steady_samples(

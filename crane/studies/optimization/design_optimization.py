@@ -3,13 +3,12 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.stats import qmc
 
 from crane.common.errors import InputError, check_name
-from crane.common.progress import progress_reporter
+from crane.common.progress import Progress, ignore_progress, progress_reporter
 from crane.common.result import Result
 from crane.common.samples import Array, as_count, as_seed
 from crane.formats.machine_loading import MachineVariants
@@ -174,7 +173,7 @@ def design(
     processes: int = 1,
     scheduler: str | None = None,
     checkpoint: str | Path | None = None,
-    progress: Any = None,
+    progress: Progress | None = None,
 ) -> Design:
     """Find the parameters of a machine that are best for measures of it.
 
@@ -213,7 +212,7 @@ def design(
         TerminatedWorkerError: Processes or the scheduler ended before their time.
         OutputError: The checkpoint cannot be written.
     """
-    progress = progress_reporter(progress)
+    progress = progress_reporter(progress) or ignore_progress
     base_machine, name = machine_from_files(machine)
     processes = check_process_count(processes)
     starts = as_count(starts, "the number of starts", 1, 10_000)
@@ -238,7 +237,7 @@ def design(
     ) -> list[DesignSolution]:
         return compute_jobs(
             solve_design_job, jobs, processes, scheduler,
-            lambda done: progress and progress((finished + done) / total),
+            lambda done: progress((finished + done) / total),
             kept and replace(kept, keys=[(str(finished + i),) for i in range(len(jobs))]),
         )  # fmt: skip
 
