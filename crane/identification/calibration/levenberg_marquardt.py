@@ -284,14 +284,11 @@ class LevenbergMarquardt:
 
     def _cost(self, z: Array) -> float:
         """Half the sum of squares, infinite if the simulation fails."""
-        total = float(np.sum((self.prior * z) ** 2))
-        for case in self.training_cases:
-            try:
-                residual = self.problem.residuals(case, z, training_only=True)
-            except CraneError:
-                return np.inf
-            total += float(np.sum((residual * self.channel_weights(case)) ** 2))
-        return 0.5 * total
+        try:
+            residuals = self.weighted_residuals(z)
+        except CraneError:
+            return np.inf
+        return 0.5 * float(residuals @ residuals + np.sum((self.prior * z) ** 2))
 
     def _linearize(self, z: Array) -> None:
         rows, weighted, blocks = [], [], []

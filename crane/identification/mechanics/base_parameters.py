@@ -134,7 +134,7 @@ def stroke_limits(machine: Machine) -> tuple[Array, Array]:
 
 
 def base_parameters(
-    model: IdentificationModel, samples: MotionSamples | None = None, seed: int = 0
+    model: IdentificationModel,
 ) -> BaseParameters:
     """Compute the base parameters of a model numerically (Gautier, 1991).
 
@@ -150,8 +150,7 @@ def base_parameters(
         InputError: The loops do not close within the limits.
     """
     p, n = len(model.names), len(model.machine.active)
-    if samples is None:
-        samples = random_samples(model, max(60, 4 * p // n), seed)
+    samples = random_samples(model, max(60, 4 * p // n))
     closure, bodies = model.machine.closure, 10 * len(model.bodies)
     # forces as virtual work per 1 rad or characteristic length, to compare drives
     rows = (model.regressor(samples) * closure.units[closure.active, None]).reshape(-1, p)

@@ -13,7 +13,7 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.identification.mechanics.recording_rejection import reject_delay, reject_unless_trusted
 from crane.identification.signals.signal_processing import Motion, sampling_step
-from crane.identification.signals.signal_quality import signal_delay
+from crane.identification.signals.signal_quality import shifted_correlation, signal_delay
 from crane.recordings.recording import Recording
 
 _MAX_FORCE_FACTOR = 30.0  # largest ratio of a force to that of the model
@@ -133,11 +133,11 @@ def check_forces(
         # like inertia a quarter of a period later
         if not 0.5 < ratio < 2.0:
             continue
-        shifted_correlation = _shifted_correlation(
+        correlation = shifted_correlation(
             expected, measured, round(lag / sampling_step(motion.time))
         )
-        if abs(lag) > longest_delay and shifted_correlation > max(
-            0.9, _shifted_correlation(expected, measured, 0) + 0.05
+        if abs(lag) > longest_delay and correlation > max(
+            0.9, shifted_correlation(expected, measured, 0) + 0.05
         ):
             reject_delay(f"{joint}_force", lag, "its model", trust)
     if messages:
@@ -238,10 +238,3 @@ def _force_scale(y: Array, x: Array, v: Array, a: Array) -> tuple[float, float, 
     parts = np.array([part.sum() for part in np.array_split(products, _BLOCK_COUNT)])
     error = math.sqrt(float(parts @ parts) * _BLOCK_COUNT / (_BLOCK_COUNT - 1)) / energy[1]
     return scale, error, abs(scale) * math.sqrt(energy[1] / energy[0])
-
-
-def _shifted_correlation(one: Array, other: Array, shift: int) -> float:
-    """Correlation of one signal with another one shifted by a number of samples."""
-    count = len(one) - abs(shift)
-    offsets = max(shift, 0), max(-shift, 0)
-    return float(np.corrcoef(one[offsets[1] :][:count], other[offsets[0] :][:count])[0, 1])

@@ -24,6 +24,7 @@ from crane.identification.signals.signal_processing import (
 from crane.identification.signals.signal_quality import (
     outlier_mask,
     replace_outliers,
+    shifted_correlation,
     signal_delay,
     spectral_edge_frequency,
     strongest_spectral_line,
@@ -369,10 +370,7 @@ def _check_velocity(
             )
     delay = signal_delay(time, derivative, v)
     shift = round(delay / step)
-    first, second = (derivative, v) if shift >= 0 else (v, derivative)
-    overlap = len(v) - abs(shift)
-    first, second = first[:overlap], second[abs(shift) :]
-    correlation = float(np.corrcoef(first, second)[0, 1]) if np.ptp(v) > 0 else 0.0
+    correlation = shifted_correlation(derivative, v, shift) if np.ptp(v) > 0 else 0.0
     if correlation < 0.7 or not 0.5 < ratio < 2:
         return reject_unless_trusted(
             f"'{joint}_velocity' is not the derivative of '{joint}' (correlation "

@@ -38,17 +38,13 @@ def spectral_edge_frequency(x: Array, step: float, share: float = 0.995) -> floa
         step: Step between samples [s].
         share: Share of the power below it, 0 to 1.
     """
+    from scipy.signal import periodogram
+
     edges = []
     for column in filter(np.ptp, x.T):
-        windowed = column - column.mean()
-        windowed /= max(column.std(), 1e-300)
-        phase = np.linspace(0.0, 2 * np.pi, len(column), endpoint=False)
-        windowed *= 1.0 - np.cos(phase, out=phase)  # window of Hann
-        power = np.abs(np.fft.rfft(windowed))
-        power *= power
-        power[1 : (len(column) + 1) // 2] *= 2.0  # those of negative frequencies
-        whole = np.cumsum(power, out=power)
-        edges.append(max(1, np.searchsorted(whole, share * whole[-1])) / (len(column) * step))
+        frequency, power = periodogram(column, 1 / step, "hann")
+        whole = np.cumsum(power)
+        edges.append(frequency[max(1, np.searchsorted(whole, share * whole[-1]))])
     return float(max(edges, default=1 / (len(x) * step)))
 
 
@@ -184,6 +180,13 @@ def signal_delay(time: Array, one: Array, other: Array) -> float:
     curvature = before - 2 * here + after
     shift = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
     return float((at - reach + shift) * step)
+
+
+def shifted_correlation(one: Array, other: Array, shift: int) -> float:
+    """Correlation of one signal with another one shifted by a number of samples."""
+    count = len(one) - abs(shift)
+    offsets = max(shift, 0), max(-shift, 0)
+    return float(np.corrcoef(one[offsets[1] :][:count], other[offsets[0] :][:count])[0, 1])
 
 
 def _products(one: Array, other: Array, reach: int) -> Array:

@@ -151,8 +151,7 @@ class DesignProblem:
                 initial_values, values, np.full(count, np.nan),
                 np.full(len(self.requirements), -np.inf), False, str(error),
             )  # fmt: skip
-        slacks = np.array([x.value for x in duals[count:]])
-        slacks = np.where(np.array(self.job.is_equality, dtype=bool), -np.abs(slacks), slacks)
+        slacks = self.signed_slacks(np.array([x.value for x in duals[count:]]))
         tolerances = _REQUIREMENT_TOLERANCE * np.array(self.scales(duals[count:], 0.0))
         objectives = np.array([x.value for x in duals[:count]])
         return DesignSolution(
@@ -167,6 +166,10 @@ class DesignProblem:
     def with_all_objectives(self, solution: DesignSolution) -> DesignSolution:
         """Return a solution with the values of all objectives."""
         return self.solution(solution.initial_values, solution.values, solution.message)
+
+    def signed_slacks(self, values: Array) -> Array:
+        """Return the slacks of requirements with these values, never above 0 for equalities."""
+        return np.where(np.array(self.job.is_equality, dtype=bool), -np.abs(values), values)
 
     def scales(self, duals: Sequence[DualNumber], smallest: float) -> list[float]:
         """Return the scale of each value: its magnitude, or its change over a range."""
@@ -284,8 +287,8 @@ class _DesignSearch:
         constraints: Any = [
             {
                 "type": kind,
-                "fun": lambda x, k=k: self._constraint_values(x)[k],
-                "jac": lambda x, k=k: self._constraint_jacobian(x)[k],
+                "fun": lambda x, k=k: self._constraints(x)[0][k],
+                "jac": lambda x, k=k: self._constraints(x)[1][k],
             }
             for kind, k in (
                 ("ineq", np.flatnonzero(~is_equality)),
@@ -312,11 +315,8 @@ class _DesignSearch:
 
     def _shortfall(self, scaled_values: Array) -> float:
         """Return the largest violation of a requirement, as a share of its scale."""
-        slacks = scaled_values[self._objective_count :]
-        if not len(slacks):
-            return 0.0
-        is_equality = np.array(self._job.is_equality, dtype=bool)
-        return max(0.0, -float(np.where(is_equality, -np.abs(slacks), slacks).min()))
+        slacks = self._problem.signed_slacks(scaled_values[self._objective_count :])
+        return max(0.0, -float(slacks.min(initial=0.0)))
 
     def _scaled_values(self, x: Array) -> tuple[Array, Array] | None:
         """Return scaled objectives, then requirements, and their derivatives by x."""
@@ -350,25 +350,19 @@ class _DesignSearch:
             return _INFEASIBLE_COST * worst, np.zeros(len(x))
         return float(scaled[0][0]), scaled[1][0]
 
-    def _constraint_count(self) -> int:
-        return len(self._requirement_scales) + self._has_bound * self._objective_count
+    def _constraints(self, x: Array) -> tuple[Array, Array]:
+        """Return the slacks of several objectives to their bound, then of the requirements.
 
-    def _constraint_values(self, x: Array) -> Array:
-        """Return the slacks of several objectives to their bound, then of the requirements."""
+        Their derivatives by x are the second result.
+        """
         scaled, count = self._scaled_values(x), self._objective_count
         if scaled is None:
-            return np.full(self._constraint_count(), -_INFEASIBLE_COST)
+            size = len(self._requirement_scales) + self._has_bound * count
+            return np.full(size, -_INFEASIBLE_COST), np.zeros((size, len(x)))
+        values, derivatives = scaled
         if not self._has_bound:
-            return scaled[0][count:]
-        return np.concatenate([x[-1] - scaled[0][:count], scaled[0][count:]])
-
-    def _constraint_jacobian(self, x: Array) -> Array:
-        scaled, count = self._scaled_values(x), self._objective_count
-        if scaled is None:
-            return np.zeros((self._constraint_count(), len(x)))
-        if not self._has_bound:
-            return scaled[1][count:]
-        jacobian = np.zeros((self._constraint_count(), len(x)))
-        jacobian[:, :-1] = np.vstack([-scaled[1][:count], scaled[1][count:]])
+            return values[count:], derivatives[count:]
+        jacobian = np.zeros((len(values), len(x)))
+        jacobian[:, :-1] = np.vstack([-derivatives[:count], derivatives[count:]])
         jacobian[:count, -1] = 1.0
-        return jacobian
+        return np.concatenate([x[-1] - values[:count], values[count:]]), jacobian
