@@ -8,6 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import correlate
 
 from crane.common.checkpoint import Checkpoint
 from crane.common.errors import CraneError
@@ -407,8 +408,6 @@ def _correlation_time(x: Array) -> float:
     power = float(x @ x)
     if not power:
         return 0.0
-    size = 1 << (2 * len(x) - 1).bit_length()
-    spectrum = np.fft.rfft(x, size)
-    correlation = np.fft.irfft(spectrum * spectrum.conj(), size)[: len(x)] / power
+    correlation = correlate(x, x, method="fft")[len(x) - 1 :] / power
     negative = np.flatnonzero(correlation < 0.05)
     return float(correlation[: negative[0] if len(negative) else len(x)].sum())
