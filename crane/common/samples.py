@@ -127,6 +127,19 @@ def solve_linear(matrix: Array, right_side: Array) -> Array:
     return np.asarray(np.linalg.solve(matrix, right_side), dtype=np.float64)
 
 
+def independent_rows(rows: Array, tolerance: float) -> list[int]:
+    """Indices of rows (m, k) that do not depend on those before them, up to a share of them."""
+    basis, found = np.zeros((0, rows.shape[1])), list[int]()
+    for i, row in enumerate(rows):
+        rest = row - basis.T @ (basis @ row)
+        rest -= basis.T @ (basis @ rest)  # twice is sufficient (Kahan, Parlett)
+        size = np.linalg.norm(rest)
+        if size > tolerance * np.linalg.norm(row):
+            basis = np.vstack([basis, rest / size])
+            found.append(i)
+    return found
+
+
 def read_only_copy(array: Array) -> Array:
     """A read-only copy of an array."""
     out = array.copy()

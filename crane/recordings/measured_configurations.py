@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from crane.common.errors import ClosureError, MechanismError, RecordingError
-from crane.common.samples import Array
+from crane.common.samples import Array, independent_rows
 from crane.description.sensors import INCLINATION_PREFIX, VELOCITY_SUFFIX, VELOCITY_UNITS
 from crane.machine.machine import Machine
 from crane.recordings.rotation_columns import body_rates
@@ -78,18 +78,10 @@ def independent_joints(
     rows before it.
     """
     gamma = machine.closure.gamma(machine.home) * _stroke_ranges(machine)
-    basis = np.zeros((0, len(machine.active)))
-    found = []
     measured = [x for x in names if x in machine.joints and x not in first]
-    for joint in (*first, *sorted(measured, key=lambda x: x not in machine.active)):
-        row = gamma[machine.column(joint)]
-        rest = row - basis.T @ (basis @ row)
-        rest -= basis.T @ (basis @ rest)  # a second time, against rounding errors
-        size = np.linalg.norm(rest)
-        if size > _MIN_INDEPENDENT_SHARE * np.linalg.norm(row):
-            basis = np.vstack([basis, rest / size])
-            found.append(joint)
-    return tuple(found)
+    joints = [*first, *sorted(measured, key=lambda x: x not in machine.active)]
+    rows = gamma[[machine.column(joint) for joint in joints]]
+    return tuple(joints[i] for i in independent_rows(rows, _MIN_INDEPENDENT_SHARE))
 
 
 def _stroke_ranges(machine: Machine) -> Array:
@@ -317,7 +309,7 @@ def _find_unknown_angles(machine: Machine, table: Table) -> tuple[tuple[str, ...
 
 def _inclining_joints(machine: Machine, name: str) -> list[str]:
     """Joints from a link to the ground that change its inclination at home."""
-    parent_joints = {joint.child: joint for joint in machine.tree.joints.values()}
+    parent_joints = machine.tree.parent_joints
     link, home, rate, found = (
         name.removeprefix(INCLINATION_PREFIX),
         machine.home[None],

@@ -39,9 +39,7 @@ from crane.identification.mechanics.base_parameters import (
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.model_terms import MotionSamples
 from crane.machine.machine import Machine
-from crane.recordings import timeseries
-from crane.recordings.recording import FORCE_UNITS, VELOCITY_UNITS
-from crane.recordings.timeseries import TIME, Table
+from crane.recordings.recording import Recording
 
 _NOISE_SHARE = 0.01  # default noise per force limit of a drive
 _REPORTED_PARAMETERS = 5  # parameters in the table
@@ -112,23 +110,21 @@ class Excitation(Result):
         Raises:
             OutputError: The file cannot be written.
         """
-        units = {TIME: "s"}
-        for suffix in ("", "_velocity", "_acceleration", "_force"):
-            for joint in self.machine.active:
-                unit = self.machine.unit(joint)
-                units[joint + suffix] = {
-                    "": unit,
-                    "_velocity": VELOCITY_UNITS[unit],
-                    "_acceleration": f"{unit}/s2",
-                    "_force": FORCE_UNITS[unit],
-                }[suffix]
+        time, q, v, a, tau = self.motion()
+        units = {joint: self.machine.unit(joint) for joint in self.machine.active}
         lead, period = self.trajectory.lead, self.trajectory.period
-        notes = {
-            "crane reference": "",
-            "machine": self.machine.load_expression,
-            "task": f"excitation, steady from {lead:g} s, period {period:g} s",
-        }
-        timeseries.write_table(path, Table(units, np.column_stack(self.motion()), notes))
+        Recording(
+            time,
+            self.machine.active,
+            q,
+            v,
+            tau,
+            units,
+            {f"{joint}_acceleration": x for joint, x in zip(units, a.T, strict=True)},
+            {f"{joint}_acceleration": f"{unit}/s2" for joint, unit in units.items()},
+            machine=self.machine.load_expression,
+            task=f"excitation, steady from {lead:g} s, period {period:g} s",
+        ).to_csv(path)
 
     def to_yaml(self, path: str | Path) -> None:
         """Write the coefficients as YAML, see `FourierTrajectory`.

@@ -9,7 +9,7 @@ import numpy as np
 from crane.closure.coordinates import Indices
 from crane.common.errors import ClosureError, InputError
 from crane.common.one_line_repr import OneLineRepr
-from crane.common.samples import Array
+from crane.common.samples import Array, independent_rows
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.model_terms import MotionSamples
 from crane.machine.machine import Machine
@@ -182,17 +182,8 @@ def group_parameters(
     norms = np.linalg.norm(rows, axis=0)
     zero = norms * units <= _ZERO_TOLERANCE * (norms * units).max(initial=0.0)
     scaled = rows / np.where(zero, 1.0, norms)
-    chosen: list[int] = []
-    directions = np.empty((len(rows), 0))
-    for i in sorted(np.flatnonzero(~zero).tolist(), key=preference):
-        rest = scaled[:, i]
-        for _ in range(2):  # twice is sufficient (Kahan, Parlett)
-            rest = rest - directions @ (directions.T @ rest)
-        length = np.linalg.norm(rest)
-        if length > _RANK_TOLERANCE:
-            chosen.append(i)
-            directions = np.column_stack([directions, rest / length])
-    independent = np.array(sorted(chosen), dtype=np.intp)
+    order = np.array(sorted(np.flatnonzero(~zero).tolist(), key=preference), dtype=np.intp)
+    independent = np.sort(order[independent_rows(scaled[:, order].T, _RANK_TOLERANCE)])
     q, r = np.linalg.qr(scaled[:, independent])
     share = np.linalg.solve(r, q.T @ scaled)
     share[np.abs(share) < 1e-9] = 0.0
