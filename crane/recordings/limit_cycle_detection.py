@@ -161,7 +161,7 @@ def _moving_mean(values: Array, width: int) -> Array:
     total = np.concatenate([[0.0], np.cumsum(values - values.mean())])
     at = np.arange(len(values))
     low, high = np.maximum(at - width // 2, 0), np.minimum(at - width // 2 + width, len(values))
-    return np.asarray((total[high] - total[low]) / (high - low) + values.mean())
+    return (total[high] - total[low]) / (high - low) + values.mean()
 
 
 def _oscillation_spans(
@@ -223,7 +223,7 @@ def _peak_to_peak(values: Array, first: int, last: int, period: float) -> Array:
     high, low = (x.reduceat(values[:last], starts) for x in (np.maximum, np.minimum))
     means = np.add.reduceat(values[:last], starts) / np.diff(starts, append=last)
     drift = np.abs(np.gradient(means))
-    return np.asarray(np.maximum(high - low - drift, 0.0))
+    return np.maximum(high - low - drift, 0.0)
 
 
 def _reversal_count(command: Array) -> int:

@@ -123,7 +123,8 @@ def read_log_arrays(path: Path) -> dict[str, np.ndarray]:
             names = [cell.strip() for cell in next(csv.reader([heading], delimiter=separator))]
         except csv.Error as error:
             raise RecordingError(f"no table of numbers ({error}), correct it") from None
-        rows = text_rows = partial(_text_rows, path, encoding, line)
+        text_rows = partial(_text_rows, path, encoding, line)
+        rows: Callable[[], Iterator[str]] = text_rows
         if separator != "," and not any("." in x for x in text_rows()):  # decimal commas
             rows = lambda: (x.replace(",", ".") for x in text_rows())  # noqa: E731
         values = _read_values(rows, line, lines, names, separator)

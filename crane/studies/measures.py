@@ -173,7 +173,7 @@ def resolution_notes(machine: Machine, measures: Sequence[str]) -> tuple[str, ..
 def _coupled_strokes(machine: Machine) -> NDArray[np.bool_]:
     """Return which driven joints (n,) move passive joints."""
     gamma = machine.closure.gamma(machine.home)[machine.closure.passive]
-    return np.asarray((np.abs(gamma).max(axis=0, initial=0.0) > 0) & machine.is_driven)
+    return (np.abs(gamma).max(axis=0, initial=0.0) > 0) & machine.is_driven
 
 
 def _values_per_stroke(is_coupled: NDArray[np.bool_]) -> int:

@@ -165,7 +165,7 @@ def singularity_proximity(machine: Machine, samples: MotionSamples) -> Array:
     rows, span = machine.closure.passive, upper - lower
 
     def size(gamma: Array) -> Array:
-        return np.asarray(np.linalg.norm(gamma[..., rows, :] * span, axis=(-2, -1)))
+        return np.linalg.norm(gamma[..., rows, :] * span, axis=(-2, -1))
 
     home = float(size(machine.closure.gamma(machine.home)))
     return size(samples.gamma) / (_SINGULARITY_GAIN * home) if home else np.zeros(len(samples.q))

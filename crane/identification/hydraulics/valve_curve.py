@@ -226,15 +226,15 @@ def _fit_curve(U: Array, v: Array, sign: float, fastest: float) -> Array:
         start[i], start[2 + i] = -offset / slope, abs(slope)
     volts, rate = float(np.ptp(U)), float(np.abs(start[2:]).max())
 
+    def residuals(x: Array) -> Array:
+        return _steady_speed(x, U, sign)[0] - v
+
+    def jacobian(x: Array) -> Array:
+        return _steady_speed(x, U, sign)[1]
+
     scale = [volts, volts, rate, rate]
     fine = 1e-14
     found = optimize.least_squares(
-        lambda x: _steady_speed(x, U, sign)[0] - v,
-        start,
-        jac=lambda x: _steady_speed(x, U, sign)[1],
-        x_scale=scale,
-        xtol=fine,
-        ftol=fine,
-        gtol=fine,
+        residuals, start, jac=jacobian, x_scale=scale, xtol=fine, ftol=fine, gtol=fine
     )
-    return np.asarray(found.x)
+    return found.x

@@ -60,7 +60,7 @@ class ForceDelays(OneLineRepr):
             return np.zeros(len(self.joints), dtype=bool)
         limit = float(t.ppf(_CONFIDENCE, self.blocks - 1)) * self.std
         is_early = (self.seconds < -limit) & (self.explained > _MIN_EXPLAINED_SHARE)
-        return np.asarray((self.seconds > limit) | is_early)
+        return (self.seconds > limit) | is_early
 
     @property
     def text(self) -> str:

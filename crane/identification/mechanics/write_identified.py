@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import pinocchio as pin
@@ -121,7 +121,8 @@ def _write_identified(identification: Identification, folder: str | Path) -> Pat
 def _unlocked_machine(machine: Machine) -> Machine:
     """The machine without locked joints; force elements that were replaced since stay replaced."""
     variants = MachineVariants(replace(machine, locked_joints={}))
-    locked_spec, elements = lock_joints(variants.spec, machine.locked_joints), {}
+    locked_spec = lock_joints(variants.spec, machine.locked_joints)
+    elements: dict[str, Any] = {}
     for kind in ("forces", "gas_springs", "ropes", "end_stops"):
         kept = getattr(locked_spec, kind)
         removed = (x for x in getattr(variants.spec, kind) if x not in kept)

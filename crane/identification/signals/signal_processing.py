@@ -188,7 +188,7 @@ def low_pass(time: Array, x: Array, cutoff: float, order: int = 4) -> Array:
     step = sampling_step(time)
     if not 0 < cutoff < 0.5 / step:
         raise InputError(f"cutoff is {cutoff:g} Hz, give one between 0 and {0.5 / step:g} Hz")
-    return np.asarray(sosfiltfilt(butter(order, cutoff, output="sos", fs=1 / step), x, axis=0))
+    return sosfiltfilt(butter(order, cutoff, output="sos", fs=1 / step), x, axis=0)
 
 
 def filter_kernel(step: float, cutoff: float) -> Array:
@@ -205,7 +205,7 @@ def filter_kernel(step: float, cutoff: float) -> Array:
     n = math.ceil(0.5 * length) - 1
     phase = 2 * math.pi * np.arange(-n, n + 1.0) / length
     weights = np.cos(np.outer(phase, np.arange(4.0))) @ _WINDOW_COEFFICIENTS
-    return np.asarray(weights / weights.sum())
+    return weights / weights.sum()
 
 
 def average_periods(time: Array, x: Array, period: float) -> tuple[Array, Array, Array]:
@@ -294,6 +294,6 @@ def _weighted_means(x: Array, weights: Array, decimation: int) -> Array:
     def convolved(x: Array) -> Array:
         edges = [(lead, reach), *[(0, 0)] * (x.ndim - 1)]
         whole = upfirdn(weights, np.pad(x, edges), down=decimation, axis=0)
-        return np.asarray(whole[kept_samples][: -(-count // decimation)])
+        return whole[kept_samples][: -(-count // decimation)]
 
     return convolved(x) / convolved(np.ones(count)).reshape(-1, *[1] * (x.ndim - 1))

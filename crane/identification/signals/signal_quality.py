@@ -350,4 +350,4 @@ def _period_means(time: Array, rows: Array, period: float) -> Array:
     whole = np.concatenate([np.zeros((len(rows), 1)), np.cumsum(steps, axis=1)], axis=1)
     since = np.maximum(time - period, time[0])
     before = np.stack([np.interp(since, time, row) for row in whole])
-    return np.asarray((whole - before) / np.maximum(time - since, time[1] - time[0]))
+    return (whole - before) / np.maximum(time - since, time[1] - time[0])

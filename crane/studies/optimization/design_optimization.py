@@ -389,7 +389,7 @@ def _simplex_weights(objective_count: int, point_count: int) -> Array:
         :point_count
     ]
     samples = -np.log(np.clip(samples, 1e-9, 1.0))
-    return np.asarray(samples / samples.sum(axis=1, keepdims=True))
+    return samples / samples.sum(axis=1, keepdims=True)
 
 
 def _nondominated(solutions: Sequence[DesignSolution]) -> list[DesignSolution]:

@@ -118,8 +118,8 @@ class VariantEvaluation:
             mass = self._constant(float(self._statics.evaluate(home).total_mass[0]))
             if not self._ranges:
                 return mass
-            derivatives = self._statics.parameter_derivatives(home, list(self._ranges))
-            return replace(mass, derivatives=derivatives.total_mass[0])
+            slopes = self._statics.parameter_derivatives(home, list(self._ranges))
+            return replace(mass, derivatives=slopes.total_mass[0])
         if name == "number" or (name in self._variants.values and not arguments):
             parameter = str(arguments[0]) if arguments else name
             derivatives = np.array([float(parameter == other) for other in self._ranges])
