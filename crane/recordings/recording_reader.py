@@ -11,7 +11,6 @@ import math
 import re
 import warnings
 from collections.abc import Mapping
-from dataclasses import replace
 from difflib import SequenceMatcher
 from pathlib import Path
 
@@ -42,10 +41,8 @@ from crane.machine.machine import Machine
 from crane.recordings import logs, table_reader
 from crane.recordings.angle_unwrapping import unwrap_table
 from crane.recordings.recording import (
-    FORCE_SUFFIX,
     IDEAL_SENSORS,
     SENSORS_NOTE,
-    VELOCITY_SUFFIX,
     Recording,
 )
 from crane.recordings.timeseries import Table, located_errors, table_column
@@ -309,11 +306,4 @@ def shift_columns(recording: Recording, delays: Mapping[str, float]) -> Recordin
     is_covered = (time >= max(first, time[0])) & (time <= min(last, time[-1]))
     if not is_covered.any():
         raise RecordingError("nothing is left of a recording that is shorter than its shift")
-    columns = {name: column[is_covered] for name, column in columns.items()}
-    zeros = np.zeros_like(columns[TIME])
-    q, v, tau = (
-        np.column_stack([columns.get(x + suffix, zeros) for x in recording.joints])
-        for suffix in ("", VELOCITY_SUFFIX, FORCE_SUFFIX)
-    )
-    channels = {name: columns[name] for name in recording.channels}
-    return replace(recording, time=columns[TIME], q=q, v=v, tau=tau, channels=channels)
+    return recording.with_columns({name: x[is_covered] for name, x in columns.items()})

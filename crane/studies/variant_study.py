@@ -49,6 +49,7 @@ from crane.studies.optimization.variant_measures import (
     VariantEvaluation,
     check_unique_names,
     load_positions,
+    unique_names,
 )
 from crane.studies.parallel_jobs import (
     StoredResults,
@@ -149,7 +150,7 @@ def study(
     seed = as_seed(seed)
     base_machine, name = machine_from_files(machine)
     values, grid_shape = _variant_values(vary, draws, seed)
-    tasks = _unique_names("task", base_machine.tasks, tasks)
+    tasks = unique_names("task", base_machine.tasks, tasks)
     has_lever_tasks = any(base_machine.tasks[task].space == "joystick" for task in tasks)
     task_measure_units = task_measures(base_machine) if tasks else {}
     available = task_measure_units | stroke_measures(base_machine)
@@ -159,7 +160,7 @@ def study(
     for text in require:
         parse_requirement(text)
     named_measures = [x for x in measures or () if x not in expressions]
-    selected_measures = _unique_names(
+    selected_measures = unique_names(
         "measure", available, named_measures or (None if not expressions else ())
     )
     with_circuit = bool(has_lever_tasks or expressions or require)
@@ -339,15 +340,6 @@ def _variant_values(
             raise InputError(f"'{name}' is drawn between two values, give the lower and the upper")
     lower, upper = np.array(axes).T
     return np.random.default_rng(seed).uniform(lower, upper, (count, len(axes))), ()
-
-
-def _unique_names(
-    label: str, available: Mapping[str, object], requested: Sequence[str] | None
-) -> tuple[str, ...]:
-    """Return the requested names without repetitions; all by default."""
-    for name in requested or ():
-        check_name(name, available, f"{label} '{name}' is unknown")
-    return tuple(dict.fromkeys(available if requested is None else requested))
 
 
 def _parameter_units(machine: Machine, vary: Mapping[str, object], with_circuit: bool) -> dict:

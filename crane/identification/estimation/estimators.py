@@ -12,7 +12,7 @@ import numpy as np
 
 from crane.common.errors import InputError
 from crane.common.one_line_repr import OneLineRepr
-from crane.common.samples import Array
+from crane.common.samples import Array, solve_linear
 from crane.identification.estimation.noise_model import (
     Jackknife,
     NoiseModel,
@@ -228,7 +228,7 @@ class RegressionProblem:
                 f"{values[0] / max(values[-1], 1e-300):.1g}), take base parameters, or a prior "
                 "with finite deviations of those that do"
             )
-        return np.asarray(np.linalg.solve(A, stacked_factor[:size, -1]), dtype=np.float64), R, A
+        return solve_linear(A, stacked_factor[:size, -1]), R, A
 
     def evaluate_estimate(self, theta: Array, e: Array, s: Array, threshold: float) -> Estimate:
         """Estimate with the covariance A^-1 (sum of Q^T noise) A^-T for correlated noise.

@@ -137,7 +137,7 @@ class PulseSignals(ValveCommand):
         ramps = self._rate * np.clip(np.minimum(since, last - since), 0.0, None)
         u = np.copysign(np.minimum(np.abs(top), ramps), top)
         # a second spool gets the signal of the first one, as in `ValveSignals`
-        return np.asarray(self._neutral + self._signal_ranges * u)[:, self._valve_indices]
+        return (self._neutral + self._signal_ranges * u)[:, self._valve_indices]
 
     def signals(self, inputs: ControllerInputs) -> Sequence[Scalar]:
         """See `ValveCommand`."""

@@ -382,4 +382,4 @@ def _identifiable_moments(base: BaseParameters, count: int) -> tuple[Array, Arra
     unseen = np.linalg.svd(K)[2][len(K) :]
     _, sizes, axes = np.linalg.svd(unseen[:, 1:4]) if len(unseen) else (0, np.zeros(3), np.eye(3))
     sizes = np.append(sizes, np.zeros(3 - len(sizes)))
-    return share, np.asarray(axes[sizes <= _IDENTIFIABLE_TOLERANCE])
+    return share, axes[sizes <= _IDENTIFIABLE_TOLERANCE]

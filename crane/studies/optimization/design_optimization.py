@@ -38,6 +38,7 @@ from crane.studies.optimization.variant_measures import (
     available_measures,
     check_unique_names,
     load_positions,
+    unique_names,
 )
 from crane.studies.parallel_jobs import (
     StoredResults,
@@ -220,9 +221,7 @@ def design(
     if not objectives:
         raise InputError("no objective is given, name what to minimise or to maximise")
     names, lower, upper = ranges = _parameter_ranges(base_machine, vary)
-    chosen_tasks = tuple(base_machine.tasks if tasks is None else tasks)
-    for task in chosen_tasks:
-        check_name(task, base_machine.tasks, f"task '{task}' is unknown")
+    chosen_tasks = unique_names("task", base_machine.tasks, tasks)
     options = MeasureOptions(frame, find_rule(rule), chosen_tasks, load_user_measures(measures))
     base_job = _base_job(base_machine, name, ranges, objectives, require, options, measures)
     initial_values = np.array([MachineVariants(base_machine).values[x] for x in names])

@@ -325,6 +325,15 @@ def check_unique_names(
             raise InputError(f"a measure '{name}' exists already, give yours another name")
 
 
+def unique_names(
+    label: str, available: Mapping[str, object], requested: Sequence[str] | None
+) -> tuple[str, ...]:
+    """Return the requested names without repetitions; all by default."""
+    for name in requested or ():
+        check_name(name, available, f"{label} '{name}' is unknown")
+    return tuple(dict.fromkeys(available if requested is None else requested))
+
+
 def load_positions(expressions: Sequence[MeasureExpression]) -> list[tuple[float, ...]]:
     """Return all arguments of `load` that are numbers."""
     positions: list[tuple[float, ...]] = []
