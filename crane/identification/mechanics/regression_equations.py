@@ -11,7 +11,11 @@ from crane.common.errors import InputError
 from crane.common.progress import Progress, ignore_progress
 from crane.common.samples import Array
 from crane.identification.estimation.estimators import Estimate, Prior
-from crane.identification.estimation.regressor import triangular_factor, update_triangular_factor
+from crane.identification.estimation.regressor import (
+    Regressor,
+    triangular_factor,
+    update_triangular_factor,
+)
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.force_comparison import ForceComparison
 from crane.identification.mechanics.identification_model import IdentificationModel
@@ -360,8 +364,8 @@ def is_long_enough(motion: Motion, bandwidth: float) -> bool:
     return bandwidth * float(motion.time[-1] - motion.time[0]) >= _MIN_PERIODS
 
 
-class CombinedRegressor:
-    """Regressor of the used rows with combined columns: a `regressor.Regressor`.
+class CombinedRegressor(Regressor):
+    """Regressor of the used rows with combined columns.
 
     Args:
         equations: Equations with the regressor W (., r).
