@@ -6,7 +6,6 @@ from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
 
 from crane.common.errors import CraneError, InputError, check_name
 from crane.common.samples import Array
@@ -14,6 +13,8 @@ from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.statics import StaticsEvaluator
 from crane.formats.machine_loading import MachineVariants
 from crane.machine.machine import Machine
+from crane.motion.kinematics import Kinematics
+from crane.motion.workspaces.workspace_extremes import maximize_on_branch
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.lifting_capacity import capacity, torques
 from crane.ratings.rating_rules import Rule
@@ -258,48 +259,33 @@ class VariantEvaluation:
         It is searched from the best configurations over all strokes, with exact derivatives. Its
         derivatives are those at its fixed configuration (envelope theorem).
         """
-        search, closure = self._configuration_search, self.machine.closure
-        strokes = search.moving
-        columns = closure.active[strokes]
-        lower, stroke_lengths = search.low[strokes], (search.high - search.low)[strokes]
-        values = self._extreme_objective(
-            name, arguments, search.statics.evaluate(search.configurations).tip_positions
-        )[0]
-        order = np.argsort(values, kind="stable")
-        lowest_cost, best_configuration = np.inf, search.configurations[order[0]]
-        for start_index in order[:: max(1, len(order) // 50)][:_START_COUNT].tolist():
-            start = search.configurations[start_index]
-            last_closed = [start]
+        search, kinematics = (
+            self._configuration_search,
+            Kinematics(self.machine, self._statics.frame),
+        )
 
-            def cost(x: Array, last: list[Array] = last_closed) -> tuple[float, Array]:
-                q = last[0].copy()
-                q[columns] = lower + x * stroke_lengths
-                closed_configurations, is_closed = search.statics.close_loops(q[None])
-                if not is_closed[0]:
-                    return 1e6, np.zeros(len(x))
-                last[0] = closed_configurations[0]
-                statics = search.statics.evaluate(closed_configurations)
-                value, gradient = self._extreme_objective(name, arguments, statics.tip_positions)
-                return float(value[0]), (
-                    gradient[0] @ statics.tip_jacobian[0][:, strokes]
-                ) * stroke_lengths
+        def objective(q: Array) -> tuple[float, Array]:
+            tip = kinematics.position_at_configuration(q)[None]
+            values, gradients = self._extreme_objective(name, arguments, tip)
+            return -float(values[0]), -gradients[0] @ kinematics.tree_jacobian(q)
 
-            result = minimize(
-                cost, (start[columns] - lower) / stroke_lengths, jac=True, method="L-BFGS-B",
-                bounds=[(0.0, 1.0)] * len(strokes), options={"ftol": 1e-15, "gtol": 1e-10},
-            )  # fmt: skip
-            cost(result.x)
-            if result.fun < lowest_cost:
-                lowest_cost, best_configuration = float(result.fun), last_closed[0]
-        sign = -1.0 if name in ("reach", "highest") else 1.0
-        extreme, q = self._constant(sign * lowest_cost), best_configuration[None]
+        tips = self._statics.evaluate(search.configurations).tip_positions
+        order = np.argsort(self._extreme_objective(name, arguments, tips)[0], kind="stable")
+        found = [
+            maximize_on_branch(
+                self.machine, q, search.moving, (search.low, search.high), objective
+            )
+            for q in search.configurations[order[:: max(1, len(order) // 50)][:_START_COUNT]]
+        ]
+        value, best = max(found, key=lambda pair: pair[0])
+        sign, q = 1.0 if name in ("reach", "highest") else -1.0, best[None]
+        extreme = self._constant(sign * value)
         if not self._ranges:
             return extreme
-        _, gradient = self._extreme_objective(
-            name, arguments, self._statics.evaluate(q).tip_positions
-        )
+        tips = self._statics.evaluate(q).tip_positions
+        gradient = -sign * self._extreme_objective(name, arguments, tips)[1][0]
         derivatives = self._statics.parameter_derivatives(q, list(self._ranges))
-        return replace(extreme, derivatives=sign * gradient[0] @ derivatives.tip_positions[0])
+        return replace(extreme, derivatives=gradient @ derivatives.tip_positions[0])
 
 
 def available_measures(
