@@ -12,9 +12,10 @@ from crane.common.samples import Array, as_number
 from crane.dynamics.dynamics import Dynamics
 from crane.identification.excitation.fisher_information import FisherInformation
 from crane.identification.excitation.fourier_trajectory import FourierTrajectory, fourier_basis
-from crane.identification.mechanics.base_parameters import stroke_limits
+from crane.identification.mechanics.base_parameters import HALF_TURN
 from crane.identification.mechanics.model_terms import MotionSamples
 from crane.machine.machine import Machine
+from crane.motion.workspaces.workspace_mapping import stroke_limits
 
 DENSE_SAMPLES = 64  # samples per period of the highest harmonic, for checks of limits
 COARSE_SAMPLES = 12  # the same for the optimization
@@ -94,7 +95,7 @@ def trajectory_limits(
     if not 0 <= as_number(margin, "the margin", "") < 1:
         raise InputError(f"the margin is {margin:g}, give a share from 0 to below 1")
     columns = machine.closure.active
-    lower, upper = stroke_limits(machine)
+    lower, upper = stroke_limits(machine, HALF_TURN)
     velocity, flow, areas = _fed(machine)
     found = TrajectoryLimits(
         (lower + upper) / 2,
@@ -161,7 +162,7 @@ def singularity_proximity(machine: Machine, samples: MotionSamples) -> Array:
     It is |gamma_P diag(span)| / (5 |...| at home). Near the end of the branch small active motions
     cause large passive ones, which drives cannot follow.
     """
-    lower, upper = stroke_limits(machine)
+    lower, upper = stroke_limits(machine, HALF_TURN)
     rows, span = machine.closure.passive, upper - lower
 
     def size(gamma: Array) -> Array:

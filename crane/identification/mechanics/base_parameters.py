@@ -12,11 +12,11 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, independent_rows
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.model_terms import MotionSamples
-from crane.machine.machine import Machine
+from crane.motion.workspaces.workspace_mapping import stroke_limits
 
 _RANK_TOLERANCE = 1e-8  # independent part of a column, relative to its norm
 _ZERO_TOLERANCE = 1e-10  # norm of a zero column, relative to the largest
-_DEFAULT_SPAN = 1.0  # [rad], of the characteristic length, for joints without limits
+HALF_TURN = 1.0  # [rad] from home to the limits of joints without limits
 # order in which parameters are preferred as base parameters
 _PREFERENCE_ORDER = {
     "Izz": 0,
@@ -94,7 +94,7 @@ def random_samples(model: IdentificationModel, count: int, seed: int = 0) -> Mot
         InputError: The loops do not close within the limits.
     """
     machine, rng = model.machine, np.random.default_rng(seed)
-    lower, upper = stroke_limits(machine)
+    lower, upper = stroke_limits(machine, HALF_TURN)
     q_a: list[Array] = []
     for _ in range(20 * count):
         trial = rng.uniform(lower, upper)
@@ -117,20 +117,6 @@ def random_samples(model: IdentificationModel, count: int, seed: int = 0) -> Mot
         for size in (1.0 / characteristic_time, 3.0 / characteristic_time**2)
     )
     return model.samples(np.array(q_a), v_a, a_a, characteristic_time)
-
-
-def stroke_limits(machine: Machine) -> tuple[Array, Array]:
-    """Limits of the active joints; without limits a default range around home."""
-    home = machine.home[machine.closure.active]
-    span = machine.upper - machine.lower
-    is_unlimited, margin = (
-        ~np.isfinite(span),
-        _DEFAULT_SPAN * machine.closure.units[machine.closure.active],
-    )
-    return (
-        np.where(is_unlimited, home - margin, machine.lower),
-        np.where(is_unlimited, home + margin, machine.upper),
-    )
 
 
 def base_parameters(
