@@ -121,8 +121,9 @@ def check_forces(
             )
             continue
         if correlation > _MIN_CORRELATION and scale < -4 * error and size > 1 / _MAX_FORCE_FACTOR:
-            text = f"'{joint}_force' is {scale:.2g} times the model's, turn its sign"
-            reject_unless_trusted(text, trust)
+            reject_unless_trusted(
+                f"'{joint}_force' is {scale:.2g} times the model's, turn its sign", trust
+            )
             continue
         ratio = math.sqrt(np.mean(measured**2) / np.mean(expected**2))
         is_known = 1 / _MAX_FORCE_FACTOR < size < _MAX_FORCE_FACTOR and error < size / 2
@@ -141,11 +142,12 @@ def check_forces(
         ):
             reject_delay(f"{joint}_force", lag, "its model", trust)
     if messages:
-        text = (
+        warnings.warn(
             f"{', '.join(messages)}: friction and rotors may outweigh the bodies there, or the "
-            "unit is wrong, this recording cannot say"
+            "unit is wrong, this recording cannot say",
+            CraneWarning,
+            stacklevel=3,
         )
-        warnings.warn(text, CraneWarning, stacklevel=3)
 
 
 def warn_validation(training: ForceComparison, validation: ForceComparison) -> None:
@@ -169,12 +171,13 @@ def warn_validation(training: ForceComparison, validation: ForceComparison) -> N
                 f"({100 * validation_error:.3g} %)"
             )
     if messages:
-        text = (
+        warnings.warn(
             "errors on the validation are far above those on the training: "
             f"{', '.join(messages)}: the recordings do not belong together, or the training data "
-            "determine too little"
+            "determine too little",
+            CraneWarning,
+            stacklevel=3,
         )
-        warnings.warn(text, CraneWarning, stacklevel=3)
 
 
 def check_shared_samples(
@@ -198,11 +201,12 @@ def check_shared_samples(
         (_shared_share(*pair) for pair in itertools.product(recordings, validation)), default=0
     )
     if share > _MAX_SHARED_SHARE:
-        text = (
+        warnings.warn(
             f"{share:.0%} of the held-out samples are training data: their errors do not apply to "
-            "other motions, give other data"
+            "other motions, give other data",
+            CraneWarning,
+            stacklevel=3,
         )
-        warnings.warn(text, CraneWarning, stacklevel=3)
 
 
 def _shared_share(one: Recording | Motion, other: Recording | Motion) -> float:

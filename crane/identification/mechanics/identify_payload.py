@@ -335,12 +335,12 @@ def _check_mass(estimate: PayloadEstimate, trust: bool) -> None:
     """
     low, high = estimate.confidence_interval()[0].tolist()
     if high < 0:
-        text = (
+        reject_unless_trusted(
             f"the mass comes out as {low:.3g} to {high:.3g} kg, and no load weighs less than "
             "nothing: look at signs and units of forces or pressures, and identify the machine "
-            "without a load first"
+            "without a load first",
+            trust,
         )
-        reject_unless_trusted(text, trust)
 
 
 def _raise_unidentifiable(

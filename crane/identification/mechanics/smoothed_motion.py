@@ -131,11 +131,12 @@ def smoothed_motion(
     # static friction makes any force
     for i in np.flatnonzero(is_noisy).tolist():
         joint, place = machine.active[i], float(found.q[:, i].mean())
-        text = (
+        warnings.warn(
             f"'{joint}' stands still but for noise: its forces are not informative, move it, or "
-            f"lock it ({joint}={place:.4g})"
+            f"lock it ({joint}={place:.4g})",
+            CraneWarning,
+            stacklevel=2,
         )
-        warnings.warn(text, CraneWarning, stacklevel=2)
     passband = math.inf
     if found.passband is not None:
         passband = float(found.passband[is_moving].min(initial=math.inf))

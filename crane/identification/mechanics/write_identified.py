@@ -109,12 +109,13 @@ def _write_identified(identification: Identification, folder: str | Path) -> Pat
     if deviations:
         worst = max(deviations, key=lambda name: deviations[name])
         unit = "N" if worst in machine.joints and machine.unit(worst) == "m" else "N m"
-        text = (
+        warnings.warn(
             f"a machine file has no place for all of the friction of {', '.join(deviations)}: "
             "the nearest law at steady speeds is written, off by at most "
-            f"{deviations[worst]:.3g} {unit} ({worst})"
+            f"{deviations[worst]:.3g} {unit} ({worst})",
+            CraneWarning,
+            stacklevel=3,
         )
-        warnings.warn(text, CraneWarning, stacklevel=3)
     return file
 
 
