@@ -140,6 +140,11 @@ def independent_rows(rows: Array, tolerance: float) -> list[int]:
     return found
 
 
+def true_runs(mask: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """First indices, and those after the last, of the runs (k, 2) of a mask (N,)."""
+    return np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+
+
 def read_only_copy(array: Array) -> Array:
     """A read-only copy of an array."""
     out = array.copy()

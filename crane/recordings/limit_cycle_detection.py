@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.common.samples import Array
+from crane.common.samples import Array, true_runs
 from crane.common.scratch_arrays import release_pages
 from crane.description.sensors import VELOCITY_SUFFIX
 from crane.recordings.recording import REFERENCE_PREFIX, Recording
@@ -200,11 +200,10 @@ def _oscillation_spans(
     good = binary_closing(np.pad(good, count), np.ones(count + 1, dtype=bool))[
         count:-count
     ]  # single jolts
-    marks = np.flatnonzero(np.diff(good.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
     last_period = count - 2 * order
     return [
         (int(edges[a]), int(edges[b - 1 + count]), float(np.median(periods[a : b + last_period])))
-        for a, b in marks.tolist()
+        for a, b in true_runs(good).tolist()
     ]
 
 

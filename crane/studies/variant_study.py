@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.checkpoint import Checkpoint
+from crane.common.checkpoint import open_checkpoint
 from crane.common.errors import (
     CraneError,
     CraneWarning,
@@ -217,11 +217,8 @@ def _kept_rows(
     settings: tuple[StudyJob, Array, object],
     columns: Sequence[str],
     units: Mapping[str, str],
-) -> "Iterator[StoredResults[_VariantRow] | None]":
+) -> Iterator[StoredResults[_VariantRow]]:
     """Context of the rows of a study in a checkpoint, if there is one; see `Study.to_csv`."""
-    if checkpoint is None:
-        yield None
-        return
     values = settings[1]
     count = values.shape[1]
 
@@ -232,7 +229,7 @@ def _kept_rows(
         named_cells = zip(columns[count:], cells[:-1], strict=True)
         return {name: float(cell) for name, cell in named_cells if cell}, cells[-1]
 
-    with Checkpoint(
+    with open_checkpoint(
         checkpoint,
         {"machine data": MachineVariants(machine).spec, "settings": settings},
         study_headings(columns, units),

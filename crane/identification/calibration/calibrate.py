@@ -1,14 +1,13 @@
 """Calibration of machines: parameters fitted to recordings through the simulation."""
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from crane.common.checkpoint import Checkpoint
+from crane.common.checkpoint import open_checkpoint
 from crane.common.errors import CraneError, InputError, RecordingError, check_name, prefix_location
 from crane.common.progress import Progress, ignore_progress, progress_reporter
 from crane.common.samples import Array
@@ -24,7 +23,6 @@ from crane.description.sensors import (
     sensor_parameters,
     with_sensor_parameters,
 )
-from crane.description.specification import MachineSpec
 from crane.formats.machine_loading import MachineVariants, load
 from crane.identification.calibration.calibration_problem import CalibrationProblem
 from crane.identification.calibration.calibration_result import (
@@ -164,9 +162,16 @@ def calibrate(
     initial_residuals = [
         problem.residuals(case, np.zeros(problem.unknown_count)) for case in problem.cases
     ]
-    with _search_log(
-        checkpoint, machine, variants.spec, (unknowns, extras, automatic), cases
-    ) as log:
+    data = [
+        (x.table.units, x.table.values, x.sensors, x.train_mask, x.known_sensors) for x in cases
+    ]
+    dependencies = {
+        "machine data": (variants.spec, machine.locked_joints),
+        "recordings": data,
+        "settings": (unknowns, extras, automatic),
+    }
+    with open_checkpoint(checkpoint, dependencies, LOG_COLUMNS, 1) as table:
+        log = SearchLog(table)
         search = LevenbergMarquardt(problem, progress, log)
         if automatic:
             problem, search, excluded = select_parameters(
@@ -187,28 +192,6 @@ def calibrate(
         score_tests=tuple(tests),
         unobserved_parameters=tuple(excluded),
     )
-
-
-@contextmanager
-def _search_log(
-    checkpoint: str | Path | None,
-    machine: Machine,
-    spec: MachineSpec,
-    settings: tuple[object, ...],
-    cases: Sequence[RecordingCase],
-) -> Iterator[SearchLog]:
-    """Context of the states of the searches, in a checkpoint if there is one."""
-    if checkpoint is None:
-        yield SearchLog(None)
-        return
-    data = [
-        (x.table.units, x.table.values, x.sensors, x.train_mask, x.known_sensors) for x in cases
-    ]
-    dependencies = {
-        "machine data": (spec, machine.locked_joints), "recordings": data, "settings": settings
-    }  # fmt: skip
-    with Checkpoint(checkpoint, dependencies, LOG_COLUMNS, 1) as table:
-        yield SearchLog(table)
 
 
 def _read_cases(

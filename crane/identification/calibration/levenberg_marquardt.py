@@ -79,15 +79,14 @@ class SearchLog:
         checkpoint: Where states are kept; None if they are not.
     """
 
-    def __init__(self, checkpoint: Checkpoint | None):
+    def __init__(self, checkpoint: Checkpoint):
         self._checkpoint, self._number = checkpoint, 0
 
     def begin(self) -> SearchState | None:
         """Begin the next search; returns its last state if one is kept."""
         self._number += 1
         with suppress(KeyError, ValueError):  # none, or damaged: it is searched again
-            rows = {} if self._checkpoint is None else self._checkpoint.rows
-            *numbers, unknowns = rows[(str(self._number),)]
+            *numbers, unknowns = self._checkpoint.rows[(str(self._number),)]
             iteration, cost, damping, has_ended, total, simulations = map(float, numbers)
             return SearchState(
                 np.array([float(x) for x in unknowns.split()]), cost, damping, int(iteration),
@@ -101,13 +100,12 @@ class SearchLog:
         Raises:
             OutputError: It cannot be written.
         """
-        if self._checkpoint is not None:
-            cells = (
-                state.iteration, repr(float(state.cost)), repr(float(state.damping)),
-                int(state.has_ended), state.total_iterations, state.simulations,
-                " ".join(map(repr, state.z.tolist())),
-            )  # fmt: skip
-            self._checkpoint.append((str(self._number),), cells)
+        cells = (
+            state.iteration, repr(float(state.cost)), repr(float(state.damping)),
+            int(state.has_ended), state.total_iterations, state.simulations,
+            " ".join(map(repr, state.z.tolist())),
+        )  # fmt: skip
+        self._checkpoint.append((str(self._number),), cells)
 
 
 class LevenbergMarquardt:

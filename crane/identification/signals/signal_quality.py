@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from crane.common.errors import InputError, RecordingError
-from crane.common.samples import Array, as_number
+from crane.common.samples import Array, as_number, true_runs
 from crane.common.scratch_arrays import BLOCK_SIZE
 from crane.identification.signals.signal_processing import low_pass, sampling_step
 
@@ -297,10 +297,9 @@ def steady_means(time: Array, settle: float, signal: Array, answer: Array) -> St
     plain = _steady_mask(time, settle, signal, answer)
     held = _steady_mask(time, settle, signal)
     step = sampling_step(time)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], held, [False]]).astype(int)))
     means, found = plain.copy(), []
     pairs = np.stack([signal, answer])
-    for start, end in edges.reshape(-1, 2).tolist():
+    for start, end in true_runs(held).tolist():
         if plain[start:end].all():
             continue
         period, amplitude = _ringing(time[start:end], answer[start:end], settle)

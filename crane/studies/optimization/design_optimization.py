@@ -232,12 +232,12 @@ def design(
     total = starts * len(objectives) + (points if is_multi_objective else 0)
 
     def solve_jobs(
-        jobs: Sequence[DesignJob], finished: int, kept: StoredResults[DesignSolution] | None
+        jobs: Sequence[DesignJob], finished: int, kept: StoredResults[DesignSolution]
     ) -> list[DesignSolution]:
         return compute_jobs(
             solve_design_job, jobs, processes, scheduler,
             lambda done: progress((finished + done) / total),
-            kept and replace(kept, keys=[(str(finished + i),) for i in range(len(jobs))]),
+            replace(kept, keys=[(str(finished + i),) for i in range(len(jobs))]),
         )  # fmt: skip
 
     single_jobs = [

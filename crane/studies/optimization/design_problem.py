@@ -11,7 +11,7 @@ from zlib import crc32
 import numpy as np
 from scipy.optimize import minimize
 
-from crane.common.checkpoint import Checkpoint
+from crane.common.checkpoint import open_checkpoint
 from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
@@ -191,7 +191,7 @@ def solution_columns(
 @contextmanager
 def kept_solutions(
     checkpoint: str | Path | None, machine: Machine, job: DesignJob, settings: tuple[object, ...]
-) -> Iterator[StoredResults[DesignSolution] | None]:
+) -> Iterator[StoredResults[DesignSolution]]:
     """Context of the solutions in a checkpoint, if there is one, without the keys of jobs.
 
     Args:
@@ -200,9 +200,6 @@ def kept_solutions(
         job: Job with all objectives; jobs with one objective leave cells empty.
         settings: All that the solutions depend on besides the machine.
     """
-    if checkpoint is None:
-        yield None
-        return
     sizes = len(job.lower), len(job.objectives), len(job.requirements), 1, len(job.lower), 1
     ends = np.cumsum(sizes).tolist()
 
@@ -223,7 +220,7 @@ def kept_solutions(
 
     starts = [f"start {name}" for name in job.parameter_names]
     columns = solution_columns(job.parameter_names, len(job.objectives), len(job.requirements))
-    with Checkpoint(
+    with open_checkpoint(
         checkpoint,
         {"machine data": MachineVariants(machine).spec, "settings": settings},
         ["search", *columns, *starts, "termination"],
