@@ -145,6 +145,11 @@ def true_runs(mask: NDArray[np.bool_]) -> NDArray[np.intp]:
     return np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
 
 
+def root_mean_square(x: Array) -> float:
+    """Root of the mean square of all numbers of an array."""
+    return float(np.sqrt(np.mean(np.square(x))))
+
+
 def read_only_copy(array: Array) -> Array:
     """A read-only copy of an array."""
     out = array.copy()

@@ -13,7 +13,7 @@ from scipy.signal import correlate
 from crane.common.checkpoint import Checkpoint
 from crane.common.errors import CraneError
 from crane.common.progress import Progress
-from crane.common.samples import Array
+from crane.common.samples import Array, root_mean_square
 from crane.dynamics.joint_forces import find_stick_slip_columns
 from crane.identification.calibration.calibration_problem import (
     DERIVATIVE_TOLERANCE,
@@ -200,7 +200,7 @@ class LevenbergMarquardt:
                 residuals.setdefault(name, []).append(x)
         scales = {}
         for name, parts in residuals.items():
-            rms = max(float(np.sqrt(np.mean(np.concatenate(parts) ** 2))), _MIN_SCALE)
+            rms = max(root_mean_square(np.concatenate(parts)), _MIN_SCALE)
             least, most = self._scale_bounds[name]
             scales[name] = min(max(least, rms), most)
         return scales

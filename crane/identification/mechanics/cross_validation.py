@@ -10,7 +10,7 @@ import numpy as np
 
 from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.common.progress import Progress, ignore_progress, progress_reporter
-from crane.common.samples import Array, as_number
+from crane.common.samples import Array, as_number, root_mean_square
 from crane.common.units import format_table
 from crane.identification.mechanics.feasible_parameters import load_convex_solver
 from crane.identification.mechanics.identifiability import prior_from_names, read_priors
@@ -42,7 +42,7 @@ class CrossValidationTrial:
     def mean_error(self) -> float:
         """Root mean square of the errors of folds with motion."""
         errors = self.errors[~np.isnan(self.errors)]
-        return float(np.sqrt(np.mean(errors**2))) if len(errors) else np.inf
+        return root_mean_square(errors) if len(errors) else np.inf
 
 
 def cross_validate(

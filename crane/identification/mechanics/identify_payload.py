@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import InputError, RecordingError, check_name
 from crane.common.progress import Progress, ignore_progress, progress_reporter
-from crane.common.samples import Array, as_sample
+from crane.common.samples import Array, as_sample, root_mean_square
 from crane.common.threads import with_single_threaded_blas
 from crane.dynamics.dynamics import Dynamics
 from crane.identification.estimation.estimators import Estimate
@@ -238,7 +238,7 @@ class _PayloadCase:
         std = [math.inf]
         for joint in self.moving_drives:
             i = self.machine.active.index(joint)
-            least = MIN_FRICTION_SHARE * float(np.sqrt(np.mean(motion.tau[:, i] ** 2)))
+            least = MIN_FRICTION_SHARE * root_mean_square(motion.tau[:, i])
             band = max(breakaway_force(self.machine, joint), least)
             std.append(band if joint in self.one_way_drives else math.inf)
         prior = np.zeros(len(std)), np.array(std)

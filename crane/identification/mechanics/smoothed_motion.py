@@ -8,7 +8,7 @@ import numpy as np
 
 from crane.common.errors import CraneWarning, RecordingError, check_name, suggest_names
 from crane.common.progress import Progress, ignore_progress
-from crane.common.samples import Array
+from crane.common.samples import Array, root_mean_square
 from crane.common.scratch_arrays import release_pages, stack_columns
 from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.dynamics.dynamics import Dynamics
@@ -120,7 +120,7 @@ def smoothed_motion(
     v, a = found.v, found.a
     is_moving = np.ones(n, dtype=bool)  # by more than the uncertainty of the velocity
     if found.std_v is not None:
-        deviations = np.array([np.sqrt(np.mean(x**2)) for x in found.std_v.T])
+        deviations = np.array([root_mean_square(x) for x in found.std_v.T])
         is_moving = np.array([x.std() for x in v.T]) > _MOTION_FACTOR * deviations
     is_noisy = ~is_moving & v.any(axis=0)
     v[:, ~is_moving] = a[:, ~is_moving] = 0.0
