@@ -159,17 +159,12 @@ def calibrate(
         if not used_names & {x.name, *dict(x.members)}
     ]
     problem, excluded = CalibrationProblem(machine, unknowns, cases), list[str]()
-    initial_residuals = [
-        problem.residuals(case, np.zeros(problem.unknown_count)) for case in problem.cases
-    ]
-    data = [
-        (x.table.units, x.table.values, x.sensors, x.train_mask, x.known_sensors) for x in cases
-    ]
+    start = np.zeros(problem.unknown_count)
+    initial_residuals = [problem.residuals(case, start) for case in problem.cases]
     dependencies = {
         "machine data": (variants.spec, machine.locked_joints),
-        "recordings": data,
-        "settings": (unknowns, extras, automatic),
-    }
+        "recordings": [x.contents for x in cases], "settings": (unknowns, extras, automatic),
+    }  # fmt: skip
     with open_checkpoint(checkpoint, dependencies, LOG_COLUMNS, 1) as table:
         log = SearchLog(table)
         search = LevenbergMarquardt(problem, progress, log)

@@ -50,6 +50,12 @@ class RecordingCase:
     start_std: Array
     first_start_index: int = 0
 
+    @property
+    def contents(self) -> tuple[object, ...]:
+        """What its residuals depend on besides the machine."""
+        table = self.table
+        return table.units, table.values, self.sensors, self.train_mask, self.known_sensors
+
     def split_training(self, machine: Machine, part_duration: float) -> list["RecordingCase"]:
         """Split the training data into parts of a duration [s] that start at measured states.
 

@@ -11,9 +11,13 @@ import numpy as np
 from crane.common.errors import CraneWarning
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
-from crane.identification.mechanics.recording_rejection import reject_delay, reject_unless_trusted
 from crane.identification.signals.signal_processing import Motion, sampling_step
-from crane.identification.signals.signal_quality import shifted_correlation, signal_delay
+from crane.identification.signals.signal_quality import (
+    reject_delay,
+    reject_unless_trusted,
+    shifted_correlation,
+    signal_delay,
+)
 from crane.recordings.recording import Recording
 
 _MAX_FORCE_FACTOR = 30.0  # largest ratio of a force to that of the model

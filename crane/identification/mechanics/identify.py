@@ -42,7 +42,6 @@ from crane.identification.mechanics.identifiability import (
 from crane.identification.mechanics.identification_model import IdentificationModel, TermChanges
 from crane.identification.mechanics.identification_result import Identification
 from crane.identification.mechanics.model_terms import FrictionTerm, ModelTerm, body_names
-from crane.identification.mechanics.recording_rejection import reject_unless_trusted
 from crane.identification.mechanics.regression_equations import (
     CombinedRegressor,
     RegressionEquations,
@@ -50,7 +49,10 @@ from crane.identification.mechanics.regression_equations import (
 )
 from crane.identification.mechanics.smoothed_motion import smoothed_motion
 from crane.identification.signals.signal_processing import Motion
-from crane.identification.signals.signal_quality import spectral_edge_frequency
+from crane.identification.signals.signal_quality import (
+    reject_unless_trusted,
+    spectral_edge_frequency,
+)
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 

@@ -29,12 +29,12 @@ from crane.identification.mechanics.payload_estimate import (
     static_cutoff,
     static_mass,
 )
-from crane.identification.mechanics.recording_rejection import reject_unless_trusted
 from crane.identification.mechanics.regression_equations import (
     RegressionEquations,
 )
 from crane.identification.mechanics.smoothed_motion import smoothed_motion
 from crane.identification.signals.signal_processing import Motion
+from crane.identification.signals.signal_quality import reject_unless_trusted
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 

@@ -12,7 +12,6 @@ from crane.common.samples import Array, root_mean_square
 from crane.common.scratch_arrays import release_pages, stack_columns
 from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.dynamics.dynamics import Dynamics
-from crane.identification.mechanics.recording_rejection import reject_delay, reject_unless_trusted
 from crane.identification.signals.signal_processing import (
     Motion,
     check_gaps,
@@ -23,6 +22,8 @@ from crane.identification.signals.signal_processing import (
 )
 from crane.identification.signals.signal_quality import (
     outlier_mask,
+    reject_delay,
+    reject_unless_trusted,
     replace_outliers,
     shifted_correlation,
     signal_delay,
