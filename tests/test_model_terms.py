@@ -23,7 +23,6 @@ from crane.identification.mechanics.cross_validation import (
 from crane.identification.mechanics.force_comparison import check_shared_samples
 from crane.identification.mechanics.identifiability import prior_from_names
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.identified_description import friction_laws
 from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.model_terms import (
     ForceDirection,
@@ -34,6 +33,7 @@ from crane.identification.mechanics.model_terms import (
     friction_term,
     root_friction_term,
 )
+from crane.identification.mechanics.write_identified import friction_laws
 from crane.identification.signals.signal_processing import Motion
 
 STEP = 5e-3

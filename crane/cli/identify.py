@@ -232,15 +232,12 @@ def identify(
     """
     from crane.common.samples import as_number
     from crane.identification.mechanics.cross_validation import format_trials, identify_options
-    from crane.identification.mechanics.write_identified import check_rewritable
 
     window, terms, priors = parse_window(train), parse_terms(model.term), parse_priors(model.prior)
     loaded, trials = options.load(machine), parse_trials(tried)
     min_speeds = parse_values("--min-speed", min_speed, joint_units(loaded, "/s"))
     if priors is None:
         loaded = loaded.replace(estimation=replace(loaded.estimation, prior={}))
-    if model.feasible:
-        check_rewritable(loaded)
     inside, outside = _split(_read(recording, loaded, reading), window)
     judges: list[crane.Recording | Motion] = [*_usable_motions(loaded, outside, trust)]
     if train is not None and not outside:

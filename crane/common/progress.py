@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from types import FrameType
 
+Progress = Callable[[float], None]  # called with the finished share, 0 to 1
 REPORT_DELAY = 2.0  # [s] before the first report
 REPORT_INTERVAL = 0.5  # [s] between two reports
 _ACTIVITIES = {
@@ -103,10 +104,10 @@ PROGRESS = ProgressTracker()
 
 
 def ignore_progress(share: float) -> None:
-    """A function of the finished share that reports it to nobody."""
+    """In place of a reporter where nobody asks for the finished share."""
 
 
-def progress_reporter(progress: Callable[[float], None] | None) -> Callable[[float], None]:
+def progress_reporter(progress: Progress | None) -> Progress:
     """The function by which the caller reports its finished share: given, or the tracker's."""
     return progress or PROGRESS.start_reporting(sys._getframe(1)) or ignore_progress
 

@@ -205,7 +205,7 @@ def _evaluate_node(node: ast.expr, arrays: Mapping[str, np.ndarray]) -> np.ndarr
             raise RecordingError(
                 f"'{ast.unparse(node)}' is not there, give numbers from 0 to {whole.shape[-1] - 1}"
             )
-        return np.asarray(whole[..., at.value])
+        return whole[..., at.value]
     if isinstance(node, ast.Name) or isinstance(node, ast.Constant) and type(node.value) is str:
         name = node.id if isinstance(node, ast.Name) else str(node.value)
         if name in arrays:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from crane.common.errors import ClosureError, CraneWarning, MechanismError
-from crane.common.samples import Array
+from crane.common.samples import Array, root_mean_square
 from crane.description.sensors import (
     INCLINATION_PREFIX,
     SENSOR_PREFIX,
@@ -252,7 +252,7 @@ class _RedundantSensor:
         rate_columns = [np.ones_like(self.time)] if self.is_rate else []
         A = np.column_stack([*columns, *rate_columns])
         values: Array = np.asarray(np.linalg.lstsq(A, discrepancy, rcond=None)[0])
-        return values, float(np.sqrt(np.mean((discrepancy - A @ values) ** 2)))
+        return values, root_mean_square(discrepancy - A @ values)
 
     @property
     def _zero_column(self) -> Array:
@@ -300,7 +300,7 @@ class _RedundantSensor:
                         + self.expected
                         - self._configurations.expected_reading(self.name, q)
                     )
-                    residual_rms = float(np.sqrt(np.mean(discrepancy**2)))
+                    residual_rms = root_mean_square(discrepancy)
                     derivative = -self._configurations.directional_derivative(
                         self.name, q, self._configurations.machine.closure.gamma(q)[:, :, i]
                     )

@@ -8,9 +8,8 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.recording_rejection import shift_remedy
 from crane.identification.signals.signal_processing import Motion, low_pass
-from crane.identification.signals.signal_quality import spectral_edge_frequency
+from crane.identification.signals.signal_quality import shift_remedy, spectral_edge_frequency
 from crane.recordings.recording import FORCE_SUFFIX
 
 _CUTOFF_FACTOR = 10.0  # cutoff, times the frequency of the motion
@@ -60,7 +59,7 @@ class ForceDelays(OneLineRepr):
             return np.zeros(len(self.joints), dtype=bool)
         limit = float(t.ppf(_CONFIDENCE, self.blocks - 1)) * self.std
         is_early = (self.seconds < -limit) & (self.explained > _MIN_EXPLAINED_SHARE)
-        return np.asarray((self.seconds > limit) | is_early)
+        return (self.seconds > limit) | is_early
 
     @property
     def text(self) -> str:

@@ -1,18 +1,17 @@
 """Derivatives, filters, resampling and decimation of recorded signals."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from crane.common.errors import InputError, RecordingError, check_name
 from crane.common.one_line_repr import OneLineRepr
+from crane.common.progress import Progress, ignore_progress
 from crane.common.samples import Array, as_number
 from crane.common.scratch_arrays import empty_array, release_pages
 from crane.identification.signals.kalman_smoother import kalman_smooth
 
-Progress = Callable[[float], None]
 METHODS = ("kalman", "lowpass")
 _MIN_SAMPLES = 50  # samples
 _MAX_GAP = 5.0  # steps
@@ -78,7 +77,7 @@ def differentiate(
     q: Array,
     method: str = "kalman",
     cutoff: float | None = None,
-    progress: Progress | None = None,
+    progress: Progress = ignore_progress,
 ) -> Derivatives:
     """Velocities and accelerations from measured coordinates.
 
@@ -112,8 +111,7 @@ def differentiate(
         std_v[:, i], std_a[:, i] = std.T[1:]
         del states, std
         release_pages()
-        if progress is not None:
-            progress((i + 1) / q.shape[1])
+        progress((i + 1) / q.shape[1])
     return Derivatives(position, v, a, std_v, std_a, noise, half)
 
 
@@ -190,7 +188,7 @@ def low_pass(time: Array, x: Array, cutoff: float, order: int = 4) -> Array:
     step = sampling_step(time)
     if not 0 < cutoff < 0.5 / step:
         raise InputError(f"cutoff is {cutoff:g} Hz, give one between 0 and {0.5 / step:g} Hz")
-    return np.asarray(sosfiltfilt(butter(order, cutoff, output="sos", fs=1 / step), x, axis=0))
+    return sosfiltfilt(butter(order, cutoff, output="sos", fs=1 / step), x, axis=0)
 
 
 def filter_kernel(step: float, cutoff: float) -> Array:
@@ -207,7 +205,7 @@ def filter_kernel(step: float, cutoff: float) -> Array:
     n = math.ceil(0.5 * length) - 1
     phase = 2 * math.pi * np.arange(-n, n + 1.0) / length
     weights = np.cos(np.outer(phase, np.arange(4.0))) @ _WINDOW_COEFFICIENTS
-    return np.asarray(weights / weights.sum())
+    return weights / weights.sum()
 
 
 def average_periods(time: Array, x: Array, period: float) -> tuple[Array, Array, Array]:
@@ -296,6 +294,6 @@ def _weighted_means(x: Array, weights: Array, decimation: int) -> Array:
     def convolved(x: Array) -> Array:
         edges = [(lead, reach), *[(0, 0)] * (x.ndim - 1)]
         whole = upfirdn(weights, np.pad(x, edges), down=decimation, axis=0)
-        return np.asarray(whole[kept_samples][: -(-count // decimation)])
+        return whole[kept_samples][: -(-count // decimation)]
 
     return convolved(x) / convolved(np.ones(count)).reshape(-1, *[1] * (x.ndim - 1))
