@@ -54,6 +54,7 @@ from crane.simulation.integration.scipy_integrator import SCIPY_METHODS, ScipyIn
 from crane.simulation.recorded_run import IntegrationResult, record_run, stop_with_recording
 from crane.simulation.run_checks import (
     buried_contact_text,
+    closed_counterbalance_text,
     find_invalid_motion,
     passed_limits_text,
     run_warnings,
@@ -188,7 +189,8 @@ def simulate(
     recording = record_run(machine, control, run.time, run.rows, label, start_text=run.start_text)
     every_step, is_exact = has_fixed_steps(dynamics, control, method), formulation == "exact"
     texts = run_warnings(machine, run.time, run.rows, step, every_step, is_exact)
-    for text in filter(None, [*texts, tipping_message(recording)]):
+    texts += [tipping_message(recording), closed_counterbalance_text(machine, recording)]
+    for text in filter(None, texts):
         warnings.warn(text, CraneWarning, stacklevel=2)
     return recording
 
