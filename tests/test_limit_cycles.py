@@ -228,8 +228,10 @@ def lowered_by_hand(holding, mass, start, duration):
 
     time = np.arange(0.0, duration + 5e-4, 1e-3)
     carried = (mass * 9.81 + AREA_B * tank) / AREA_A
-    run = solve_ivp(rates, (0, duration), [start, 0.0, *((np.array([carried, tank]) - vapour) / 1e5)],
-                    "Radau", t_eval=time, rtol=1e-8, atol=1e-8, max_step=5e-3)  # fmt: skip
+    first = [start, 0.0, (carried - vapour) / 1e5, (tank - vapour) / 1e5]
+    run = solve_ivp(
+        rates, (0, duration), first, "Radau", t_eval=time, rtol=1e-8, atol=1e-8, max_step=5e-3
+    )
     return run.y[0], vapour + 1e5 * np.maximum(run.y[2], 0.0)
 
 

@@ -139,6 +139,27 @@ def coordinate_rates(
     return out
 
 
+def motion_commutator(
+    geometry: "TreeGeometry", velocities: Sequence[Scalar], motion: Sequence[Scalar]
+) -> list[Scalar]:
+    """Commutator (nb,) of joint velocities (nb,) and a small motion (nb,) of the joints.
+
+    The rate of a small motion x along joint velocities v that change by dv is x' = dv - [v, x]:
+    [v, x] = w x t for the angular parts w, t of a ball joint, and for the linear parts u, l of a
+    floating base w x l + u x t (Lie bracket of SE(3)); 0 of all other joints.
+    """
+    out: list[Scalar] = [0.0] * len(velocities)
+    for i in geometry.rotation_bodies:
+        part = slice(i - 1, i + 2)
+        out[part] = cross(velocities[part], motion[part])
+    for i in geometry.floating_bases:
+        linear, angular = slice(i - 1, i + 2), slice(i + 2, i + 5)
+        out[linear] = add_vectors(
+            cross(velocities[angular], motion[linear]), cross(velocities[linear], motion[angular])
+        )
+    return out
+
+
 def wrap_rotation_vector(vector: Sequence[Scalar]) -> list[Scalar]:
     """The same rotation with a vector of length pi or less, from one shorter than 2 pi."""
     length = _regularized_norm(vector)

@@ -375,8 +375,6 @@ def integrator_factory(
             raise InputError("a program with a period runs on the compiled backend alone")
         if requested_method is None and not valves:
             return FixedStepIntegrator(chart, control, controller_state_count)
-        if chart.machine.coordinates.rotation_columns:
-            raise InputError("scipy's methods do not limit rotation vectors to pi, take rk4")
         name = "BDF" if method == "rosenbrock" else method
         return ScipyIntegrator(chart, control, controller_state_count, name, **options)
 
