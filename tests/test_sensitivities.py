@@ -178,7 +178,8 @@ loops: [{name: l, type: revolute, predecessor: eye, successor: pin}]
 active: [c]
 home: {c: 0.8, d: -0.58, r: 0.93}
 """
-TURNING = {  # start, parameters; an open tree, a rod whose spin alone is active, a ship with a loop
+# starts and parameters: an open tree, a rod whose spin alone is active, a floating loop
+TURNING = {
     "rod": (
         ([0.1, 0.3, 2.0, 1.0], [0.0, 1.0, 2.0, 5.0]),
         ("start.b_ry", "start.b_rz_velocity", "rod.mass"),

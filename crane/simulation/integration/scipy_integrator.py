@@ -119,11 +119,7 @@ class ScipyIntegrator(StickSlipIntegrator):
             self._record(instants, until, dense_output, state, rows)
             if progress is not None:
                 progress(self.next_instant)
-            rotations = [
-                float(np.linalg.norm(view(solver.y).q[column : column + 3]))
-                for column in coordinates.rotation_columns
-            ]
-            if event_state is not None or max(rotations, default=0.0) > _MAX_ROTATION:
+            if event_state is not None or self._has_long_rotation(solver.y):
                 state[:] = solver.y if event_state is None else event_state
                 self.python_stepper.close_loops(until, state)
                 if event_state is not None:
@@ -135,6 +131,12 @@ class ScipyIntegrator(StickSlipIntegrator):
             if self._chart.largest_gamma_entry(q) > self.python_stepper.chart_limits[0]:
                 return False
         return True
+
+    def _has_long_rotation(self, state: Array) -> bool:
+        """Whether a rotation vector has to be limited to pi."""
+        q = self.python_stepper.state_layout.view(state).q
+        columns = self._chart.machine.coordinates.rotation_columns
+        return any(np.linalg.norm(q[i : i + 3]) > _MAX_ROTATION for i in columns)
 
     def _check_passive_velocities(self, time: float, state: Array) -> None:
         """Check the velocities of the passive joints.
