@@ -12,7 +12,7 @@ from command_line import typed
 import crane
 from crane.common.errors import CraneError, CraneWarning, InputError, RecordingError
 from crane.description import Friction
-from crane.description.specification import EstimationSettings, ParameterPrior
+from crane.description.estimation_settings import EstimationSettings, ParameterPrior
 from crane.formats import write_machine
 from crane.identification.mechanics.cross_validation import (
     FOLD_COUNT,

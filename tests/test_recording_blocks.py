@@ -173,7 +173,7 @@ finally:
 @pytest.fixture
 def small(monkeypatch):
     """Scratch files for short recordings, too, in blocks of a few samples."""
-    monkeypatch.setattr(scratch_arrays, "_MIN_FILE_ELEMENTS", 1)
+    monkeypatch.setattr(scratch_arrays, "MIN_FILE_ELEMENTS", 1)
     monkeypatch.setattr(scratch_arrays, "BLOCK_SIZE", 64)
     monkeypatch.setattr("crane.recordings.timeseries.BLOCK_ROWS", 50)
 
@@ -228,7 +228,7 @@ def test_a_motion_is_smoothed_in_a_few_columns(mini, monkeypatch):
     """Whole series are in scratch files, and blocks take as much for any recording."""
     from crane.identification.mechanics.smoothed_motion import smoothed_motion
 
-    monkeypatch.setattr(scratch_arrays, "_MIN_FILE_ELEMENTS", 1)
+    monkeypatch.setattr(scratch_arrays, "MIN_FILE_ELEMENTS", 1)
     time = np.arange(0.0, 200.0, 1e-3)
     rates = 2 * np.pi * np.array([0.31, 0.43, 0.57])
     middle, reach = 0.5 * (mini.lower + mini.upper), 0.2 * (mini.upper - mini.lower)

@@ -10,7 +10,7 @@ import typer
 
 import crane
 from crane.cli.command import OptionBlock, command, refuse_options
-from crane.cli.option_units import joint_units, number_option, parameter_units
+from crane.cli.option_units import joint_turns, joint_units, number_option, parameter_units
 from crane.cli.options import (
     Bandwidth,
     CentreOfMass,
@@ -233,8 +233,10 @@ def identify(
     from crane.identification.mechanics.cross_validation import format_trials, identify_options
     from crane.identification.mechanics.write_identified import check_rewritable
 
-    window, terms, priors = parse_window(train), parse_terms(model.term), parse_priors(model.prior)
-    loaded, trials = options.load(machine), parse_trials(tried)
+    window, loaded = parse_window(train), options.load(machine)
+    turns = joint_turns(loaded)
+    terms, priors = parse_terms(model.term, turns), parse_priors(model.prior, turns)
+    trials = parse_trials(tried, turns)
     min_speeds = parse_values("--min-speed", min_speed, joint_units(loaded, "/s"))
     if priors is None:
         loaded = loaded.replace(estimation=replace(loaded.estimation, prior={}))
@@ -263,7 +265,7 @@ def identify(
                 loaded, inside, trials, progress, **settings
             )
         print(f"{format_trials(tried_settings)}\n")
-        settings = identify_options(tried_settings[0].settings, settings)
+        settings = identify_options(loaded, tried_settings[0].settings, settings)
     with progress_bar("identifying") as progress:
         result = crane.identify(loaded, inside, judges or None, progress=progress, **settings)
     if result.validation is None:

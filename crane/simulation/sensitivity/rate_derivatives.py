@@ -172,7 +172,7 @@ class ReverseDerivatives(RateProgram):
         if loops.rows:
             # q_P depends linearly on the gaps of the loops; their values cancel
             gaps = [tape.load(7, r) for r in range(len(loops.rows))]
-            held = {joint: [0.0] for joint in loops.active_joints}
+            held: dict[int, list[Scalar]] = {joint: [0.0] for joint in loops.active_joints}
             motion, _ = loops.solve_passive(held, [[-1.0 * gap] for gap in gaps])
             changes = {i: row[0] for i, row in motion.items()}
             steps, turned = loops.coordinate_steps(changes), _active_commutator(dynamics, changes)
