@@ -6,6 +6,7 @@ import numpy as np
 
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
+from crane.common.scratch_arrays import release_pages
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.recording_rejection import shift_remedy
@@ -126,6 +127,7 @@ def force_delays(
     blocks = min(_MAX_BLOCKS, int(frequency * (time[-1] - time[0]) / _PERIODS_PER_BLOCK))
     if blocks < _MIN_BLOCKS or len(time) < 10 * filter_reach:
         return unknown
+    release_pages()
     at = model.samples(motion.q[chosen], motion.v[chosen], motion.a[chosen], step * decimation)
     W = model.regressor(at)[:, :, base.independent]
     for i in range(n):
