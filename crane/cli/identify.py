@@ -234,9 +234,8 @@ def identify(
     from crane.identification.mechanics.write_identified import check_rewritable
 
     window, loaded = parse_window(train), options.load(machine)
-    turns = joint_turns(loaded)
-    terms, priors = parse_terms(model.term, turns), parse_priors(model.prior, turns)
-    trials = parse_trials(tried, turns)
+    terms = parse_terms(model.term, turns := joint_turns(loaded))
+    priors, trials = parse_priors(model.prior, turns), parse_trials(tried, turns)
     min_speeds = parse_values("--min-speed", min_speed, joint_units(loaded, "/s"))
     if priors is None:
         loaded = loaded.replace(estimation=replace(loaded.estimation, prior={}))

@@ -38,9 +38,12 @@ def parse_expression(text: str) -> ast.expr:
         tree = ast.parse(text, mode="eval").body
     except (SyntaxError, MemoryError, RecursionError):
         raise ValueError(f"'{text[:80]}' is no expression") from None
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and type(node.value) in (int, float):
-            number = ast.get_source_segment(text, node) or ""
-            if re.fullmatch("[0-9.eE+-]+", number) is None:
-                raise ValueError(f"'{number}' is not a number")
+    numbers = [
+        ast.get_source_segment(text, node) or ""
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and type(node.value) in (int, float)
+    ]
+    for number in numbers:
+        if re.fullmatch("[0-9.eE+-]+", number) is None:
+            raise ValueError(f"'{number}' is not a number")
     return tree
