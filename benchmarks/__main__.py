@@ -13,6 +13,7 @@ import warnings
 from pathlib import Path
 
 import forward_dynamics
+import hydraulic_crane
 import report
 from problem import Problem, problems
 from reference import write_reference
@@ -48,9 +49,11 @@ def main() -> None:
     print(parts[0], flush=True)
     points = run_work_precision(chosen)
     parts += report.work_precision_tables(chosen, points)
-    results = [] if options.only else run_forward_dynamics(options.quick)
-    if results:
-        parts += ["### Forward dynamics", report.forward_dynamics_table(results)]
+    results = []
+    if not options.only:
+        parts += ["#### Two arms on cylinders", report.hydraulics_table(hydraulic_crane.measure())]
+        results = run_forward_dynamics(options.quick)
+        parts += ["### Forward dynamics of all engines", report.forward_dynamics_table(results)]
     print("\n\n".join(parts[1:]))
     if options.json:
         rows = [point.as_json() for point in points]

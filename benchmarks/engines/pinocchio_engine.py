@@ -1,5 +1,6 @@
 """Pinocchio's forward dynamics with loops, in a Runge-Kutta loop in Python."""
 
+import contextlib
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -8,6 +9,7 @@ from dense_equations import SpringForces, exact_forward
 from multibody import Array, Loop, Multibody
 from problem import Problem
 
+import crane
 from engines.engine import Engine, TreeSimulator, UnsupportedError
 
 SETTINGS = [(k, mu) for k in (1, 2, 3, 5, 10) for mu in (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)]
@@ -84,11 +86,15 @@ def sample_states(system: Multibody, count: int) -> list[tuple[Array, Array, Arr
     rate, phase = random.uniform(0.5, 1.5, n), random.uniform(0, 2 * np.pi, n)
     turn = 0.01 * np.arange(count)[:, None] * rate + phase
     reach = min(0.1, len(system.loops) / system.model.nv)
-    q_a = system.q[active] + reach * (np.sin(turn) - np.sin(phase))
-    configurations = closure.solve(q_a)
+    path = closure.units[active] * (np.sin(turn) - np.sin(phase))
+    while True:
+        with contextlib.suppress(crane.CraneError):
+            configurations = closure.solve(system.q[active] + reach * path)
+            break
+        reach /= 2  # where the loops cannot be closed on all of it
     tau = np.zeros((count, system.model.nv))
     tau[:, active] = 10 * random.normal(size=(count, n))
-    v_a = reach * rate * np.cos(turn)
+    v_a = reach * closure.units[active] * rate * np.cos(turn)
     return [
         (q, closure.gamma(q) @ rate, force)
         for q, rate, force in zip(configurations, v_a, tau, strict=True)

@@ -150,7 +150,7 @@ class Closure(BranchSolver, OneLineRepr):
         if not _has_same_geometry(LoopEquations(model, loops, couplings), self.equations):
             return None
         other = copy.copy(self)
-        other.__dict__.pop("_cursors", None)
+        other.__dict__.pop("_solvers", None)
         other.__dict__.pop("_beyond", None)
         return other
 
@@ -244,6 +244,12 @@ class Closure(BranchSolver, OneLineRepr):
             SingularConfigurationError: The branch ends there, at a dead centre.
             WrongBranchError: The guess belongs to another branch.
         """
+        if (
+            initial_guess is None
+            and self.is_compiled
+            and (q := self._solvers.value.evaluate_sample(q_a)) is not None
+        ):
+            return q
         targets = as_samples(q_a, len(self.active), "q_a", self.active_names)
         if targets.size == 0:
             raise InputError("q_a is an empty stack, give at least one sample")
@@ -297,6 +303,9 @@ class Closure(BranchSolver, OneLineRepr):
             InputError: Wrong shape or not finite.
             SingularConfigurationError: The passive joints are not determined there.
         """
+        code = self._machine_code
+        if code is not None and (gamma := code.gamma_function(q)) is not None:
+            return gamma
         q = as_samples(q, self.model.nv, "q", self.equations.coordinates.names)
         if q.size == 0:
             raise InputError("q is an empty stack, give at least one sample")

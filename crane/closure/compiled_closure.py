@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -22,6 +23,7 @@ from crane.closure.loop_equations import Cluster, LoopEquations, find_clusters
 from crane.closure.loop_formulas import LoopFormulas
 from crane.closure.predictor_formulas import PredictorFormulas
 from crane.codegen import Layout, LayoutView, Program, Scalar, Tape, max_abs, maximum
+from crane.codegen.llvm.sample_function import SampleFunction
 from crane.codegen.symbolic import minimum
 from crane.common.samples import Array
 
@@ -47,6 +49,18 @@ class ContinuationCursor:
         """Start the next step from a closed configuration."""
         self.state[: len(configuration.q)] = configuration.q
         self.state[len(configuration.q) :] = configuration.passive_gamma[self.gamma_entries]
+
+
+class ContinuedFunction(NamedTuple):
+    """A function of one sample that closes the loops from a cursor; every thread has its own.
+
+    Attributes:
+        cursor: The cursor.
+        evaluate_sample: The function, see `Program.sample_function`.
+    """
+
+    cursor: ContinuationCursor
+    evaluate_sample: SampleFunction
 
 
 class _SharedCode:
@@ -216,6 +230,15 @@ class CompiledClosure:
         cursor.start_from(self._home)
         return cursor
 
+    def new_solver(self) -> "ContinuedFunction":
+        """The function of one target (n,) that returns q (nq,), with a new cursor."""
+        cursor, target, q = self.new_cursor(), np.zeros((1, self._n)), np.zeros(self._nq)
+        arrays = self.geometry.constants, target, cursor.state, q, self.tolerances
+        return ContinuedFunction(
+            cursor,
+            self._closure_program.sample_function("follow", 1, *arrays, inputs=target, output=q),
+        )
+
     def start_cursor_at(self, cursor: "ContinuationCursor", q: Array) -> bool:
         """Move a cursor to a configuration (nq,) that is closed to 1e-6 or better.
 
@@ -256,6 +279,14 @@ class CompiledClosure:
             cursor.state,
             out,
             self.tolerances,
+        )
+
+    @cached_property
+    def gamma_function(self) -> SampleFunction:
+        """The function of one closed configuration (nq,) that returns gamma (nv, n)."""
+        q, gamma = np.zeros((1, self._nq)), np.zeros((self._nq, self._n))
+        return self._closure_program.sample_function(
+            "gamma_each", 1, self.geometry.constants, q, gamma, inputs=q, output=gamma
         )
 
     def close_in_place(self, q: Array) -> int:

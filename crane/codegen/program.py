@@ -14,7 +14,6 @@ import ctypes
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from ctypes import addressof, c_char
-from functools import partial
 from struct import pack
 from typing import Any
 
@@ -22,6 +21,7 @@ import numpy as np
 
 from crane.codegen.llvm.machine_code import MachineCode
 from crane.codegen.llvm.routine_builder import Routine
+from crane.codegen.llvm.sample_function import SampleFunction, make_sample_function
 from crane.codegen.program_cache import FunctionSignature, ProgramRecord, cache_entry_name
 from crane.codegen.symbolic import Scalar, required_operations
 from crane.codegen.vector_layout import Formula, Layout
@@ -164,17 +164,25 @@ class Program:
         )
         return result
 
-    def bind(self, name: str, *arguments: "int | np.ndarray") -> partial[int]:
-        """A function with its arguments bound, for many fast calls; see `call`.
+    def sample_function(
+        self, name: str, *arguments: "int | np.ndarray", inputs: Array, output: Array
+    ) -> SampleFunction:
+        """A function of one sample in machine code that Python calls directly.
 
-        Passing one pointer from Python is much faster than passing a dozen.
+        It takes up to k arrays (n,) and returns a new array of the shape of `output`; None where
+        an argument is not a float64 array (n,) of finite numbers, or the routine does not return
+        1. It holds the global interpreter lock; the routine must not call Python.
+
+        Args:
+            name: Name of the routine.
+            arguments: See `call`.
+            inputs: (k, n) that the routine reads, all or rows of it among the arguments.
+            output: Array among the arguments that the routine writes.
         """
-        addresses = np.frombuffer(
-            pack(f"{len(arguments)}q", *map(_argument_address, arguments)), dtype=np.int64
+        addresses = np.array([*map(_argument_address, arguments)], dtype=np.int64)
+        return make_sample_function(
+            self._entry_point(name, arguments), addresses, inputs, output, self, arguments
         )
-        bound = partial(self._entry_point(name, arguments), addresses.ctypes.data)
-        vars(bound)["references"] = self, addresses, arguments  # are kept alive
-        return bound
 
     def _entry_point(self, name: str, arguments: Sequence["int | np.ndarray"]) -> Any:
         expected, _ = self._signatures[name]

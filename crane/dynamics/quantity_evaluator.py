@@ -21,6 +21,8 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, apply_per_sample, as_samples, stack_length
 from crane.description.machine_parameters import unknown_parameter_text
 from crane.dynamics.compiled_dynamics import (
+    MATRIX_QUANTITIES,
+    WITH_FRICTION,
     CompiledParameterDerivatives,
     CompiledQuantity,
 )
@@ -124,6 +126,18 @@ class ConstantDerivatives:
 
 
 BACKENDS = ("compiled", "pinocchio")
+QUANTITY_ARGUMENTS = {  # arguments of the quantities of `derivatives`
+    "inverse": ("q_a", "v_a", "a_a"),
+    "forward": ("q_a", "v_a", "tau_a"),
+    "mass_matrix": ("q_a",),
+    "bias": ("q_a", "v_a"),
+    "gravity": ("q_a",),
+    "friction": ("q_a", "v_a"),
+    "passive": ("q_a", "v_a"),
+    "energy": ("q_a", "v_a"),
+    "regressor": ("q_a", "v_a", "a_a"),
+    "statics": ("q_a",),
+}
 
 
 class QuantityEvaluator(OneLineRepr):
@@ -342,41 +356,32 @@ class QuantityEvaluator(OneLineRepr):
         code = self._parameter_derivatives[key]
         return np.array([code.evaluate_closed(*row) for row in zip(q, inputs, strict=True)])
 
-    def _evaluate(
-        self,
-        quantity: str,
-        shape: tuple[int, ...],
-        q_a: ArrayLike,
-        v_a: ArrayLike | None = None,
-        x: ArrayLike | None = None,
-        x_name: str = "",
-    ) -> Array:
-        """A quantity of samples or stacks; single samples apply to every row of a stack.
-
-        `shape` is that of one result, () for a vector.
-        """
+    def _evaluate(self, quantity: str, *arguments: ArrayLike) -> Array:
+        """A quantity of samples or stacks; single samples apply to every row of a stack."""
         formula = self._compiled_quantities.get(quantity)
-        if formula is not None and (out := formula.evaluate_sample(q_a, v_a, x)) is not None:
-            return out.reshape(shape) if shape else out
+        if (
+            formula is not None
+            and (out := formula.sample_function.value.evaluate_sample(*arguments)) is not None
+        ):
+            return out
         names, n = self.machine.active, self._mobility
-        q_a = as_samples(q_a, n, "q_a", names)
-        checked = [
+        name = quantity.removesuffix(WITH_FRICTION).replace(" ", "_")
+        q_a, *others = (
             as_samples(value, n, what, names)
-            for what, value in (("v_a", v_a), (x_name, x))
-            if value is not None
-        ]
-        length = stack_length((q_a, *checked))
+            for value, what in zip(arguments, QUANTITY_ARGUMENTS[name], strict=True)
+        )
+        length = stack_length((q_a, *others))
         count = 1 if length is None else length
         if count == 0:
             raise InputError("the stack is empty, give at least one sample")
         rows = np.zeros((count, 2 * n))
-        for i, array in enumerate(checked):
+        for i, array in enumerate(others):
             rows[:, i * n : (i + 1) * n] = array
         out = self._evaluate_stack(
             quantity, np.ascontiguousarray(np.broadcast_to(q_a, (count, n))), rows, q_a.ndim == 2
         )
-        if shape:
-            return out.reshape(shape if length is None else (count, *shape))
+        if quantity in MATRIX_QUANTITIES:
+            out = out.reshape(count, n, -1)
         return out[0] if length is None else out
 
     def _evaluate_stack(self, quantity: str, targets: Array, rows: Array, is_stack: bool) -> Array:
@@ -388,7 +393,9 @@ class QuantityEvaluator(OneLineRepr):
 
         def reach(i: int) -> None:
             sample = f" (sample {i})" if is_stack else ""
-            q = closure.continue_from_home(formula.cursor, targets[i], sample)
+            q = closure.continue_from_home(
+                formula.sample_function.value.cursor, targets[i], sample
+            )
             out[i] = self._evaluate_beside_change_point(formula, q, rows[i], sample)
             error = None if np.isfinite(out[i]).all() else self.singular_mass_error(q, sample)
             if error is not None and formula.solves_mass_matrix:

@@ -402,7 +402,7 @@ class Machine(IdleMotionProperties, OneLineRepr):
         )
 
     def with_external_forces(self, *forces: ExternalForce) -> "Machine":
-        """A copy with additional external forces.
+        """A copy with additional external forces; the machine itself without any.
 
         Raises:
             InputError: Not an external force, an unknown or fixed frame, or a name that exists
@@ -416,7 +416,7 @@ class Machine(IdleMotionProperties, OneLineRepr):
                 raise InputError(f"'{force.frame}' does not move, a load on it does nothing")
             if [other.name for other in every].count(force.name) > 1:
                 raise InputError(f"two loads are called '{force.name}', give them names")
-        return dataclasses.replace(self, external_forces=every)
+        return dataclasses.replace(self, external_forces=every) if forces else self
 
     def with_phase_function(self, clock: Callable[[Array], Array] | None) -> "Machine":
         """A copy whose phased external forces use the clock of a simulation.
