@@ -10,7 +10,7 @@ import typer
 
 import crane
 from crane.cli.command import OptionBlock, command, refuse_options
-from crane.cli.option_units import joint_turns, joint_units, number_option, parameter_units
+from crane.cli.option_units import joint_units, number_option, parameter_units
 from crane.cli.options import (
     Bandwidth,
     CentreOfMass,
@@ -234,7 +234,7 @@ def identify(
     from crane.identification.mechanics.write_identified import check_rewritable
 
     window, loaded = parse_window(train), options.load(machine)
-    terms = parse_terms(model.term, turns := joint_turns(loaded))
+    terms = parse_terms(model.term, turns := {x: loaded.unit(x) == "rad" for x in loaded.joints})
     priors, trials = parse_priors(model.prior, turns), parse_trials(tried, turns)
     min_speeds = parse_values("--min-speed", min_speed, joint_units(loaded, "/s"))
     if priors is None:

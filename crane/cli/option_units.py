@@ -29,11 +29,6 @@ def joint_units(machine: "crane.Machine", by_time: str = "") -> UnitsOf:
     return units_of
 
 
-def joint_turns(machine: "crane.Machine") -> dict[str, bool]:
-    """Whether each joint turns."""
-    return {joint: machine.unit(joint) == "rad" for joint in machine.joints}
-
-
 def parameter_units(machine: "crane.Machine") -> UnitsOf:
     """SI unit of each parameter."""
     from crane.description.machine_parameters import parameter_unit

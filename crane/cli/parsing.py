@@ -248,13 +248,15 @@ def parse_terms(
     Raises:
         InputError: A text has another form, or a name is given twice.
     """
-    from crane.description.estimation_settings import term_units
+    from crane.description.estimation_settings import estimation_units
 
     def parse(name: str, values: str | None) -> "TermValues | None":
         if values == "off":
             return None
         words = [] if values in (None, "on") else str(values).split(",")
-        return tuple(parse_number(x, term_units(name, turns, i)) for i, x in enumerate(words))
+        return tuple(
+            parse_number(x, estimation_units(name, turns, i)) for i, x in enumerate(words)
+        )
 
     return _parse_named("--term", texts, _TERM_FORM, parse)
 
@@ -269,7 +271,7 @@ def parse_priors(
     Raises:
         InputError: A text has another form, or a name is given twice.
     """
-    from crane.description.estimation_settings import ParameterPrior, parameter_units
+    from crane.description.estimation_settings import ParameterPrior, estimation_units
 
     if texts and list(texts) == ["none"]:
         return None
@@ -278,7 +280,7 @@ def parse_priors(
         name, equals, value = text.rpartition("=")
         name = name.strip() if equals else "*"
         try:
-            prior = ParameterPrior.parse(value, parameter_units(name, turns))
+            prior = ParameterPrior.parse(value, estimation_units(name, turns))
         except UnitError as error:
             raise InputError(f"--prior {name}: {error}") from None
         except InputError:
@@ -299,14 +301,14 @@ def parse_trials(
     Raises:
         InputError: A text has another form, or a name is given twice.
     """
-    from crane.description.estimation_settings import ParameterPrior, parameter_units
+    from crane.description.estimation_settings import ParameterPrior, estimation_units
 
     def parse(name: str, values: str | None) -> "list[float | ParameterPrior]":
         words = (values or "").split(",")
         return [
             parse_number(x, ("Hz",))
             if name == "bandwidth"
-            else ParameterPrior.parse(x, parameter_units(name, turns))
+            else ParameterPrior.parse(x, estimation_units(name, turns))
             for x in words
         ]
 

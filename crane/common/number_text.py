@@ -43,7 +43,6 @@ def parse_expression(text: str) -> ast.expr:
         for node in ast.walk(tree)
         if isinstance(node, ast.Constant) and type(node.value) in (int, float)
     ]
-    for number in numbers:
-        if re.fullmatch("[0-9.eE+-]+", number) is None:
-            raise ValueError(f"'{number}' is not a number")
+    if wrong := [x for x in numbers if re.fullmatch("[0-9.eE+-]+", x) is None]:
+        raise ValueError(f"'{wrong[0]}' is not a number")
     return tree

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 from crane.common.errors import InputError
 from crane.common.unit_conversions import UnitError, is_quantity, parse_number, parse_quantity
-from crane.description.key_types import NumberListKey
 
 TermValues = tuple[float, ...]
 _MIN_STD = 1e-12  # with a finite weight
@@ -18,45 +17,39 @@ _PARAMETERS = {
         ("coulomb", "coulomb_offset", "stiction", "presliding", "memory"), ("N", "N m")
     ),
     **dict.fromkeys(("viscous", "viscous_offset"), ("N s/m", "N m s/rad")),
-    **dict.fromkeys(("m",), ("kg", "kg")),
+    "m": ("kg", "kg"),
     **dict.fromkeys(("mx", "my", "mz"), ("kg m", "kg m")),
     **dict.fromkeys(("Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz"), ("kg m2", "kg m2")),
     "rotor_inertia": ("kg", "kg m2"),
     "gas_scale": ("", ""),
 }
 _TERM_VALUES = {  # by the kind of a model term
-    "stiction": NumberListKey("", "m/s", "rad/s"),
-    "presliding": NumberListKey("", "m", "rad"),
-    "memory": NumberListKey(column_units=("s", "m/s, rad/s")),
+    "stiction": [("m/s", "rad/s")] * 9,
+    "presliding": [("m", "rad")],
+    "memory": [("s", "s"), ("m/s", "rad/s")],
 }
 
 
-def parameter_units(name: str, turns: Mapping[str, bool]) -> tuple[str, ...]:
-    """SI units that an estimated parameter may have; several where a pattern matches more.
+def estimation_units(
+    name: str, turns: Mapping[str, bool], position: int | None = None
+) -> tuple[str, ...]:
+    """SI units that an estimated parameter, or a value of a model term, may have.
+
+    They are several where a pattern matches more.
 
     Args:
         name: Its name, or a pattern, as in "q1.viscous" or "q*.coulomb".
         turns: Whether each joint turns.
+        position: Position among the values of a term; None: of the parameter.
     """
     where, _, kind = name.rpartition(".")
-    turning = _turning(where, turns)
-    sides = (False, True) if turning is None else (turning,)
-    matching = [units for known, units in _PARAMETERS.items() if fnmatch.fnmatchcase(known, kind)]
-    return tuple(dict.fromkeys(units[side] for units in matching for side in sides))
-
-
-def term_units(name: str, turns: Mapping[str, bool], position: int) -> tuple[str, ...]:
-    """SI units that a value of a model term may have; see `parameter_units`."""
-    where, _, kind = name.rpartition(".")
-    key = _TERM_VALUES.get(kind, NumberListKey())
-    return key.si_units(_turning(where, turns), (position,))
-
-
-def _turning(where: str, turns: Mapping[str, bool]) -> bool | None:
-    """Whether all joints of a name or pattern turn, or none of them; None otherwise."""
-    names: Sequence[str] = [where] if where in turns else fnmatch.filter(turns, where)
-    kinds = {turns[name] for name in names}
-    return kinds.pop() if len(kinds) == 1 else None
+    names = [where] if where in turns else fnmatch.filter(turns, where)
+    sides = {turns[joint] for joint in names} or {False, True}
+    if position is not None:
+        matching = _TERM_VALUES.get(kind, ())[position : position + 1] or [("", "")]
+    else:
+        matching = [units for known, units in _PARAMETERS.items() if fnmatch.fnmatch(known, kind)]
+    return tuple(dict.fromkeys(units[side] for units in matching for side in sorted(sides)))
 
 
 @dataclass(frozen=True)

@@ -58,8 +58,9 @@ class Sway(OneLineRepr):
     def __init__(self, machine: Machine):
         self.free_indices = np.setdiff1d(np.flatnonzero(~machine.is_driven), machine.held)
         if not len(self.free_indices):
-            more = " besides idle ones" if machine.held else ""
-            raise InputError(f"nothing sways on '{machine.name}': it has no free joints{more}")
+            raise InputError(
+                f"nothing sways on '{machine.name}': it has no free joints that move an inertia"
+            )
         self.machine = machine
         self._names = ", ".join(machine.active[i] for i in self.free_indices)
         self._dynamics = Dynamics(machine)

@@ -230,11 +230,12 @@ def _remove_free_forces(machine: Machine, table: Table) -> Table:
     for i, joint in free_columns.items():
         if table.values[:, i].any():
             raise RecordingError(free_force_message(joint, table.values[:, i]))
-    if not free_columns:
-        return Table(table.units, table.values, notes)
     kept_columns = [i for i in range(len(table.units)) if i not in free_columns]
     units = {name: unit for i, (name, unit) in enumerate(table.units.items()) if i in kept_columns}
-    return Table(units, stack_columns(table.values.T[kept_columns], len(units)), notes)
+    columns = (table.values[:, i] for i in kept_columns)
+    return Table(
+        units, stack_columns(columns, len(units)) if free_columns else table.values, notes
+    )
 
 
 def is_measured(table: Table) -> bool:

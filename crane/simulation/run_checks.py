@@ -365,10 +365,11 @@ def _closed_valve_text(
     )
     count = len(pilot_pressure)
     needed = (holding.pressure - load_pressure) / holding.pilot_ratio
-    is_short = count * np.diff(recording.time[:2]).sum() < _MIN_CLOSED_TIME
-    if is_short or (pilot_pressure > needed).any():
-        return ""
-    if pilot_pressure[: 3 * count // 4].max() < _MIN_SETTLED_SHARE * pilot_pressure.max():
+    if (
+        count * np.diff(recording.time[:2]).sum() < _MIN_CLOSED_TIME
+        or (pilot_pressure > needed).any()
+        or pilot_pressure[: 3 * count // 4].max() < _MIN_SETTLED_SHARE * pilot_pressure.max()
+    ):
         return ""
     nearest = int((pilot_pressure - needed).argmax())
     return (

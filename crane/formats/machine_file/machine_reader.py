@@ -14,8 +14,7 @@ from crane.description.estimation_settings import (
     EstimationSettings,
     ParameterPrior,
     TermValues,
-    parameter_units,
-    term_units,
+    estimation_units,
 )
 from crane.description.external_forces import ExternalForce
 from crane.description.findings import UnknownNames, error_recovery, report_error
@@ -359,15 +358,16 @@ def _read_term(section: YamlSection, name: str) -> TermValues | None:
         label = f"'{name}' of {section.title} is '{value}'"
         raise section.error_at(name, f"{label}, give on, off, a number or a list of numbers")
     count = len(value) if isinstance(value, list) else 1
-    units = (", ".join(term_units(name, section.turns, i)) for i in range(count))
-    key = NumberListKey(column_units=tuple(units))
-    section.schema = dataclasses.replace(section.schema, others=key)
+    units = (", ".join(estimation_units(name, section.turns, i)) for i in range(count))
+    section.schema = dataclasses.replace(
+        section.schema, others=NumberListKey(column_units=tuple(units))
+    )
     return section.numbers(name) if isinstance(value, list) else (section.number(name),)
 
 
 def _read_prior(section: YamlSection, name: str) -> ParameterPrior:
     try:
-        return ParameterPrior.parse(section.raw_value(name), parameter_units(name, section.turns))
+        return ParameterPrior.parse(section.raw_value(name), estimation_units(name, section.turns))
     except InputError as error:
         raise section.error_at(name, f"'{name}' of 'prior': {error}") from None
 

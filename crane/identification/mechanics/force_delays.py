@@ -135,8 +135,7 @@ def force_delays(
     known = low_pass(time, model.known_forces(at), cutoff)
     force = low_pass(motion.time, motion.tau, cutoff)[chosen]
     fastest = np.maximum(motion.v.max(axis=0), -motion.v.min(axis=0))
-    lowest = np.maximum(min_speed, _STANDSTILL_SHARE * fastest)
-    is_resting = np.abs(motion.v[chosen]) <= lowest
+    is_resting = np.abs(motion.v[chosen]) <= np.maximum(min_speed, _STANDSTILL_SHARE * fastest)
     is_used = ~binary_dilation(is_resting, np.ones((2 * filter_reach + 1, 1), dtype=bool))
     is_used[:filter_reach] = is_used[-filter_reach:] = False
     is_used[:, ~model.machine.is_driven] = False  # forces of free joints are zero

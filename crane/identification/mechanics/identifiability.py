@@ -9,7 +9,7 @@ from scipy.linalg import qr
 
 from crane.common.errors import InputError, check_name
 from crane.common.samples import Array, as_number, as_sample
-from crane.description.estimation_settings import ParameterPrior, parameter_units
+from crane.description.estimation_settings import ParameterPrior, estimation_units
 from crane.identification.estimation.estimators import Estimate, Prior
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.feasible_parameters import body_size, body_units
@@ -130,7 +130,7 @@ def read_priors(
         return {
             name: what
             if isinstance(what, ParameterPrior)
-            else ParameterPrior.parse(what, parameter_units(name, turns))
+            else ParameterPrior.parse(what, estimation_units(name, turns))
             for name, what in given.items()
         }
     share = as_number(given, "the prior's relative standard deviation", "", *_RELATIVE_STD_RANGE)

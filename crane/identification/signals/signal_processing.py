@@ -133,9 +133,7 @@ def sampling_step(time: Array) -> float:
     if len(time) < _MIN_SAMPLES:
         raise RecordingError(f"{len(time)} samples are too few, record at least {_MIN_SAMPLES}")
     step = (time[-1] - time[0]) / (len(time) - 1)
-    deviation = np.arange(len(time), dtype=np.float64)  # in place, of long recordings
-    deviation *= step
-    deviation += time[0]
+    deviation = np.linspace(time[0], time[-1], len(time))
     np.abs(np.subtract(deviation, time, out=deviation), out=deviation)
     if not deviation.max() <= _MAX_JITTER * step:
         at = int(deviation.argmax())
@@ -205,13 +203,12 @@ def low_pass(time: Array, x: Array, cutoff: float, order: int = 4) -> Array:
     reach = math.ceil(_FILTER_MEMORY / (cutoff * step))
     if np.size(x) < MIN_FILE_ELEMENTS or x.ndim > 2 or reach > BLOCK_SIZE:
         return np.asarray(sosfiltfilt(sections, x, axis=0))
-
-    def filtered(part: slice) -> Array:
-        first = max(0, part.start - reach)
-        values = sosfiltfilt(sections, x[first : part.stop + reach], axis=0)
-        return np.asarray(values[part.start - first : part.stop - first].reshape(-1, x[0].size))
-
-    return compute_in_blocks(filtered, len(x)).reshape(x.shape, order="F")
+    return compute_in_blocks(
+        lambda part: sosfiltfilt(
+            sections, x[max(0, part.start - reach) : part.stop + reach], axis=0
+        )[min(part.start, reach) :][: part.stop - part.start].reshape(-1, x[0].size),
+        len(x),
+    ).reshape(x.shape, order="F")
 
 
 def filter_kernel(step: float, cutoff: float) -> Array:

@@ -119,22 +119,19 @@ class ScipyIntegrator(StickSlipIntegrator):
             self._record(instants, until, dense_output, state, rows)
             if progress is not None:
                 progress(self.next_instant)
-            if event_state is not None or self._has_long_rotation(solver.y):
-                state[:] = solver.y if event_state is None else event_state
-                self._restart(until, state, instants, finds_modes=event_state is not None)
+            if event_state is None and self._has_long_rotation(solver.y):
+                event_state = solver.y
+            if event_state is not None:
+                state[:] = event_state
+                self.python_stepper.close_loops(until, state)
+                self._find_modes(until, state)
+                self.next_instant = self.done
+                self.offset = until - instants[self.next_instant]
                 return True
             before, q = after, view(solver.y).q
             if self._chart.largest_gamma_entry(q) > self.python_stepper.chart_limits[0]:
                 return False
         return True
-
-    def _restart(self, time: float, state: Array, instants: Array, finds_modes: bool) -> None:
-        """Prepare a new start of the method at a time [s] after the recorded instants."""
-        self.python_stepper.close_loops(time, state)
-        if finds_modes:
-            self._find_modes(time, state)
-        self.next_instant = self.done
-        self.offset = time - instants[self.next_instant]
 
     def _has_long_rotation(self, state: Array) -> bool:
         """Whether a rotation vector has to be limited to pi."""
