@@ -94,8 +94,8 @@ class BranchSolver:
         self.home = self.continuation.home.q.copy()
         self.home.flags.writeable = False
         self._with_machine_code = with_machine_code
-        self.__dict__.pop("_machine_code", None)  # of the closure that this one is a copy of
-        for name in ("_solvers", "_beyond", "_codes_beyond"):
+        # of the closure that this one is a copy of
+        for name in ("_machine_code", "_solvers", "_beyond", "_codes_beyond"):
             self.__dict__.pop(name, None)
 
     @cached_property

@@ -30,7 +30,7 @@ from crane.closure.kinematics_formulas import tree_geometry
 from crane.closure.loop_equations import LoopEquations
 from crane.common.errors import InputError, MechanismError
 from crane.common.one_line_repr import OneLineRepr
-from crane.common.samples import Array, apply_per_sample, as_samples
+from crane.common.samples import Array, apply_per_sample, as_sample, as_samples
 from crane.description.specification import Coupling, LoopSpec
 
 # least singular value of the independent equations over that of all, for the same coordinates
@@ -255,9 +255,7 @@ class Closure(BranchSolver, OneLineRepr):
             raise InputError("q_a is an empty stack, give at least one sample")
         guess, names = None, self.equations.coordinates.names
         if initial_guess is not None:
-            guess = as_samples(initial_guess, self.model.nv, "guess", names)
-            if guess.ndim != 1:
-                raise InputError(f"guess has the shape {guess.shape}, give one ({self.model.nv},)")
+            guess = as_sample(initial_guess, self.model.nv, "guess", names)
         out = np.empty((*targets.shape[:-1], self.model.nv))
         self._solve_stack(np.atleast_2d(targets), guess, targets.ndim == 2, np.atleast_2d(out))
         return out

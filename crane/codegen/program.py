@@ -4,10 +4,8 @@ A formula reads arrays and writes one, without branches; its operations come fro
 routine adds sequences, loops over samples, conditions and local arrays. `crane.codegen.llvm`
 translates both.
 
-    with program.add_routine("each", counts=("count",), arrays=("inputs", "out")) as r:
-        with r.loop(r.count) as i:
-            r.call("formula", r.inputs.row_pointer(i, 3), r.out.row_pointer(i, 2))
-        r.return_value(r.count)
+    with program.add_loop("each", arrays=("inputs", "out")) as (r, i):
+        r.call("formula", r.inputs.row_pointer(i, 3), r.out.row_pointer(i, 2))
 """
 
 import ctypes
@@ -20,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from crane.codegen.llvm.machine_code import MachineCode
-from crane.codegen.llvm.routine_builder import Routine
+from crane.codegen.llvm.routine_builder import Routine, RoutineValue
 from crane.codegen.llvm.sample_function import SampleFunction, make_sample_function
 from crane.codegen.program_cache import FunctionSignature, ProgramRecord, cache_entry_name
 from crane.codegen.symbolic import Scalar, required_operations
@@ -48,11 +46,13 @@ class Program:
     Attributes:
         functions: By name, in the order in which they were added; empty if loaded from the cache.
         max_formula_length: Number of operations of the longest formula.
+        dependent_programs: Programs that call its functions, by what they depend on.
     """
 
     def __init__(self) -> None:
         self.functions: dict[str, Formula | Routine] = {}
         self.max_formula_length = 0
+        self.dependent_programs: dict[tuple, Program] = {}
         self._signatures: dict[str, FunctionSignature] = {}
         self._machine_code: Any = None
 
@@ -134,6 +134,43 @@ class Program:
         yield routine
         self.functions[name] = routine
         self._signatures[name] = len(routine.argument_kinds), None
+
+    @contextmanager
+    def add_loop(
+        self,
+        name: str,
+        *,
+        functions: Sequence[str] = (),
+        arrays: Sequence[str] | Mapping[str, Layout | None],
+    ) -> Iterator[tuple[Routine, RoutineValue]]:
+        """Add a routine that repeats `count` times what is built in the context.
+
+        It returns `count`, or what the context returns. The context gets the index as well.
+        """
+        with self.add_routine(name, counts=("count",), functions=functions, arrays=arrays) as r:
+            with r.loop(r.count) as i:
+                yield r, i
+            r.return_value(r.count)
+
+    def add_formula_loop(
+        self, name: str, formula: str, row_lengths: Mapping[str, int | None]
+    ) -> None:
+        """Add a routine that evaluates a formula `count` times.
+
+        Args:
+            name: Its name.
+            formula: Name of the formula.
+            row_lengths: Length of the rows of each array; None: the same array each time.
+        """
+        with self.add_loop(name, arrays=tuple(row_lengths)) as (r, i):
+            arrays = {array: getattr(r, array) for array in row_lengths}
+            r.call(
+                formula,
+                *(
+                    arrays[array] if length is None else arrays[array].row_pointer(i, length)
+                    for array, length in row_lengths.items()
+                ),
+            )
 
     def formula_outputs(self, name: str) -> Layout:
         """Layout of the outputs of a formula."""

@@ -330,28 +330,20 @@ def _add_evaluation_routines(
     """
     arrays = ("geometry", "constants", "targets", "inputs", "cursor", "q", "out", "tolerances")
     outputs = program.formula_outputs("formula").size
-    with program.add_routine("each", counts=("count",), functions=("follow",), arrays=arrays) as r:
+    with program.add_loop("each", functions=("follow",), arrays=arrays) as (r, i):
         checked = r.local_array("checked", program.formula_outputs("check"))
-        with r.loop(r.count) as i:
-            got = r.call(
-                "follow", 1, r.geometry, r.targets.row_pointer(i, n), r.cursor, r.q, r.tolerances
-            )
-            with r.if_then(got < 1):
+        got = r.call(
+            "follow", 1, r.geometry, r.targets.row_pointer(i, n), r.cursor, r.q, r.tolerances
+        )
+        with r.if_then(got < 1):
+            r.return_value(i)
+        out = r.out.row_pointer(i, outputs)
+        r.call("formula", r.geometry, r.constants, r.q, r.inputs.row_pointer(i, 2 * n), out)
+        if stops_where_infinite:
+            r.call("check", out, checked)
+            with r.if_then(~(checked["all"] < np.inf)):
                 r.return_value(i)
-            out = r.out.row_pointer(i, outputs)
-            r.call("formula", r.geometry, r.constants, r.q, r.inputs.row_pointer(i, 2 * n), out)
-            if stops_where_infinite:
-                r.call("check", out, checked)
-                with r.if_then(~(checked["all"] < np.inf)):
-                    r.return_value(i)
-        r.return_value(r.count)
-    closed = ("geometry", "constants", "configurations", "inputs", "out")
-    with program.add_routine("closed_each", counts=("count",), arrays=closed) as r:
-        with r.loop(r.count) as i:
-            q, inputs, out = (
-                r.configurations.row_pointer(i, nq),
-                r.inputs.row_pointer(i, 2 * n),
-                r.out.row_pointer(i, outputs),
-            )
-            r.call("formula", r.geometry, r.constants, q, inputs, out)
-        r.return_value(r.count)
+    row_lengths = {
+        "geometry": None, "constants": None, "configurations": nq, "inputs": 2 * n, "out": outputs,
+    }  # fmt: skip
+    program.add_formula_loop("closed_each", "formula", row_lengths)

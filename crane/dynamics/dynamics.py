@@ -330,23 +330,19 @@ class Dynamics(QuantityEvaluator):
             raise InputError(
                 f"'{quantity}' is without friction or with its own, leave friction out"
             )
-        rows: dict[str, Array] = {}
-        for name, given in zip(arguments, (q_a, v_a, x), strict=False):
-            if given is None:
+        given: dict[str, ArrayLike] = {}
+        for name, value in zip(arguments, (q_a, v_a, x), strict=False):
+            if value is None:
                 raise InputError(f"derivatives of '{quantity}' need {name}, give it")
-            rows[name] = as_samples(given, n, name, self.machine.active)
+            given[name] = value
         by = arguments if by is None else by
         parameters = [name for name in by if name not in ("q_a", "v_a", "a_a", "tau_a")]
         for name in by:
             if name not in (*arguments, *parameters):
                 hint = suggest_names(arguments, name)
                 raise InputError(f"'{quantity}' does not depend on '{name}', {hint}")
-        length = stack_length(rows.values())
-        count = 1 if length is None else length
-        q = self.machine.closure.solve(np.broadcast_to(rows["q_a"], (count, n)))
-        inputs = np.zeros((count, 2 * n))
-        for i, name in enumerate(arguments[1:]):
-            inputs[:, i * n : (i + 1) * n] = rows[name]
+        targets, inputs, length = self._stack_arguments(given)
+        q, count = self.machine.closure.solve(targets), len(targets)
         key = quantity.replace("_", " ") + (WITH_FRICTION if friction else "")
         shape, found = self.result_shape(quantity), dict[str, Array]()
         if len(parameters) < len(by):

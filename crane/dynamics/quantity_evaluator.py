@@ -1,6 +1,6 @@
 """Evaluation of the quantities of a machine's dynamics, compiled or by Pinocchio."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -32,7 +32,7 @@ from crane.dynamics.pinocchio_dynamics import PinocchioDynamics
 from crane.formats.machine_loading import MachineVariants
 from crane.machine.machine import Machine
 from crane.machine.machine_checks import has_mass
-from crane.machine.massless_motions import MIN_INERTIA_SHARE
+from crane.machine.massless_motions import MIN_INERTIA_SHARE, is_definite
 
 UNIT_OF_ZERO_PARAMETER = 0.1  # magnitude assumed for a parameter that is 0
 _RELATIVE_STEP = 1e-3  # step as a fraction of the parameter
@@ -179,21 +179,19 @@ class QuantityEvaluator(OneLineRepr):
         self._parameter_derivatives: dict[
             tuple[str, tuple[str, ...]], CompiledParameterDerivatives
         ] = {}
-        self.formula_constants = np.zeros(0)
+        layout = self.formula_structure.constants_layout
+        self.formula_constants = np.zeros(layout.size)
         if self.backend == "compiled":
             geometry = machine.closure.compiled_closure.geometry
-            self.formula_constants = np.ascontiguousarray(
-                dynamics_constants(machine, geometry, self.forces, machine.least_inertias)
+            self.formula_constants[:] = dynamics_constants(
+                machine, geometry, self.forces, machine.least_inertias
             )
         # constants to fold into formulas; NaN for those that change with the motion
         self.constant_pattern = self.formula_constants.copy()
         self._mode_indices = self.formula_structure.stick_slip_mode_indices
-        self._circuit_friction_indices = self.formula_structure.constants_layout[
-            "circuit_friction"
-        ]
-        if self.backend == "compiled":
-            self.constant_pattern[self._mode_indices] = np.nan
-            self.constant_pattern[self._circuit_friction_indices] = np.nan
+        self._circuit_friction_indices = layout["circuit_friction"]
+        self.constant_pattern[self._mode_indices] = np.nan
+        self.constant_pattern[self._circuit_friction_indices] = np.nan
 
     def backend_of(self, quantity: str = "forward") -> str:
         """The backend that computes a quantity of `compiled_dynamics.QUANTITIES`."""
@@ -226,15 +224,10 @@ class QuantityEvaluator(OneLineRepr):
 
     def check_free_block(self, q_a: ArrayLike, free_block: Array) -> None:
         """Raise the error of a singular mass matrix of the free joints (..., k, k)."""
-        try:
-            pivots = np.diagonal(np.linalg.cholesky(free_block), axis1=-2, axis2=-1) ** 2
-            least = MIN_INERTIA_SHARE * np.diagonal(free_block, axis1=-2, axis2=-1)
-            machine = self.machine
-            least = least + machine.least_inertias[machine.closure.active][~machine.is_driven]
-            is_singular = bool((pivots <= least).any())
-        except np.linalg.LinAlgError:
-            is_singular = True
-        if is_singular:
+        machine = self.machine
+        least = machine.least_inertias[machine.closure.active][~machine.is_driven]
+        rounding = MIN_INERTIA_SHARE * np.diagonal(free_block, axis1=-2, axis2=-1)
+        if not is_definite(free_block, least + rounding):
             self.check_mass_matrices(self.machine.closure.solve(np.atleast_2d(q_a)))
 
     def check_mass_matrices(self, q: Array) -> None:
@@ -270,11 +263,8 @@ class QuantityEvaluator(OneLineRepr):
         They only affect the quantities of the integration, `STICK_SLIP_QUANTITIES`.
         """
         self.forces.set_stick_slip_modes(slip_sign, is_held, inverse_velocity, is_moving)
-        if self.backend == "compiled":
-            self.formula_constants[self._mode_indices] = [
-                *np.column_stack([slip_sign, is_held, inverse_velocity]).ravel(),
-                is_moving,
-            ]
+        modes = np.column_stack([slip_sign, is_held, inverse_velocity])
+        self.formula_constants[self._mode_indices] = [*modes.ravel(), is_moving]
 
     def set_circuit_friction(self, circuit_friction: Array) -> None:
         """Set the circuit friction; see `JointForces.set_circuit_friction`.
@@ -282,8 +272,7 @@ class QuantityEvaluator(OneLineRepr):
         It only affects the quantities of the integration, `STICK_SLIP_QUANTITIES`.
         """
         self.forces.set_circuit_friction(circuit_friction)
-        if self.backend == "compiled":
-            self.formula_constants[self._circuit_friction_indices] = circuit_friction
+        self.formula_constants[self._circuit_friction_indices] = circuit_friction
 
     def result_shape(self, quantity: str) -> tuple[int, ...]:
         """Shape of one sample of a quantity of `derivatives`."""
@@ -364,12 +353,24 @@ class QuantityEvaluator(OneLineRepr):
             and (out := formula.sample_function.value.evaluate_sample(*arguments)) is not None
         ):
             return out
-        names, n = self.machine.active, self._mobility
         name = quantity.removesuffix(WITH_FRICTION).replace(" ", "_")
-        q_a, *others = (
-            as_samples(value, n, what, names)
-            for value, what in zip(arguments, QUANTITY_ARGUMENTS[name], strict=True)
-        )
+        given = dict(zip(QUANTITY_ARGUMENTS[name], arguments, strict=True))
+        targets, rows, length = self._stack_arguments(given)
+        out = self._evaluate_stack(quantity, targets, rows, np.ndim(arguments[0]) == 2)
+        if quantity in MATRIX_QUANTITIES:
+            out = out.reshape(len(targets), self._mobility, -1)
+        return out[0] if length is None else out
+
+    def _stack_arguments(
+        self, arguments: Mapping[str, ArrayLike]
+    ) -> tuple[Array, Array, int | None]:
+        """q_A (N, n), the other arguments (N, 2 n), and N, None for a single sample.
+
+        Args:
+            arguments: Samples or stacks by name, q_A first.
+        """
+        n, names = self._mobility, self.machine.active
+        q_a, *others = (as_samples(x, n, name, names) for name, x in arguments.items())
         length = stack_length((q_a, *others))
         count = 1 if length is None else length
         if count == 0:
@@ -377,12 +378,7 @@ class QuantityEvaluator(OneLineRepr):
         rows = np.zeros((count, 2 * n))
         for i, array in enumerate(others):
             rows[:, i * n : (i + 1) * n] = array
-        out = self._evaluate_stack(
-            quantity, np.ascontiguousarray(np.broadcast_to(q_a, (count, n))), rows, q_a.ndim == 2
-        )
-        if quantity in MATRIX_QUANTITIES:
-            out = out.reshape(count, n, -1)
-        return out[0] if length is None else out
+        return np.ascontiguousarray(np.broadcast_to(q_a, (count, n))), rows, length
 
     def _evaluate_stack(self, quantity: str, targets: Array, rows: Array, is_stack: bool) -> Array:
         closure, n = self.machine.closure, self._mobility

@@ -16,10 +16,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from crane.closure.kinematics_formulas import motion_commutator
 from crane.codegen import Program, Scalar, SymbolicExpression
 from crane.codegen.differentiation import directional_derivative, weighted_gradient
-from crane.codegen.symbolic import subtract_vectors
+from crane.codegen.symbolic import add_vectors, cross, subtract_vectors
 from crane.common.samples import Array
 from crane.dynamics.dynamics_formulas import DynamicsFormulas
 from crane.simulation.integration.machine_formulas import AT_REST_SUFFIX
@@ -102,7 +101,7 @@ class ForwardDerivatives(RateProgram):
         for array in range(1, 5):
             seed(array)
         derivatives = directional_derivative(formulas.all_values, seeds)
-        turned = _active_commutator(dynamics, {i: row[0] for i, row in moving.items()})
+        turned = motion_commutator(dynamics, {i: row[0] for i, row in moving.items()})
         derivatives[: self._mobility] = subtract_vectors(derivatives[: self._mobility], turned)
         for k, (_, factor) in enumerate(formulas.outputs, start=len(formulas.rate)):
             derivatives[k] = factor * derivatives[k]
@@ -163,7 +162,8 @@ class ReverseDerivatives(RateProgram):
         for k, (_, factor) in enumerate(formulas.outputs, start=len(formulas.rate)):
             weights[k] = factor * weights[k]
         loops = dynamics.loops
-        moved_joints = [*loops.passive_joints, *loops.partly_active_joints]
+        held_parts = dynamics.kinematics.geometry.partly_active_joints(loops.active_joints)
+        moved_joints = [*loops.passive_joints, *held_parts]
         passive = [
             SymbolicExpression(tape, operation_index(dynamics.q[i - 1])) for i in moved_joints
         ]
@@ -175,7 +175,7 @@ class ReverseDerivatives(RateProgram):
             held: dict[int, list[Scalar]] = {joint: [0.0] for joint in loops.active_joints}
             motion, _ = loops.solve_passive(held, [[-1.0 * gap] for gap in gaps])
             changes = {i: row[0] for i, row in motion.items()}
-            steps, turned = loops.coordinate_steps(changes), _active_commutator(dynamics, changes)
+            steps, turned = loops.coordinate_steps(changes), motion_commutator(dynamics, changes)
             values = [*(steps[i] for i in moved_joints), *turned]
             shares = [-1.0 * w for w in weights[: self._mobility]]
             z = weighted_gradient(values, [*found[len(numbers) :], *shares], gaps)
@@ -186,12 +186,23 @@ class ReverseDerivatives(RateProgram):
         self._add_routine(program, "against" + suffix, "cotangent" + suffix, widths)
 
 
-def _active_commutator(dynamics: DynamicsFormulas, motion: Mapping[int, Scalar]) -> list[Scalar]:
-    """[v, dq]_A (n,) of a small motion dq of all joints, by joint; see `motion_commutator`."""
-    joints = range(1, len(dynamics.q) + 1)
-    out = motion_commutator(
-        dynamics.kinematics.geometry,
-        [dynamics.joint_velocities[i] for i in joints],
-        [motion[i] for i in joints],
-    )
-    return [out[joint - 1] for joint in dynamics.loops.active_joints]
+def motion_commutator(dynamics: DynamicsFormulas, motion: Mapping[int, Scalar]) -> list[Scalar]:
+    """Commutator [v, x]_A (n,) of the velocities v and a small motion x of all joints.
+
+    The rate of a small motion x along joint velocities v that change by dv is x' = dv - [v, x]:
+    [v, x] = w x t for the angular parts w, t of a ball joint, and for the linear parts u, l of a
+    floating base w x l + u x t (Lie bracket of SE(3)); 0 of all other joints.
+
+    Args:
+        dynamics: Formulas with v.
+        motion: x by joint.
+    """
+    v, geometry = dynamics.joint_velocities, dynamics.kinematics.geometry
+    x: list[Scalar] = [0.0, *(motion[i] for i in range(1, len(v)))]
+    out: list[Scalar] = [0.0] * len(v)
+    for i in geometry.rotation_bodies:
+        out[i : i + 3] = cross(v[i : i + 3], x[i : i + 3])
+    for i in geometry.floating_bases:
+        linear, angular = slice(i, i + 3), slice(i + 3, i + 6)
+        out[linear] = add_vectors(cross(v[angular], x[linear]), cross(v[linear], x[angular]))
+    return [out[joint] for joint in dynamics.loops.active_joints]
