@@ -233,8 +233,9 @@ def identify(
     from crane.common.samples import as_number
     from crane.identification.mechanics.cross_validation import format_trials, identify_options
 
-    window, terms, priors = parse_window(train), parse_terms(model.term), parse_priors(model.prior)
-    loaded, trials = options.load(machine), parse_trials(tried)
+    window, loaded = parse_window(train), options.load(machine)
+    terms = parse_terms(model.term, turns := {x: loaded.unit(x) == "rad" for x in loaded.joints})
+    priors, trials = parse_priors(model.prior, turns), parse_trials(tried, turns)
     min_speeds = parse_values("--min-speed", min_speed, joint_units(loaded, "/s"))
     if priors is None:
         loaded = loaded.replace(estimation=replace(loaded.estimation, prior={}))
@@ -261,7 +262,7 @@ def identify(
                 loaded, inside, trials, progress, **settings
             )
         print(f"{format_trials(tried_settings)}\n")
-        settings = identify_options(tried_settings[0].settings, settings)
+        settings = identify_options(loaded, tried_settings[0].settings, settings)
     with progress_bar("identifying") as progress:
         result = crane.identify(loaded, inside, judges or None, progress=progress, **settings)
     if result.validation is None:

@@ -249,7 +249,8 @@ class ValveFeedforward(ValvePD):
         super().__init__(machine, reference, gains)
         circuit = require_circuit(machine)
         check_invertible(circuit)
-        self.planned_trajectory, self._free_indices = reference, np.flatnonzero(~machine.is_driven)
+        self.planned_trajectory = reference
+        self._free_indices = np.setdiff1d(np.flatnonzero(~machine.is_driven), machine.held)
         valves = circuit.valves.values()
         lags = [2.0 * x.damping / x.bandwidth if x.bandwidth else 0.0 for x in valves]
         self._damps_sway = damping > 0

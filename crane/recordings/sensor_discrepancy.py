@@ -14,6 +14,7 @@ import numpy as np
 
 from crane.common.errors import ClosureError, CraneWarning, MechanismError
 from crane.common.samples import Array, root_mean_square
+from crane.common.scratch_arrays import release_pages
 from crane.description.sensors import (
     INCLINATION_PREFIX,
     SENSOR_PREFIX,
@@ -125,6 +126,7 @@ class _RedundantSensor:
         self.unit = str(quantity_unit(configurations.machine.tree, self.quantity))
         from scipy.integrate import cumulative_trapezoid
 
+        release_pages()
         reading, random_walk = table_column(configurations.table, name), 0.0
         if self.is_rate:
             time = table_column(configurations.table, TIME)

@@ -54,6 +54,7 @@ from crane.simulation.integration.scipy_integrator import SCIPY_METHODS, ScipyIn
 from crane.simulation.recorded_run import IntegrationResult, record_run, stop_with_recording
 from crane.simulation.run_checks import (
     buried_contact_text,
+    closed_counterbalance_text,
     find_invalid_motion,
     passed_limits_text,
     run_warnings,
@@ -187,7 +188,8 @@ def simulate(
     recording = record_run(machine, control, run.time, run.rows, label, start_text=run.start_text)
     every_step, is_exact = has_fixed_steps(dynamics, control, method), formulation == "exact"
     texts = run_warnings(machine, run.time, run.rows, step, every_step, is_exact)
-    for text in filter(None, [*texts, tipping_message(recording)]):
+    texts += [tipping_message(recording), closed_counterbalance_text(machine, recording)]
+    for text in filter(None, texts):
         warnings.warn(text, CraneWarning, stacklevel=2)
     return recording
 
@@ -357,8 +359,6 @@ def integrator_factory(
             raise InputError("a program with a period runs on the compiled backend alone")
         if requested_method is None and drive is None:
             return FixedStepIntegrator(chart)
-        if chart.machine.coordinates.rotation_columns:
-            raise InputError("scipy's methods do not limit rotation vectors to pi, take rk4")
         name = "BDF" if method == "rosenbrock" else method
         return ScipyIntegrator(chart, name, **options)
 

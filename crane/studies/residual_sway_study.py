@@ -157,9 +157,8 @@ def _residual_sway(machine: Machine, control: ValveFeedforward, duration: float)
         machine, control, initial=(start, np.zeros_like(start)), duration=end_time, step=_STEP
     )
     configurations_after: Array = run.q[run.time >= duration]
-    free = ~machine.is_driven
-    sway_angles = (
-        configurations_after[:, free]
-        - Sway(machine).hanging_equilibrium(configurations_after)[:, free]
-    )
+    sway = Sway(machine)
+    sway_angles = (configurations_after - sway.hanging_equilibrium(configurations_after))[
+        :, sway.free_indices
+    ]
     return float(np.linalg.norm(sway_angles, axis=1).max())

@@ -106,7 +106,9 @@ def cross_validate(
     return sorted(trials, key=lambda trial: trial.mean_error)
 
 
-def identify_options(settings: Mapping[str, object], options: Mapping[str, Any]) -> dict[str, Any]:
+def identify_options(
+    machine: Machine, settings: Mapping[str, object], options: Mapping[str, Any]
+) -> dict[str, Any]:
     """Options of `identify` for the settings of a trial and other options."""
     out, prior_settings = dict(options), dict(settings)
     if _BANDWIDTH in prior_settings:
@@ -117,7 +119,7 @@ def identify_options(settings: Mapping[str, object], options: Mapping[str, Any])
             raise InputError(
                 "the prior is an array of all parameters, give it by name to vary parts of it"
             )
-        out["prior"] = read_priors(given_prior) | read_priors(prior_settings)
+        out["prior"] = read_priors(given_prior, machine) | read_priors(prior_settings, machine)
     return out
 
 
@@ -147,8 +149,10 @@ def _check_settings(
             if name == _BANDWIDTH:
                 as_number(_read_frequency(value), "the bandwidth", "Hz", greater_than=0)
             else:
-                prior_from_names(model, read_priors({name: value}), np.ones(len(model.names)))
-        identify_options(settings, options)
+                prior_from_names(
+                    model, read_priors({name: value}, machine), np.ones(len(model.names))
+                )
+        identify_options(machine, settings, options)
 
 
 def _read_frequency(value: object) -> float:
@@ -182,7 +186,7 @@ def _held_out_error(
             if len(motion.time[part]) >= _MIN_FOLD_SAMPLES
         ]
     with warnings.catch_warnings(action="ignore", category=CraneWarning):
-        trial = identify_options(settings, options)
+        trial = identify_options(machine, settings, options)
         # checks are not reliable on folds; the complete recordings were checked
         identification = identify(machine, training, **trial | {"trust": True})
         held_out_equations = RegressionEquations(

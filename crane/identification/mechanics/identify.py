@@ -236,7 +236,7 @@ def _build_prior(
     if given is not None:
         if not isinstance(given, Mapping | int | float):
             return check_prior(model, equations.base, given, feasible)
-        given_priors = read_priors(given)  # takes precedence over the machine file
+        given_priors = read_priors(given, model.machine)  # takes precedence over the machine file
         known = {
             name: what for name, what in known.items() if name not in given_priors
         } | given_priors

@@ -10,6 +10,7 @@ import numpy as np
 from crane.common.errors import InputError
 from crane.common.progress import Progress, ignore_progress
 from crane.common.samples import Array
+from crane.common.scratch_arrays import release_pages
 from crane.identification.estimation.estimators import Estimate, Prior
 from crane.identification.estimation.regressor import (
     Regressor,
@@ -178,6 +179,7 @@ class RegressionEquations:
         tau = part.motion.tau[start:stop]
         if part.filter_reach:
             both, tau = filter_rows(both, tau, part.step, self.bandwidth, thinning)
+        release_pages()
         here = slice(rows.start - start // thinning, rows.stop - start // thinning)
         self.forces[block.instants], self.offset[block.instants] = tau[here], both[here, :, -1]
         return np.ascontiguousarray(both[here, :, :-1])

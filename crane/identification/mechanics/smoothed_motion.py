@@ -43,6 +43,8 @@ _MAX_SPEED_FACTOR = 30.0
 _HUM_FACTOR = 10.0  # times the frequency of the motion, above which a spectral line is hum
 _MIN_SAMPLES = 50  # samples
 _COMPARISON_CUTOFF = 10.0  # [Hz] of the comparison of velocities and positions
+_MAX_COMPARED_SAMPLES = 1 << 20  # above which velocities are compared at fewer instants,
+_SAMPLES_PER_PERIOD = 16  # of the cutoff
 _MAX_OUTLIER_SHARE = 0.05  # of the samples of a column, above which it is rejected
 # units that are confused with SI units
 _COMMON_UNITS = {"rad": ("deg", 180 / math.pi), "m": ("mm", 1e3)}
@@ -245,6 +247,7 @@ def remove_outliers(
     messages = []
     for name, column in () if trust else zip(names, columns.T, strict=True):
         bad = outlier_mask(column)
+        release_pages()
         if not bad.any():
             continue
         first = f"the first at {time[bad.argmax()]:.6g} s"
@@ -352,10 +355,14 @@ def _check_velocity(
     time: Array, x: Array, v: Array, joint: str, unit: str, longest_delay: float, trust: bool
 ) -> None:
     """Compare a velocity with the derivative of its coordinate below 10 Hz."""
-    time, columns = resample_evenly(time, np.column_stack([x, v]))
+    time, columns = resample_evenly(time, stack_columns([x, v], 2))
     step = sampling_step(time)
     if 0.4 / step > _COMPARISON_CUTOFF:
         columns = low_pass(time, columns, _COMPARISON_CUTOFF)
+        if len(time) > _MAX_COMPARED_SAMPLES:
+            stride = max(1, int(1.0 / (_SAMPLES_PER_PERIOD * _COMPARISON_CUTOFF * step)))
+            time, columns, step = time[::stride], columns[::stride].copy(), stride * step
+    release_pages()
     derivative = np.gradient(columns[:, 0], step, axis=0, edge_order=2)
     v = columns[:, 1]
     # less than a micrometre is noise or rounding, not motion

@@ -86,6 +86,7 @@ def kalman_smooth(y: Array, step: float) -> tuple[Array, Array, float, float]:
     G = np.stack([_backward_recursion(C, F, forced[:, :, i]) for i in range(4)], axis=2)
     covariance[:reach] += np.einsum("kij,jl,kil->ki", G, cov_mu, G)[:, :3]
 
+    release_pages()
     units = (h / step) ** np.arange(3)
     sigma = math.sqrt(variance)
     states *= units

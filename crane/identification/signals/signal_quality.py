@@ -9,7 +9,7 @@ import numpy as np
 
 from crane.common.errors import CraneWarning, InputError, RecordingError
 from crane.common.samples import Array, as_number, true_runs
-from crane.common.scratch_arrays import BLOCK_SIZE
+from crane.common.scratch_arrays import BLOCK_SIZE, release_pages
 from crane.identification.signals.signal_processing import low_pass, sampling_step
 
 _SEGMENT_COUNT = 8
@@ -42,6 +42,7 @@ def spectral_edge_frequency(x: Array, step: float, share: float = 0.995) -> floa
     """
     edges = []
     for column in filter(np.ptp, x.T):
+        release_pages()
         windowed = column - column.mean()
         windowed /= max(column.std(), 1e-300)
         phase = np.linspace(0.0, 2 * np.pi, len(column), endpoint=False)

@@ -218,7 +218,7 @@ def sensitivities(
         progress: See `simulate`.
 
     Raises:
-        InputError: Unknown names, a machine that floats, or one without formulas.
+        InputError: Unknown names, or a machine without formulas.
         SimulationError: The motion reaches a dead centre; else as `simulate`.
     """
     if not parameters:

@@ -205,9 +205,8 @@ class RateProgram:
             else []
         )
         accelerations = machine.accelerations(with_joints_at_rest)
-        coordinate_rates = machine.dynamics_formulas.coordinate_derivatives
         rate = [
-            *(coordinate_rates[i] for i in self._chart.machine.closure.active),
+            *machine.dynamics_formulas.v_a,
             *accelerations.a_a,
             *machine.controller_rate[: self._stiff_state_count],
         ]

@@ -124,7 +124,7 @@ class SimulatedMotion:
         has_joints_at_rest: Whether a joint is at rest.
 
     Raises:
-        InputError: The machine has no formulas or a floating base.
+        InputError: The machine has no formulas.
         SimulationError: The motion reaches a dead centre; else as `simulate`.
     """
 
@@ -145,11 +145,6 @@ class SimulatedMotion:
             raise InputError(
                 f"'{machine.name}' with its controller has no formulas to differentiate: lock "
                 "joints, or write the controller as a Law, and loads as ExternalForce"
-            )
-        if machine.coordinates.is_rotation_vector[machine.closure.active].any():
-            raise InputError(
-                f"'{machine.name}' floats or turns freely about a ball joint, sensitivities are "
-                "of machines without active rotation vectors: lock them"
             )
         if state_count(machine.external_forces):
             raise InputError(

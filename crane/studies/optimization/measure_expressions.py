@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from crane.common.errors import InputError
+from crane.common.number_text import parse_expression
 from crane.common.samples import Array
 from crane.machine.machine import Machine
 
@@ -124,11 +125,9 @@ class MeasureExpression:
                 f"an expression has {len(self.text)} characters, give 1 to {_MAX_LENGTH}"
             )
         try:
-            self._tree = ast.parse(self.text, mode="eval").body
-        except (SyntaxError, ValueError, MemoryError, RecursionError):
-            raise InputError(
-                f"'{self.text[:80]}' is no expression, write such as 2*peak_X + 1"
-            ) from None
+            self._tree = parse_expression(self.text)
+        except ValueError as error:
+            raise InputError(f"{error}, write such as 2*peak_X + 1") from None
         if sum(1 for _ in ast.walk(self._tree)) > _MAX_NODES:
             raise InputError(f"an expression has more than {_MAX_NODES} parts, make it shorter")
         self(lambda name: np.nan, lambda name, arguments: np.nan, lambda number: np.nan)
