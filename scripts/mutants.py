@@ -15,6 +15,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import time
 from bisect import bisect
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -40,16 +41,17 @@ FAULTS = re.compile(
 )
 # before the end of a change, in its line: a check of lengths, stars that do not multiply
 NO_FAULT = re.compile(r"(strict=True|[,({]\s*\*+)$")
-MAX_DURATION = 120.0  # [s] of the tests of one fault, as they were recorded
+MAX_DURATION = 60.0  # [s] of the tests of one fault, as they were recorded
+FIRST = 16  # tests that run before the others
 TIME_LIMIT = 900.0  # [s]
 PROCESSES = 2
 
 
 class Recorder:
-    """Plugin of pytest: durations, and the lines that each test and shared fixture executes."""
+    """Plugin of pytest: durations and executed lines of all tests and shared fixtures."""
 
     def __init__(self):
-        self.tests, self.running = {}, ""
+        self.contexts, self.durations, self.running = {}, Counter(), ""
         self.coverage = Coverage("lines", data_suffix=True, source=["crane"], config_file=False)
         self.coverage.start()
 
@@ -57,27 +59,33 @@ class Recorder:
     def pytest_runtest_protocol(self, item):  # noqa: D102
         fixtures = [defined[-1] for defined in item._fixtureinfo.name2fixturedefs.values()]
         self.running = item.nodeid
-        self.tests[item.nodeid] = [0.0, [item.nodeid, *map(fixture_name, fixtures)]]
+        self.contexts[item.nodeid] = [item.nodeid, *map(fixture_name, fixtures)]
         self.coverage.switch_context(item.nodeid)
         return (yield)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_fixture_setup(self, fixturedef):  # noqa: D102
-        if fixturedef.scope != "function":
-            self.coverage.switch_context(fixture_name(fixturedef))
+        if fixturedef.scope == "function":
+            return (yield)
+        self.coverage.switch_context(fixture_name(fixturedef))
+        start = time.monotonic()
         try:
             return (yield)
         finally:
+            duration = time.monotonic() - start
+            self.durations[fixture_name(fixturedef)] = duration
+            self.durations[self.running] -= duration  # which the report of the test includes
             self.coverage.switch_context(self.running)
 
     def pytest_runtest_logreport(self, report):  # noqa: D102
-        if report.nodeid in self.tests:  # not where tests are only distributed
-            self.tests[report.nodeid][0] += math.inf if report.failed else report.duration
+        if report.nodeid in self.contexts:  # not where tests are only distributed
+            self.durations[report.nodeid] += math.inf if report.failed else report.duration
 
     def pytest_sessionfinish(self):  # noqa: D102
         self.coverage.stop()
         self.coverage.save()
-        Path(f"tests-{os.getpid()}.json").write_text(json.dumps(self.tests))
+        recorded = json.dumps([self.contexts, self.durations])
+        Path(f"tests-{os.getpid()}.json").write_text(recorded)
 
 
 def fixture_name(fixture):
@@ -90,7 +98,7 @@ def pytest_load_initial_conftests(early_config):
     early_config.pluginmanager.register(Recorder())
 
 
-def pytest_command(copy, *options):
+def shell_command(copy, *options):
     """A line for the shell that runs tests in a copy of the repository."""
     path = ":".join([str(copy), f"{copy}/scripts", os.environ.get("PYTHONPATH", "")])
     python = f"PYTHONDONTWRITEBYTECODE= PYTHONPATH={path} exec {sys.executable}"
@@ -101,11 +109,13 @@ def record_tests(place):
     """Record what the fast tests execute: `lines` of coverage, `tests.json` with durations."""
     copy = copy_repository(place / "copy-0")
     (place / "nothing").touch(0o600)  # a file for a folder: no program comes from the cache
-    line = pytest_command(copy, f"-n {PROCESSES}", "-p mutants")
+    line = shell_command(copy, f"-n {PROCESSES}", "-p mutants")
     subprocess.run(line, shell=True, env=os.environ | {"XDG_CACHE_HOME": f"{place}/nothing"})
     tests = {}
     for part in copy.glob("tests-*.json"):
-        tests |= json.loads(part.read_text())
+        contexts, durations = json.loads(part.read_text())
+        for name, used in contexts.items():
+            tests[name] = sum(durations.get(x, 0.0) for x in used), used
     Coverage(f"{place}/lines", config_file=False).combine([str(copy)])
     (place / "tests.json").write_text(json.dumps(tests))
 
@@ -148,6 +158,8 @@ def select_tests(executed, tests, path, line):
     k = bisect(statements, line)
     own = {x for n in contexts if statements[k - 1] <= n < statements[k] for x in contexts[n]}
     used = own - {""} or {x for names in contexts.values() for x in names} - {""}
+    if own and not used:  # constants, which any test may need
+        used = set(tests)
     found = [name for name, (_, names) in tests.items() if not used.isdisjoint(names)]
     found.sort(key=lambda name: tests[name][0])
     durations = accumulate(tests[name][0] for name in found)
@@ -157,9 +169,12 @@ def select_tests(executed, tests, path, line):
 def judge(copy, fault, is_executed, names):
     """What the tests with these names find of a fault in a copy."""
     path = fault.module_path.relative_to(ROOT)
-    (copy / "tests.txt").write_text("\n".join(names))
     # programs are not kept while a file has just been written: each test would build its own
-    line = f"sleep 3; {pytest_command(copy, '-x', '@tests.txt')}" if names else "true"
+    line = "sleep 3"
+    # most faults are noticed before the modules of all tests are collected
+    for file, part in {"first.txt": names[:FIRST], "others.txt": names[FIRST:]}.items():
+        (copy / file).write_text("\n".join(part))
+        line += f" && ({shell_command(copy, '-x', f'@{file}')})" if part else ""
     result = mutate_and_test(
         [evolve(fault, module_path=copy / path)], shlex.join(["sh", "-c", line]), TIME_LIMIT
     )
@@ -212,7 +227,9 @@ def main():
             results.write_text(json.dumps(found, indent=1))
             print("{place}: {verdict}".format(**future.result()), flush=True)
     judged = [found[key] for key in chosen]
-    print(f"\n{len(judged)} faults:", *Counter(x["verdict"] for x in judged).most_common())
+    counts = Counter(x["verdict"] for x in judged)
+    for verdict in ("killed", "survived", "timed out", "not covered"):
+        print(f"{verdict:12}{counts[verdict]:4}")
     for x in judged:
         if x["verdict"] in ("survived", "not covered"):
             print("\n{place}: {verdict}, {tests} tests".format(**x), *x["difference"], sep="\n")
