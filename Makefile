@@ -6,13 +6,14 @@ BIN := .venv/bin
 READY := .venv/.installed
 READY_DEV := .venv/.installed-dev
 READY_DOCS := .venv/.installed-docs
+READY_REFEREE := .venv/.installed-referee
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check
 # tests as pytest rewrites them are kept, whatever the shell says: collecting them again takes a third
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test slow long mutants lint docs bench reproduce clean
+.PHONY: help setup demo test slow long mutants lint docs bench referee reproduce clean
 
 help:
 	@echo "make setup   create .venv and install the package with its extras and development tools"
@@ -24,6 +25,7 @@ help:
 	@echo "make lint    ruff and mypy"
 	@echo "make docs    the site, its tutorials executed and its links followed; build/site/index.html"
 	@echo "make bench   measure speed; results in docs/performance.md"
+	@echo "make referee   all engines on all problems, half an hour; results in docs/performance.md"
 	@echo "make reproduce   both forwarder papers again; docs/validation/"
 	@echo "make clean   remove .venv, caches and results"
 
@@ -49,6 +51,11 @@ $(READY_DEV): $(READY)
 $(READY_DOCS): $(READY)
 	@echo "Installing what builds the site into .venv: 0.2 GB of downloads, one to five minutes"
 	@$(INSTALL) --editable '.[docs]'
+	@touch $@
+
+$(READY_REFEREE): $(READY)
+	@echo "Installing the engines of benchmarks/ into .venv: 0.5 GB of downloads, one to five minutes"
+	@$(INSTALL) --editable '.[referee]'
 	@touch $@
 
 demo: $(READY)
@@ -82,7 +89,9 @@ docs: $(READY_DOCS)
 
 bench: $(READY_DEV)
 	$(BIN)/python scripts/benchmark.py --write docs/performance.md
-	$(BIN)/python scripts/large_machines.py --write docs/performance.md
+
+referee: $(READY_REFEREE)
+	$(BIN)/python benchmarks --write docs/performance.md
 
 reproduce: $(READY)
 	$(BIN)/python scripts/reproduce_mini_forwarder.py --write docs/validation/mini_forwarder.md

@@ -1,10 +1,10 @@
-"""Compare the speed of crane with other engines on the mini forwarder; write tables and a figure.
+"""Measure the parts of crane on the mini forwarder beside other engines; write tables.
 
 All candidates of a table run in turns in one process; the tables give medians of CPU times over
 the rounds. Ratios apply to other computers, too, times do not. Needs MuJoCo (extra "mjcf").
 
     python scripts/benchmark.py                              # print
-    python scripts/benchmark.py --write docs/performance.md  # also into the page, with its figure
+    python scripts/benchmark.py --write docs/performance.md  # also into the page
 """
 
 import argparse
@@ -17,12 +17,10 @@ from evaluations import agree, forward_dynamics, one_step, stacks, task, threads
 from measuring import conditions, put
 from start_times import starts
 from valve_cranes import at_work, hydraulic_crane
-from work_precision import work_precision
 
 import crane
 
 MARKS = "<!-- results: written by scripts/benchmark.py -->", "<!-- end of results -->"
-PICTURE = "images/work_precision.png"
 
 
 def main() -> None:
@@ -34,7 +32,6 @@ def main() -> None:
     warnings.simplefilter("ignore", crane.CraneWarning)
     mini = crane.load("mini_forwarder")
     bare, few = swinging(mini), max(3, options.rounds // 5)
-    picture = options.write and options.write.parent / PICTURE
     parts = [conditions(), agree(bare)]
     for title, part in (
         ("Forward dynamics", lambda: forward_dynamics(bare, options.rounds)),
@@ -47,7 +44,6 @@ def main() -> None:
         ("A grapple, and ground under it", lambda: at_work(few)),
         ("Gradients of a motion", gradients),
         ("Starting", lambda: starts(few)),
-        ("Work and precision", lambda: work_precision(bare, few, picture)),
     ):
         parts += [f"### {title}", part()]
         print("\n\n".join(parts[-4:] if title == "Forward dynamics" else parts[-2:]) + "\n")

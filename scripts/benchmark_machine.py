@@ -1,6 +1,7 @@
 """The machine of the benchmark, the mini forwarder in springs and dampers, and its motions."""
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -116,9 +117,12 @@ class FormulaLoop:
         program.compile()
         constants = formula._constants
         address = formula._program.function_address("formula")
-        self._loop = program.bind("loop", len(q), address, *constants, q, self._x, self.out)
+        arrays = *constants, q, self._x, self.out
+        self._loop = partial(program.call, "loop", len(q), address, *arrays)
         self._each = [
-            formula._program.bind("formula", *constants, *rows)
+            formula._program.sample_function(
+                "closed_each", 1, *constants, *rows, inputs=np.empty((0, 0)), output=rows[-1]
+            )
             for rows in zip(q, self._x, self.out, strict=True)
         ]
 

@@ -72,7 +72,7 @@ def forward_dynamics(machine: crane.Machine, rounds: int) -> str:
     few = samples[:100]
     calls: dict[str, Call] = {
         "compiled backend, formula in a loop of machine code, configuration given": formula.run,
-        "the same, called through ctypes": formula.call_each,
+        "the same, called from Python": formula.call_each,
         "compiled backend, a stack (loops closed, everything in machine code)": (
             lambda: ours.forward(q_a, v_a, tau)
         ),

@@ -9,7 +9,7 @@ import pytest
 
 import crane
 from crane.common.errors import CraneError
-from crane.formats.checks import check
+from crane.formats import check
 
 DATA = Path(__file__).parent / "data"
 MODELS = Path(__file__).parents[1] / "models"

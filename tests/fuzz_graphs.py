@@ -22,7 +22,7 @@ from executed_lines import TooMuchWorkError, at_most
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
-from crane.formats.checks import check
+from crane.formats import check
 
 MOST = 500_000  # lines of the package for one file; the longest of 2500 draws ran a fifth
 APART = 8  # times as much for SDF, in which every part that nothing ties to another floats

@@ -28,7 +28,7 @@ import numpy as np  # noqa: E402
 import crane  # noqa: E402
 from crane.common.errors import CraneError, CraneWarning  # noqa: E402
 from crane.control import joystick, make_controller  # noqa: E402
-from crane.formats.checks import check  # noqa: E402
+from crane.formats import check  # noqa: E402
 from crane.identification.mechanics.identify import identify  # noqa: E402
 from crane.motion.task_trajectories import task_trajectory  # noqa: E402
 from crane.recordings.measured_recordings import read_run  # noqa: E402

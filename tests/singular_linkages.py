@@ -60,14 +60,19 @@ def kite_angles(crank, a=1.0, b=1.5):
     return np.array([crank, -crank / 2 - tilt, crank / 2 + tilt])
 
 
-def kite(folder, active):
-    """Of a crank of 1 m on a base of 1 m, coupler and rocker of 1.5 m; folds once in a turn."""
+def kite(folder, active, coupler="continuous"):
+    """Of a crank of 1 m on a base of 1 m, coupler and rocker of 1.5 m; folds once in a turn.
+
+    Its coupler may be on a ball joint, and turns as on a pin.
+    """
     parts = [
         _rod("one", 1.0), _rod("two", 1.5), _rod("three", 1.5), _joint("a", "base", "one"),
-        _joint("b", "one", "two", 1.0), _joint("c", "base", "three", 1.0), _end("two", 1.5),
-        _end("three", 1.5), _pin("pin", "two_end", "three_end"),
+        joint("b", "one", "two", (1, 0, 0), kind=coupler, axis=(0, 1, 0)), _end("two", 1.5),
+        _joint("c", "base", "three", 1.0), _end("three", 1.5),
+        _pin("pin", "two_end", "three_end"),
     ]  # fmt: skip
-    home = dict(zip("abc", kite_angles(-1.0), strict=True))
+    names = "a", "b_ry" if coupler == "spherical" else "b", "c"
+    home = dict(zip(names, kite_angles(-1.0), strict=True))
     return load(folder, "linkage", parts, home, active)
 
 

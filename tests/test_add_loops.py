@@ -15,7 +15,7 @@ from warned import without_a_word
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
-from crane.formats.checks import check
+from crane.formats import check
 
 MODELS = Path(__file__).parents[1] / "models"
 ROBOTS = Path(__file__).parents[2] / "shared/data/third_party/parallel_robots"
@@ -113,7 +113,7 @@ def test_frames_without_names_that_meet(mass, tmp_path):
     (tmp_path / "bars.urdf").write_text(text)
     (proposal,) = check(tmp_path / "bars.urdf").proposals
     assert (proposal.loop.type, proposal.loop.axis) == ("revolute", (0, 0, 1))
-    assert proposal.gap == pytest.approx(0, abs=1e-15) and not proposal.is_named
+    assert proposal.gap == pytest.approx(0, abs=1e-15)
     added = crane.formats.add_loops(tmp_path / "bars.urdf", out=tmp_path / "bars.yaml")
     assert added.mobility == 2
 

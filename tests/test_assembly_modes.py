@@ -16,7 +16,7 @@ import crane
 from crane.closure.assembly_modes import find_alternative_assembly_modes
 from crane.common.errors import CraneError, CraneWarning
 from crane.description import bundled_machines
-from crane.formats.checks import check
+from crane.formats import check
 
 STROKES = np.arange(0.14, 0.96, 0.02).round(2).tolist()
 CHOICES = re.compile(r"under 'home:' write (.+) for the other \(.+\) or (.+) to keep this one")

@@ -39,8 +39,8 @@ READ = {
     "redundancy": {"tolerance"},
     "geometry": {
         "parents", "is_revolute", "floating_bases", "body_rotations", "constants", "frame_bodies",
-        "reference_body", "ball_joints", "series_of_body", "rotation_bodies", "massless_bodies",
-        "supporting_bodies",
+        "reference_body", "series_of_body", "rotation_bodies", "massless_bodies",
+        "supporting_bodies", "partly_active_joints",
     },
 }  # fmt: skip
 
@@ -158,7 +158,7 @@ def test_whatever_changes_of_a_machine_changes_the_key(place, tmp_path):
         {"structure": {"blocks": (*structure.blocks, (rows, columns))}},
         {"structure": {"redundancy": RedundancyGap(2.0 * structure.redundancy.tolerance)}},
         {"geometry": {"floating_bases": (1,)}},
-        {"geometry": {"ball_joints": (1,)}},
+        {"geometry": {"rotation_bodies": (1,)}},
         {"_active_columns": fast._active_columns[::-1]},
         {"_passive_columns": fast._passive_columns[::-1]},
         {"signs": -fast._determinant_signs(fast._home)},

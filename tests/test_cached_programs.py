@@ -46,12 +46,16 @@ def another_processor():
         def flatten(self):
             return ""
 
+    def ask_again():
+        machine_code.host_cpu.cache_clear()
+        machine_code.compiler_settings.cache_clear()
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(llvm, "get_host_cpu_name", lambda: "generic")
         patch.setattr(llvm, "get_host_cpu_features", NoFeatures)
-        machine_code.compiler_settings.cache_clear()
+        ask_again()
         yield
-    machine_code.compiler_settings.cache_clear()
+    ask_again()
 
 
 def ask(factor=3.0):

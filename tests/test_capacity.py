@@ -13,7 +13,6 @@ from scipy.optimize import brentq, root
 
 import crane
 from crane.description.machine_parameters import parameter_unit
-from crane.dynamics.statics import StaticsEvaluator
 from crane.formats.machine_loading import MachineVariants
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.lifting_capacity import torques
@@ -363,7 +362,7 @@ def test_a_column_behind_the_axis_has_a_table():
 def test_places_at_folds_are_found():
     """Of a robot whose elbow goes through straight: each posture is among those of its place."""
     machine = crane.load("kr300", lock={"q4": 0.0, "q5": 0.0, "q6": 0.0})
-    places_ = ConfigurationSearch(StaticsEvaluator(machine))
+    places_ = ConfigurationSearch(machine)
     random, closure = np.random.default_rng(0), machine.closure
     drawn = np.tile(closure.home[closure.active], (300, 1))
     for i in places_.position_strokes:

@@ -132,11 +132,13 @@ def test_pictures_name_all_causes(chart):
     assert named == {str(chart.limiting_factors[k]) for k in chart.active_factors}
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["front", "side"]
     sheet = capacity_sheet_figure(chart)
-    words = {text.get_text() for text in sheet.texts}
-    assert {cell for row in load_table(chart).format_rows() for cell in row if cell} <= words
     sheet.draw_without_rendering()
+    tables = [table for axes in sheet.axes for table in axes.tables]
+    texts = [*sheet.texts, *(x.get_text() for table in tables for x in table.get_celld().values())]
+    words = {text.get_text() for text in texts}
+    assert {cell for row in load_table(chart).format_rows() for cell in row if cell} <= words
     page = sheet.bbox
-    for text in sheet.texts:  # nothing runs off the page
+    for text in texts:  # nothing runs off the page
         box = text.get_window_extent()
         assert page.x0 <= box.x0 and box.x1 <= page.x1 and page.y0 <= box.y0 and box.y1 <= page.y1
 

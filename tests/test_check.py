@@ -28,8 +28,8 @@ from crane.common.errors import SimulationError
 from crane.control.levers import LeverPhases
 from crane.description import bundled_machines, example_robots
 from crane.description.specification import Phase
-from crane.formats import write_machine
-from crane.formats.checks import CheckReport, check
+from crane.formats import check, write_machine
+from crane.formats.checks.check_report import CheckReport
 
 CHAIN_B1 = "urdf/mini_forwarder/chain_b1.urdf"
 CHAIN_B2 = "urdf/mini_forwarder/chain_b2.urdf"
@@ -367,8 +367,11 @@ INERTIAS = [
 UNITS = [
     seen(
         [
-            "ground.urdf:5: warning: 400 m in <origin> is a long way for a machine (3 such "
-            "in this file), write metres if these are millimetres",
+            *(
+                f"ground.urdf:{where} m in <origin> is a long way for a machine, write "
+                "metres if these are millimetres"
+                for where in ("5: warning: 400", "26: warning: 200", "41: warning: 400")
+            ),
             "rocker.urdf:17: warning: 300 m in <origin> is a long way for a machine, write "
             "metres if these are millimetres",
         ],

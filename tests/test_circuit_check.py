@@ -19,7 +19,7 @@ from crane.common.plausible_ranges import (
 )
 from crane.description.circuit_schema import MOTOR
 from crane.description.key_types import component_name
-from crane.formats.checks import check
+from crane.formats import check
 from crane.hydraulics.circuit_elements import (
     Accumulator,
     CircuitElement,

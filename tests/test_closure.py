@@ -7,6 +7,7 @@ import numpy as np
 import oracles
 import pinocchio as pin
 import pytest
+from executed_lines import at_most
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -143,6 +144,11 @@ def test_stacks_equal_single_samples(mini):
     assert closure.solve([[0.0, 0.01, 0.01]]).shape == (1, 11)
     # one posture for a stack of velocities
     assert np.array_equal(closure.drift(q[0], v), [closure.drift(q[0], one) for one in v])
+    path = strokes(1, seed=8) + 0.05 * strokes(20, seed=9)
+    stack = closure.solve(path, initial_guess=q[0])
+    first = closure.solve(path[0], initial_guess=q[0])
+    with at_most(10 * len(path)):
+        assert np.array_equal(stack, [first, *map(closure.solve, path[1:])])
 
 
 def test_home_is_closed_and_cannot_be_overwritten(mini):

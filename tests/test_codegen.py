@@ -3,8 +3,11 @@
 import functools
 import gc
 import math
+import pickle
 import subprocess
 import sys
+import tracemalloc
+import weakref
 from decimal import Decimal, localcontext
 
 import numpy as np
@@ -12,6 +15,7 @@ import pytest
 
 from crane.codegen import Program, SymbolicExpression, Tape, max_abs, maximum
 from crane.codegen.llvm import formula_emitter as llvm_formulas
+from crane.codegen.llvm import sample_function
 from crane.codegen.llvm.machine_code import emit_module
 from crane.codegen.symbolic import (
     LdltFactorization,
@@ -648,3 +652,125 @@ assert np.abs(second.inverse(home, rest, rest) - wanted).max() > 0.1
         [sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, timeout=300
     )
     assert done.returncode == 0, done.stderr
+
+
+# --- functions of one sample, which Python calls directly ---------------------------------------
+
+
+def sums():
+    """f(a, b) -> [[a_0 + b_0, 2 a_1], [a_2 - b_2, b_1]], None where a_0 + b_0 is not below 100.
+
+    With its program and its output array.
+    """
+    tape, program = Tape(), Program()
+    a, b = tape.load_vector(0, 0, 3), tape.load_vector(1, 0, 3)
+    program.add_formula("formula", 2, [a[0] + b[0], a[1] * 2.0, a[2] - b[2], b[1]])
+    with program.add_routine("one", counts=("count",), arrays=("a", "b", "out")) as r:
+        r.call("formula", r.a, r.b, r.out)
+        with r.if_then(r.out[0] < 100.0):
+            r.return_value(r.count)
+        r.return_value(0)
+    program.compile()
+    inputs, out = np.zeros((2, 3)), np.zeros((2, 2))
+    arguments = 1, inputs[0], inputs[1], out
+    return program.sample_function("one", *arguments, inputs=inputs, output=out), program, out
+
+
+A, B = np.array([0.7, -1.9, 3.1]), np.array([0.25, -0.6, 12.0])
+SUMS = [[A[0] + B[0], 2 * A[1]], [A[2] - B[2], B[1]]]
+READ_ONLY = A.copy()
+READ_ONLY.flags.writeable = False
+UNALIGNED = np.zeros(25, dtype=np.uint8)[1:].view(np.float64)
+UNALIGNED[:] = A
+SAME_AS_A = {
+    "reversed": A[::-1].copy()[::-1],
+    "column": np.column_stack([B, A, B])[:, 1],
+    "read-only": READ_ONLY,
+    "not aligned": UNALIGNED,
+    "unpickled": pickle.loads(pickle.dumps(A)),
+    "little-endian": A.astype("<f8"),
+}
+
+
+@pytest.mark.parametrize("name", SAME_AS_A)
+def test_a_sample_function_reads_all_vectors_of_doubles(name):
+    function, _, out = sums()
+    for first, second in ((SAME_AS_A[name], B), (A, SAME_AS_A[name])):
+        wanted = SUMS if second is B else [[2 * A[0], 2 * A[1]], [0.0, A[1]]]
+        one, two = function(first, second), function(first, second)
+        np.testing.assert_array_equal(one, wanted)
+        assert one.flags.owndata and one.flags.writeable and one.dtype == np.float64
+        one[:] = 7.0
+        np.testing.assert_array_equal(two, wanted)
+        np.testing.assert_array_equal(out, wanted)
+    np.testing.assert_array_equal(function(B), function(B, SAME_AS_A[name]))  # as the last time
+
+
+REFUSED = {
+    "list": [*A],
+    "nothing": None,
+    "number": 0.7,
+    "object": object(),
+    "type": np.ndarray,
+    "float32": A.astype(np.float32),
+    "integers": np.array([1, 2, 3]),
+    "other byte order": A.astype(np.dtype(np.float64).newbyteorder()),
+    "complex": A.astype(complex),
+    "objects": A.astype(object),
+    "long double": A.astype(np.longdouble),
+    "times": np.array([1, 2, 3], dtype="m8[s]"),
+    "record": np.array([(1.0,)] * 3, dtype=[("x", float)]),
+    "subclass": np.ma.masked_array(A),
+    "short": A[:2],
+    "empty": A[:0],
+    "long": np.append(A, A),
+    "scalar": np.array(0.7),
+    "row": A[None],
+    "not a number": np.array([0.7, NAN, 3.1]),
+    "infinite": np.array([0.7, -1.9, -INF]),
+    "too large": np.array([100.0, 0.0, 0.0]),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_sample_function_leaves_everything_else(name):
+    function, _, _ = sums()
+    bad = REFUSED[name]
+    assert function(bad, B) is None and function(A, bad) is None
+    assert function(A, B, A) is None and function(*[bad] * 30) is None
+    np.testing.assert_array_equal(function(A, B), SUMS)
+
+
+def test_a_sample_function_keeps_the_counts_of_references():
+    function, program, _ = sums()
+    given = [A, B, *REFUSED.values(), np.ndarray, A.dtype, None, function]
+    calls = [(A, B)]
+    for bad in REFUSED.values():
+        calls += [(bad, B), (A, bad)]
+
+    def call_all(function, count):
+        for _ in range(count):
+            for arguments in calls:
+                function(*arguments)
+
+    tracemalloc.start()
+    call_all(function, 10)
+    before, memory = [*map(sys.getrefcount, given)], tracemalloc.get_traced_memory()[0]
+    call_all(function, 2000)
+    grown = tracemalloc.get_traced_memory()[0] - memory
+    tracemalloc.stop()
+    assert np.abs(np.subtract([*map(sys.getrefcount, given)], before)).max() < 100
+    assert grown < 10_000
+    owned = weakref.ref(program)
+    del program
+    gc.collect()
+    assert owned() is not None  # its machine code is called
+    np.testing.assert_array_equal(function(A, B), SUMS)
+    del function, given
+    gc.collect()
+    assert owned() is None
+
+
+def test_sample_functions_do_nothing_where_they_do_not_know_the_objects(monkeypatch):
+    monkeypatch.setattr(sample_function, "_OBJECT_SIZE", 32)
+    assert sums()[0](A, B) is None

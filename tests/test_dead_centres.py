@@ -128,6 +128,23 @@ def test_parallelograms_stay_such_in_line(tmp_path, count, active):
     assert singular_linkages.imbalance(found) < 1e-9
 
 
+@pytest.mark.parametrize(
+    ("duration", "step", "method", "error"),
+    [
+        (10.0, 10.0, "DOP853", 1e-7), (10.0, 1.0, "DOP853", 1e-7), (10.0, 0.1, "DOP853", 1e-7),
+        (0.715, 0.715, "DOP853", 1e-10), (0.715, 0.143, "DOP853", 1e-10),
+        (0.72, 0.72, "DOP853", 1e-10), (10.0, 0.005, "rk4", 1e-7), (10.0, 0.02, "rk4", 2e-5),
+    ],
+)  # fmt: skip
+def test_distant_outputs_do_not_hide_a_crossing(tmp_path, duration, step, method, error):
+    """Ten crossings between outputs a second apart, and runs that end within the first one."""
+    machine = singular_linkages.windows(tmp_path, "r0", 2)
+    found = run(machine, "r0", 1.0, duration, step=step, method=method)
+    wanted = swung(-np.pi / 2, 1.0, duration, lambda _: 3.0, 3.5, found.time)
+    np.testing.assert_allclose(found.q[:, 0], wanted, rtol=0, atol=error)
+    assert len(found.time) == round(duration / step) + 1
+
+
 def test_crossings_do_not_analyse_the_structure_anew(tmp_path, monkeypatch):
     """Ten times the links come in line; the equations that count stay the same."""
     analysed, whole = [], home_search.analyse_constraints
@@ -218,6 +235,17 @@ def test_loops_are_followed_through_change_points(tmp_path, name):
     np.testing.assert_allclose(tau, wanted, rtol=0, atol=1e-6 * np.abs(wanted).max())
     with pytest.raises(crane.CraneError, match="is at the edge of its branch"):
         machine.closure.gamma(machine.closure.solve([change_point]))
+
+
+def test_guesses_beyond_a_change_point_may_have_either_rotation_vector(tmp_path):
+    """The same rotation of a ball joint, by less or by more than half a revolution."""
+    machine = singular_linkages.kite(tmp_path, "a", "spherical")
+    a, b, c = singular_linkages.kite_angles(1.5)
+    for angle in (b + 2 * np.pi, b):
+        guess = np.array([a, 0.0, angle, 0.0, c])
+        with warnings.catch_warnings(action="ignore"):
+            q = machine.closure.solve([a], guess)
+        np.testing.assert_allclose(q, [a, 0.0, b, 0.0, c], rtol=0, atol=1e-12)
 
 
 def test_a_limit_of_neighbours_or_none():

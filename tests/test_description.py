@@ -383,3 +383,11 @@ class TestDocumentation:
         locked = [int(axis in words.split(", ")) for words in row[:2] for axis in "xyz"]
         assert tuple(locked) == LOOP_TYPES[kind]
         assert int(row[2]) == sum(locked)
+
+
+def test_machines_with_numbers_of_numpy_are_written(tmp_path):
+    machine = crane.load("mini_forwarder")
+    spring = crane.description.ForceElement(machine.active[0], np.float64(2.5), rest=np.float64(0))
+    path = crane.write_machine(machine.replace(forces=(spring,)), tmp_path / "machine")
+    (found,) = crane.load(path).forces
+    assert found == crane.description.ForceElement(machine.active[0], 2.5)

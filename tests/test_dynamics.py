@@ -7,6 +7,7 @@ import oracles
 import pinocchio as pin
 import pytest
 import scipy.integrate
+from executed_lines import at_most
 from lxml import etree
 from warned import quiet
 
@@ -560,12 +561,33 @@ def test_bad_arguments(mini, dynamics):
         (lambda: dynamics.inverse(q_a, v_a[:2], a_a), r"2, 3. samples do not go together"),
         (lambda: dynamics.inverse(q_a, v_a[:, :2], a_a), r"v_a has the shape \(3, 2\)"),
         (lambda: dynamics.forward(q_a, v_a, np.full((3, 3), np.nan)), "tau_a is nan at q1 of"),
+        (lambda: dynamics.forward(q_a[0], v_a[0], v_a[0] * np.nan), "tau_a is nan at q1, give"),
+        (lambda: dynamics.forward(q_a[0], v_a[0], v_a[0, :2]), r"tau_a has the shape \(2,\)"),
+        (lambda: dynamics.forward(q_a[0], None, v_a[0]), "v_a is not made of real numbers"),
         (lambda: dynamics.gravity([0.0, np.inf, 0.0]), "q_a is inf at X1"),
         (lambda: dynamics.mass_matrix(np.zeros((0, 3))), "empty"),
         (lambda: crane.Dynamics(mini, "exakt"), "formulation 'exakt' is unknown, .*'exact'"),
     ):
         with pytest.raises(InputError, match=text):
             call()
+
+
+def test_single_calls_are_those_of_lists(loaded):
+    """Lists are checked and evaluated as a stack of one, arrays by machine code alone."""
+    q_a, *others = states(40)
+    q_a = q_a[0] + 0.05 * (q_a - q_a[0])
+    q_a[20] = states(3, 1)[0][2]  # too far for one step, and back
+    counts = {
+        "inverse": 3, "forward": 3, "mass_matrix": 1, "bias": 2, "gravity": 1, "friction": 2,
+        "passive": 2, "energy": 2, "regressor": 3,
+    }  # fmt: skip
+    direct, checked = crane.Dynamics(loaded), crane.Dynamics(loaded)
+    for name, count in counts.items():
+        for i, sample in enumerate(zip(*(q_a, *others)[:count], strict=True)):
+            with at_most(np.inf if i in (0, 20, 21) else 12):
+                found = getattr(direct, name)(*sample)
+            wanted = getattr(checked, name)(*map(list, sample))
+            assert np.array_equal(found, wanted) and np.shape(found) == np.shape(wanted), name
 
 
 @pytest.mark.parametrize("name", ["ur5_robot", "xarm7"])

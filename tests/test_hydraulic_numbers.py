@@ -16,7 +16,7 @@ from crane.common.plausible_ranges import (
     implausible_value_text,
 )
 from crane.control import ValveSignals
-from crane.formats.checks import check
+from crane.formats import check
 from crane.hydraulics import Supply
 
 

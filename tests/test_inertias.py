@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import crane
 from crane.common.errors import DescriptionError
 from crane.description.kinematic_tree import inertia_problem, nearest_inertia
-from crane.formats.checks import check
+from crane.formats import check
 
 GRBDA = Path(__file__).parents[2] / "shared" / "data" / "third_party" / "grbda"
 FILES = sorted(GRBDA.glob("*.urdf"))

@@ -28,7 +28,8 @@ from crane.common.errors import InputError, RecordingError
 from crane.recordings.recording import Recording
 from crane.view.live.live_page import readout_html, warning_html
 from crane.view.live.live_server import AccessGuard
-from crane.view.live.live_session import Playback, Session, round_up_to_nice
+from crane.view.live.live_session import Playback, Session
+from crane.view.page.scene import round_up_to_nice
 
 
 @pytest.fixture
@@ -201,9 +202,9 @@ def group_is_empty(group):
 def test_the_machine_is_in_view_and_above_the_panel_of_a_phone(patu, aspect):
     """Projected corners of all shapes: within the window, and of one upright in its upper part."""
     pytest.importorskip("viser")
-    from crane.view.live.live_scene import LiveScene, _shape_corners
+    from crane.view.live.live_scene import LiveScene
     from crane.view.live.live_server import AccessGuard, start_server, stop_server
-    from crane.view.page.scene import read_visuals
+    from crane.view.page.scene import link_poses, read_visuals, shape_corners
 
     session = Session(patu)
     server = start_server(AccessGuard("127.0.0.1"), 0)
@@ -213,7 +214,9 @@ def test_the_machine_is_in_view_and_above_the_panel_of_a_phone(patu, aspect):
         stop_server(server)
     forward = (look_at - position) / np.linalg.norm(look_at - position)
     right = np.cross(forward, [0, 0, 1]) / np.linalg.norm(np.cross(forward, [0, 0, 1]))
-    ways = (_shape_corners(read_visuals(patu), session) - position) @ np.column_stack(
+    visuals = read_visuals(patu)
+    poses = link_poses(patu, patu.home[None], {visual.link for visual in visuals})
+    ways = (shape_corners(visuals, poses) - position) @ np.column_stack(
         [right, np.cross(right, forward), forward]
     )
     half = np.tan(np.radians(20))

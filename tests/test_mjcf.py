@@ -13,7 +13,7 @@ from warned import told, without_a_word
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
-from crane.formats.checks import check
+from crane.formats import check
 from crane.formats.mjcf.unsupported_features import colliding_geoms
 
 TREE = """<mujoco model="tree">

@@ -5,7 +5,7 @@ import pytest
 from closing_from_anywhere import Task, rows, table
 
 from crane.closure.multi_start_search import remove_revolutions
-from crane.formats.checks import check
+from crane.formats import check
 
 NAMED = 0.05  # difference of distances from the start that counts [rad], or machine's size
 

@@ -384,15 +384,16 @@ class Handle:
     def __init__(self):
         self.lines = []
 
-    def update(self, line):
-        self.lines.append(line._repr_html_())
+    def update(self, line, raw):
+        assert raw and line["text/plain"] == ""
+        self.lines.append(line["text/html"])
 
 
 def test_a_cell_that_takes_long_has_a_line_that_goes(monkeypatch, heard):
     handle, events = Handle(), {}
     shell = SimpleNamespace(events=SimpleNamespace(register=events.__setitem__))
     monkeypatch.setitem(sys.modules, "IPython.display", SimpleNamespace(
-        display=lambda line, display_id: handle.update(line) or handle))  # fmt: skip
+        display=lambda line, raw, display_id: handle.update(line, raw) or handle))  # fmt: skip
     monkeypatch.setattr(progress, "REPORT_DELAY", 0.02)
     monkeypatch.setattr(progress, "REPORT_INTERVAL", 0.02)
     notebook_progress.show_cell_progress(shell)

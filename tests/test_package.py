@@ -19,7 +19,7 @@ from crane.description import machine_lookup
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
-TOOLS = {"all", "dev", "docs"}  # what is for everybody, for developers, for the site
+TOOLS = {"all", "dev", "docs", "referee"}  # what is for everybody, for developers, for the site
 
 CONDA = {  # names on conda-forge that differ from those of Python's index
     "pin": "pinocchio-python", "meshcat": "meshcat-python", "matplotlib": "matplotlib-base",

@@ -14,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 import crane
 from crane.common.errors import CraneWarning, InputError, LimitError, OutOfReachError, OutputError
 from crane.description import bundled_machines
-from crane.view.sketches.sketch_canvas import format_joint_symbol
+from crane.view.plots.figure_style import joint_symbol
 from crane.view.sketches.sketch_elements import find_plane
 from crane.view.sketches.sketch_figure import sketch_figure
 
@@ -111,7 +111,7 @@ def test_pins_are_where_forward_kinematics_puts_them(machines, name):
 def test_every_joint_and_loop_is_named_once(at_home):
     for machine, figure in at_home:
         expected = [*machine.joints, *(loop.name for loop in machine.closure.equations.loops)]
-        assert sorted(names(figure)) == sorted(map(format_joint_symbol, expected)), machine.name
+        assert sorted(names(figure)) == sorted(map(joint_symbol, expected)), machine.name
 
 
 def test_no_words_overlap_or_lie_on_lines_at_home(at_home):

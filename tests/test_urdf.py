@@ -10,7 +10,7 @@ from command_line import typed
 import crane
 from crane.common.errors import CraneWarning, DescriptionError, InputError
 from crane.common.package_search import use_load_options
-from crane.formats.checks import check
+from crane.formats import check
 from crane.formats.urdf.urdf_reader import read_urdf
 from crane.formats.xml_file import XmlFile
 

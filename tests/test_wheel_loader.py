@@ -8,7 +8,6 @@ import wheel_loader
 from scipy.optimize import brentq
 
 import crane
-from crane.dynamics.statics import StaticsEvaluator
 from crane.ratings.strokes import Strokes, find_toggle
 
 
@@ -196,7 +195,7 @@ def test_a_toggle_is_said_and_ended_by_what_holds(with_toggle):
 
 def test_a_toggle_is_beside_it_alone(with_toggle):
     """The extreme is found within 1 % of the stroke, away from zero and infinite levers."""
-    strokes = Strokes(StaticsEvaluator(with_toggle))
+    strokes = Strokes(with_toggle)
     closure = with_toggle.closure
     lift = wheel_loader.LIFTED
 

@@ -15,7 +15,7 @@ from warned import quiet, without_a_word
 import crane
 from crane.common.errors import CraneError, CraneWarning
 from crane.description import bundled_machines
-from crane.formats.checks import check
+from crane.formats import check
 
 WRONG = (0.7, 0.9, 0.99, 1.01, 1.1, 1.3)
 LINKAGES = misfit_linkages.LINKAGES

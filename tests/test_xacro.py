@@ -13,7 +13,7 @@ from warned import quiet
 import crane
 from crane.common.errors import CraneError, InputError
 from crane.formats import robot_files
-from crane.formats.xacro_expressions import UnsafeExpressionError, restrict_expressions
+from crane.formats.xacro_process import UnsafeExpressionError, restrict_expressions
 
 xacro = pytest.importorskip("xacro")
 

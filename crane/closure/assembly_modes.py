@@ -127,26 +127,15 @@ class _AssemblyModeSearch:
         self.model, self.equations = closure.model, closure.equations
         self.home, self.blocks = closure.home, closure.structure.blocks
         self._coordinate_units = self.equations.coordinate_units
+        self._distances = self.equations.coordinates.scaled_distances
         self._is_rotation = ~self.equations.coordinates.is_translation
         self._loop_subsets: dict[tuple[int, ...], LoopEquations] = {}
         self._body_placements: dict[bytes, Array] = {}
         self._massless = not any(inertia.mass > 0 for inertia in list(self.model.inertias)[1:])
 
-    def coordinate_differences(self, first: Array, second: Array) -> Array:
-        """(nq,) distances of two configurations by coordinate, in units of 1 rad or `length`."""
-        difference = first - second
-        angle_difference = np.remainder(difference + np.pi, 2 * np.pi) - np.pi
-        return np.asarray(
-            np.where(
-                self._is_rotation,
-                np.abs(angle_difference),
-                np.abs(difference) / self._coordinate_units,
-            )
-        )
-
     def distance_from_guess(self, q: Array, columns: Indices) -> float:
         """Largest distance of some joints from the guess."""
-        return float(self.coordinate_differences(q, self.guess)[columns].max(initial=0.0))
+        return float(self._distances(q, self.guess)[columns].max(initial=0.0))
 
     def specified_among(self, columns: Indices) -> Indices:
         """Those of some columns that the file specifies; all of them if it specifies none."""
@@ -169,8 +158,7 @@ class _AssemblyModeSearch:
         ][:max_starts]:
             q = self._solve_newton(start, rows, columns, found)
             if q is None or any(
-                self.coordinate_differences(q, x)[columns].max() < _SAME_CONFIGURATION_TOLERANCE
-                for x in found
+                self._distances(q, x)[columns].max() < _SAME_CONFIGURATION_TOLERANCE for x in found
             ):
                 continue
             found.append(q)
@@ -312,9 +300,7 @@ class _AssemblyModeSearch:
         is_inside = within_limits(self.equations, q)[passive].all()
         if self.equations.find_opposed_loop(q) is not None or not is_inside:
             return None
-        columns = np.flatnonzero(
-            self.coordinate_differences(q, self.home) > _SAME_CONFIGURATION_TOLERANCE
-        )
+        columns = np.flatnonzero(self._distances(q, self.home) > _SAME_CONFIGURATION_TOLERANCE)
         if not len(columns) or self.is_same_for_masses(q, self.home):
             return None
         compared = self.specified_among(columns)
@@ -341,7 +327,7 @@ class _AssemblyModeSearch:
         )
 
     def _largest_deviation(self, q: Array, columns: Indices) -> tuple[int, float]:
-        differences = self.coordinate_differences(q, self.guess)[columns]
+        differences = self._distances(q, self.guess)[columns]
         column = int(columns[differences.argmax()])
         return column, float(differences.max() * self._coordinate_units[column])
 

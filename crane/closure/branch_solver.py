@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from crane.closure.active_joint_selection import null_space_basis
-from crane.closure.compiled_closure import CompiledClosure, ContinuationCursor
+from crane.closure.compiled_closure import CompiledClosure, ContinuationCursor, ContinuedFunction
 from crane.closure.constraint_structure import ConstraintStructure
 from crane.closure.continuation_diagnosis import ClosedConfiguration
 from crane.closure.coordinates import Indices
@@ -94,8 +94,8 @@ class BranchSolver:
         self.home = self.continuation.home.q.copy()
         self.home.flags.writeable = False
         self._with_machine_code = with_machine_code
-        self.__dict__.pop("_machine_code", None)  # of the closure that this one is a copy of
-        for name in ("_cursors", "_beyond", "_codes_beyond"):
+        # of the closure that this one is a copy of
+        for name in ("_machine_code", "_solvers", "_beyond", "_codes_beyond"):
             self.__dict__.pop(name, None)
 
     @cached_property
@@ -126,8 +126,8 @@ class BranchSolver:
         return self._machine_code
 
     @cached_property
-    def _cursors(self) -> ThreadLocal[ContinuationCursor]:
-        return ThreadLocal(self.compiled_closure.new_cursor)
+    def _solvers(self) -> ThreadLocal[ContinuedFunction]:
+        return ThreadLocal(self.compiled_closure.new_solver)
 
     @cached_property
     def _beyond(self) -> ThreadLocal["_ChangePointBranch"]:
@@ -149,7 +149,7 @@ class BranchSolver:
         """
         nearest = self.continuation.nearest_closed_configuration
         if self.is_compiled:
-            cursor = self._cursors.value
+            cursor = self._solvers.value.cursor
             if guess is not None and not self.compiled_closure.start_cursor_at(cursor, guess):
                 cursor.start_from(known := nearest(guess))
                 self._go_beyond(known)
@@ -241,7 +241,7 @@ class BranchSolver:
     def is_on_branch(self, q: Array) -> bool:
         """Whether a closed configuration (nq,) lies on the branch of home."""
         if self.is_compiled:
-            return self.compiled_closure.start_cursor_at(self._cursors.value, q)
+            return self.compiled_closure.start_cursor_at(self._solvers.value.cursor, q)
         try:
             found = self.continuation.nearest_closed_configuration(q)
         except WrongBranchError:

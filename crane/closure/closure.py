@@ -30,7 +30,7 @@ from crane.closure.kinematics_formulas import tree_geometry
 from crane.closure.loop_equations import LoopEquations
 from crane.common.errors import InputError, MechanismError
 from crane.common.one_line_repr import OneLineRepr
-from crane.common.samples import Array, apply_per_sample, as_samples
+from crane.common.samples import Array, apply_per_sample, as_sample, as_samples
 from crane.description.specification import Coupling, LoopSpec
 
 # least singular value of the independent equations over that of all, for the same coordinates
@@ -150,7 +150,7 @@ class Closure(BranchSolver, OneLineRepr):
         if not _has_same_geometry(LoopEquations(model, loops, couplings), self.equations):
             return None
         other = copy.copy(self)
-        other.__dict__.pop("_cursors", None)
+        other.__dict__.pop("_solvers", None)
         other.__dict__.pop("_beyond", None)
         return other
 
@@ -244,14 +244,18 @@ class Closure(BranchSolver, OneLineRepr):
             SingularConfigurationError: The branch ends there, at a dead centre.
             WrongBranchError: The guess belongs to another branch.
         """
+        if (
+            initial_guess is None
+            and self.is_compiled
+            and (q := self._solvers.value.evaluate_sample(q_a)) is not None
+        ):
+            return q
         targets = as_samples(q_a, len(self.active), "q_a", self.active_names)
         if targets.size == 0:
             raise InputError("q_a is an empty stack, give at least one sample")
         guess, names = None, self.equations.coordinates.names
         if initial_guess is not None:
-            guess = as_samples(initial_guess, self.model.nv, "guess", names)
-            if guess.ndim != 1:
-                raise InputError(f"guess has the shape {guess.shape}, give one ({self.model.nv},)")
+            guess = as_sample(initial_guess, self.model.nv, "guess", names)
         out = np.empty((*targets.shape[:-1], self.model.nv))
         self._solve_stack(np.atleast_2d(targets), guess, targets.ndim == 2, np.atleast_2d(out))
         return out
@@ -297,6 +301,9 @@ class Closure(BranchSolver, OneLineRepr):
             InputError: Wrong shape or not finite.
             SingularConfigurationError: The passive joints are not determined there.
         """
+        code = self._machine_code
+        if code is not None and (gamma := code.gamma_function(q)) is not None:
+            return gamma
         q = as_samples(q, self.model.nv, "q", self.equations.coordinates.names)
         if q.size == 0:
             raise InputError("q is an empty stack, give at least one sample")

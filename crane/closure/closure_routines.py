@@ -76,53 +76,43 @@ def _add_follow(program: Program, nq: int, n: int, wraps_rotations: bool) -> Non
     arrays = {
         "constants": None, "targets": None, "cursor": cursor, "out": None, "tolerances": None,
     }  # fmt: skip
-    with program.add_routine("follow", counts=("count",), arrays=arrays) as r:
+    with program.add_loop("follow", arrays=arrays) as (r, i):
         guess = r.local_array("guess", nq)
         correction = r.local_array("correction", program.formula_outputs("distance"))
         predicted = r.local_array("predicted", program.formula_outputs("predict"))
         result = r.local_array("result", program.formula_outputs("newton"))
-        with r.loop(r.count) as i:
-            r.call("predict", r.constants, r.cursor, r.targets.row_pointer(i, n), predicted)
-            move = r.new_variable(predicted["move"])
-            with r.if_then(~(move < 1.0)):
-                r.return_value(i)
-            r.copy(guess, predicted.element_pointer("q"), nq)
-            closed = r.call("close", r.constants, guess, result, r.tolerances)
-            with r.if_then(closed < 1):
-                r.return_value(i)
-            r.call("distance", r.constants, predicted, guess, correction)
-            with r.if_then(~(correction["all"] <= move * 0.5 + 0.02)):
-                r.return_value(i)
-            with r.if_then(~(correction["all"] * _MIN_REGULARITY < result["determinant"])):
-                r.return_value(i)
-            if wraps_rotations:
-                r.copy(predicted.element_pointer("q"), guess, nq)
-                r.call("wrap", predicted, guess)
-            r.copy(r.cursor, guess, nq)
-            r.copy(r.cursor.element_pointer("gamma"), result.element_pointer("gamma"), entries)
-            r.copy(r.out.row_pointer(i, nq), guess, nq)
-        r.return_value(r.count)
+        r.call("predict", r.constants, r.cursor, r.targets.row_pointer(i, n), predicted)
+        move = r.new_variable(predicted["move"])
+        with r.if_then(~(move < 1.0)):
+            r.return_value(i)
+        r.copy(guess, predicted.element_pointer("q"), nq)
+        closed = r.call("close", r.constants, guess, result, r.tolerances)
+        with r.if_then(closed < 1):
+            r.return_value(i)
+        r.call("distance", r.constants, predicted, guess, correction)
+        with r.if_then(~(correction["all"] <= move * 0.5 + 0.02)):
+            r.return_value(i)
+        with r.if_then(~(correction["all"] * _MIN_REGULARITY < result["determinant"])):
+            r.return_value(i)
+        if wraps_rotations:
+            r.copy(predicted.element_pointer("q"), guess, nq)
+            r.call("wrap", predicted, guess)
+        r.copy(r.cursor, guess, nq)
+        r.copy(r.cursor.element_pointer("gamma"), result.element_pointer("gamma"), entries)
+        r.copy(r.out.row_pointer(i, nq), guess, nq)
 
 
 def _add_loops_over_configurations(program: Program, nq: int, n: int) -> None:
     """Add "close_each", which closes configurations in place, and "gamma_each"."""
     newton = program.formula_outputs("newton")
-    with program.add_routine(
-        "close_each", counts=("count",), arrays=("constants", "q", "tolerances")
-    ) as r:
+    with program.add_loop("close_each", arrays=("constants", "q", "tolerances")) as (r, i):
         result = r.local_array("result", newton)
-        with r.loop(r.count) as i:
-            closed = r.call("close", r.constants, r.q.row_pointer(i, nq), result, r.tolerances)
-            with r.if_then(closed < 1):
-                r.return_value(i)
-        r.return_value(r.count)
-    with program.add_routine(
-        "gamma_each", counts=("count",), arrays=("constants", "q", "out")
-    ) as r:
+        closed = r.call("close", r.constants, r.q.row_pointer(i, nq), result, r.tolerances)
+        with r.if_then(closed < 1):
+            r.return_value(i)
+    with program.add_loop("gamma_each", arrays=("constants", "q", "out")) as (r, i):
         result = r.local_array("result", newton)
-        with r.loop(r.count) as i:
-            r.call("newton", r.constants, r.q.row_pointer(i, nq), result)
-            with r.if_then(~(result["regular"] > 0.0)):
-                r.return_value(i)
-            r.call("gamma", result, r.out.row_pointer(i, nq * n))
-        r.return_value(r.count)
+        r.call("newton", r.constants, r.q.row_pointer(i, nq), result)
+        with r.if_then(~(result["regular"] > 0.0)):
+            r.return_value(i)
+        r.call("gamma", result, r.out.row_pointer(i, nq * n))

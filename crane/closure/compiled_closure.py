@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -22,6 +23,7 @@ from crane.closure.loop_equations import Cluster, LoopEquations, find_clusters
 from crane.closure.loop_formulas import LoopFormulas
 from crane.closure.predictor_formulas import PredictorFormulas
 from crane.codegen import Layout, LayoutView, Program, Scalar, Tape, max_abs, maximum
+from crane.codegen.llvm.sample_function import SampleFunction
 from crane.codegen.symbolic import minimum
 from crane.common.samples import Array
 
@@ -49,21 +51,20 @@ class ContinuationCursor:
         self.state[len(configuration.q) :] = configuration.passive_gamma[self.gamma_entries]
 
 
-class _SharedCode:
-    """Machine code that all machines with equal formulas share.
+class ContinuedFunction(NamedTuple):
+    """A function of one sample that closes the loops from a cursor; every thread has its own.
 
     Attributes:
-        closure_program: Program that closes the loops.
-        programs: Further programs, by what they depend on.
+        cursor: The cursor.
+        evaluate_sample: The function, see `Program.sample_function`.
     """
 
-    def __init__(self, closure_program: Program):
-        self.closure_program = closure_program
-        self.programs: dict[tuple, Program] = {}
+    cursor: ContinuationCursor
+    evaluate_sample: SampleFunction
 
 
 # Kept while a machine uses it. Two threads may both create an entry; either is valid.
-_SHARED_CODE: WeakValueDictionary[tuple, _SharedCode] = WeakValueDictionary()
+_SHARED_CODE: WeakValueDictionary[tuple, Program] = WeakValueDictionary()
 
 
 class CompiledClosure:
@@ -111,19 +112,19 @@ class CompiledClosure:
         self._predictor = PredictorFormulas(
             self.geometry, active, passive, self._gamma_entry_pairs
         )
+        joints = [int(column) + 1 for column in active]
+        self._has_partly_active_rotations = bool(self.geometry.partly_active_joints(joints))
         signs = self.signs = self._determinant_signs(home) if signs is None else signs
         key = self._cache_key(signs)
-        shared = _SHARED_CODE.get(key)
-        if shared is None:
-            loops = Program.from_cache(("loops", key), lambda program: self._build(program, signs))
-            shared = _SHARED_CODE[key] = _SharedCode(loops)
-        self._shared_code = shared  # keeps the machine code alive
-        self._formula_key = key
-        program, self.programs = shared.closure_program, shared.programs
-        self._closure_program = program
+        program = _SHARED_CODE.get(key)
+        if program is None:
+            program = Program.from_cache(("loops", key), lambda new: self._build(new, signs))
+            _SHARED_CODE[key] = program
+        self._formula_key, self._closure_program = key, program
+        self.programs = program.dependent_programs
         self.follow_address = program.function_address("follow")
         self.close_address = program.function_address(
-            "project" if self._predictor.has_partly_active_rotations else "close"
+            "project" if self._has_partly_active_rotations else "close"
         )
         self._home = home
         self.tolerances = np.array([1e-15 * rounding_scale, 1e-13 * rounding_scale, 1e-9])
@@ -167,7 +168,7 @@ class CompiledClosure:
             geometry.parents,
             geometry.is_revolute,
             geometry.floating_bases,
-            geometry.ball_joints,
+            geometry.rotation_bodies,
             geometry.frame_bodies,
             folding_pattern(geometry.constants),
             tuple(loop.type for loop in equations.loops),
@@ -178,7 +179,7 @@ class CompiledClosure:
 
     def _build(self, program: Program, signs: Array) -> None:
         self._add_newton_formula(program, signs, "newton", holds_coordinates=True)
-        if self._predictor.has_partly_active_rotations:
+        if self._has_partly_active_rotations:
             self._add_newton_formula(program, signs, "newton_motion", holds_coordinates=False)
         self._predictor.add_to(program)
         self._add_gamma(program)
@@ -186,7 +187,7 @@ class CompiledClosure:
             program,
             self._nq,
             self._n,
-            self._predictor.has_partly_active_rotations,
+            self._has_partly_active_rotations,
             self._predictor.wraps_rotations,
         )
 
@@ -215,6 +216,15 @@ class CompiledClosure:
         )
         cursor.start_from(self._home)
         return cursor
+
+    def new_solver(self) -> "ContinuedFunction":
+        """The function of one target (n,) that returns q (nq,), with a new cursor."""
+        cursor, target, q = self.new_cursor(), np.zeros((1, self._n)), np.zeros(self._nq)
+        arrays = self.geometry.constants, target, cursor.state, q, self.tolerances
+        return ContinuedFunction(
+            cursor,
+            self._closure_program.sample_function("follow", 1, *arrays, inputs=target, output=q),
+        )
 
     def start_cursor_at(self, cursor: "ContinuationCursor", q: Array) -> bool:
         """Move a cursor to a configuration (nq,) that is closed to 1e-6 or better.
@@ -256,6 +266,14 @@ class CompiledClosure:
             cursor.state,
             out,
             self.tolerances,
+        )
+
+    @cached_property
+    def gamma_function(self) -> SampleFunction:
+        """The function of one closed configuration (nq,) that returns gamma (nv, n)."""
+        q, gamma = np.zeros((1, self._nq)), np.zeros((self._nq, self._n))
+        return self._closure_program.sample_function(
+            "gamma_each", 1, self.geometry.constants, q, gamma, inputs=q, output=gamma
         )
 
     def close_in_place(self, q: Array) -> int:
@@ -392,15 +410,9 @@ class CompiledClosure:
 
     def _add_gamma(self, program: Program) -> None:
         """Add "gamma": gamma of all joints from the result of "newton"."""
-        tape, n, result = Tape(), self._n, program.formula_outputs("newton")
-        at = {
-            pair: result.start_index("gamma") + i for i, pair in enumerate(self._gamma_entry_pairs)
-        }
-        rows: list[list[Scalar]] = [[0.0] * n for _ in range(self._nq)]
-        for k, column in enumerate(self._active_columns):
-            rows[column][k] = 1.0
-        for (row, k), index in sorted(at.items()):
-            rows[self._passive_columns[row]][k] = tape.load(0, index)
+        start = program.formula_outputs("newton").start_index("gamma")
+        entries = Tape().load_vector(0, start, len(self._gamma_entry_pairs))
+        rows = self._predictor.gamma_rows(entries)
         program.add_formula("gamma", 1, [entry for row in rows for entry in row])
 
     def _determinant_signs(self, home: ClosedConfiguration) -> Array:

@@ -257,8 +257,8 @@ class _ConstraintAnalysis:
         home = self._constraints.close_loops(self._guess, self._passive)
         # full revolutions of passive joints are removed, within limits or half a revolution
         lower, upper = self._coordinates.lower, self._coordinates.upper
-        periodic = periodic_coordinates(self._equations)
-        periodic[np.setdiff1d(np.arange(len(home)), self._passive)] = False
+        is_passive = np.isin(np.arange(len(home)), self._passive)
+        periodic = periodic_coordinates(self._equations) & is_passive
         nearby = np.where(np.isinf(lower) | np.isinf(upper), 0.0, home)
         home = remove_revolutions(home, nearby, periodic, lower, upper)
         home = self._coordinates.wrap_rotations(home, self._passive)

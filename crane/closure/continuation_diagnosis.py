@@ -7,6 +7,7 @@ import numpy as np
 from crane.closure.constraint_structure import ConstraintStructure
 from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
+from crane.closure.multi_start_search import closest_approach
 from crane.common.errors import OutOfReachError, SingularConfigurationError, WrongBranchError
 from crane.common.samples import Array
 
@@ -36,14 +37,28 @@ class ClosedConfiguration:
 
 
 class ContinuationDiagnosis:
-    """Why a continuation cannot go on, as errors; base class of `NewtonContinuation`."""
+    """Why a continuation cannot go on, as errors; base class of `NewtonContinuation`.
 
-    _equations: LoopEquations
-    _structure: ConstraintStructure
-    _active_columns: Indices
-    _passive_columns: Indices
-    _coordinate_units: Array
-    _largest_dimension: float
+    Args:
+        equations: All loop equations.
+        structure: Independent equations.
+        active: Columns of the active joints.
+        passive: Columns of the other joints.
+    """
+
+    def __init__(
+        self,
+        equations: LoopEquations,
+        structure: ConstraintStructure,
+        active: Indices,
+        passive: Indices,
+    ):
+        self._equations, self._structure = equations, structure
+        self._active_columns, self._passive_columns = active, passive
+        self._coordinate_units = equations.coordinate_units
+        model = equations.model
+        places = [*model.jointPlacements, *(frame.placement for frame in model.frames)]
+        self._largest_dimension = max(float(np.abs(place.translation).max()) for place in places)
 
     def rounding_scale(self, q: Array) -> float:
         """Factor on rounding errors at a configuration (nq,): its largest scaled dimension."""
@@ -88,24 +103,10 @@ class ContinuationDiagnosis:
     def _out_of_reach_error(
         self, target: Array, last_reached: ClosedConfiguration, sample: str
     ) -> OutOfReachError:
-        from scipy.optimize import least_squares  # slow to import
-
         q = last_reached.q.copy()
         q[self._active_columns] = target
-
-        def evaluate(passive: Array) -> tuple[Array, Array]:
-            moved = self._equations.displace(q, self._passive_columns, passive)
-            phi, jacobian = self._equations.evaluate_scaled(moved)
-            return phi, jacobian[:, self._passive_columns]
-
-        def residual(passive: Array) -> Array:
-            return evaluate(passive)[0]
-
-        def jacobian(passive: Array) -> Array:
-            return evaluate(passive)[1]
-
-        start = np.zeros(len(self._passive_columns))
-        phi = evaluate(least_squares(residual, start, jacobian, xtol=1e-12).x)[0]
+        evaluate, passive = self._equations.evaluate_scaled, self._passive_columns
+        phi = evaluate(closest_approach(self._equations, q, passive, evaluate, xtol=1e-12))[0]
         worst = int(np.abs(phi).argmax())
         place, last = self._format_values(target), self._format_values(last_reached.q_a)
         if np.abs(phi[worst]) < 10 * CLOSED_TOLERANCE * self.rounding_scale(q):

@@ -29,6 +29,8 @@ class Coordinates:
         joints: (nv,) index of Pinocchio's joint of each coordinate.
         floating_base_columns: First column of each floating base.
         rotation_columns: First column of each rotation vector.
+        is_translation: (nv,) whether a coordinate is a length.
+        is_rotation_vector: (nv,) whether a coordinate is a component of a rotation vector.
         parents: (nv + 1,) parent bodies, where coordinate i moves body i + 1; the coordinates of a
             ball joint or floating base are a series; 0 is the world.
         body_of_joint: Body of each joint of Pinocchio's model in this numbering.
@@ -41,18 +43,24 @@ class Coordinates:
         self.rotation_columns: tuple[int, ...] = ()
         joint_of_coordinate: list[int] = []
         configuration_indices: list[int] = []  # in Pinocchio's q; of quaternions the vector part
+        kinds: list[str] = []  # "slide" and "turn" of single joints, "x" to "rz" of others
         for i in range(1, model.njoints):
             joint, name = model.joints[i], model.names[i]
             if joint.shortname() == FREE_FLYER:
                 self.floating_base_columns += (joint.idx_v,)
             if joint.shortname() in (FREE_FLYER, BALL):
                 self.rotation_columns += (joint.idx_v + joint.nv - 3,)
-                parts = ("x", "y", "z", "rx", "ry", "rz")[-joint.nv :]
+                parts = ["x", "y", "z", "rx", "ry", "rz"][-joint.nv :]
                 self.names += tuple(f"{name}_{part}" for part in parts)
             else:
+                parts = ["slide" if joint.shortname().startswith("JointModelP") else "turn"]
                 self.names += (name,)
+            kinds += parts
             joint_of_coordinate += [i] * joint.nv
             configuration_indices += range(joint.idx_q, joint.idx_q + joint.nv)
+        self.is_translation = np.isin(kinds, ("slide", "x", "y", "z"))
+        self.is_rotation_vector = np.isin(kinds, ("rx", "ry", "rz"))
+        self._is_composite = ~np.isin(kinds, ("slide", "turn"))
         self.joints = np.array(joint_of_coordinate, dtype=np.intp)
         last = {0: 0} | {joint: i + 1 for i, joint in enumerate(joint_of_coordinate)}
         self.body_of_joint: tuple[int, ...] = tuple(last[joint] for joint in range(model.njoints))
@@ -73,12 +81,6 @@ class Coordinates:
             raise InputError(f"joint '{name}' is unknown, {suggest_names(self.names, name)}")
         return self._columns_by_name[name]
 
-    @property
-    def ball_joint_columns(self) -> tuple[int, ...]:
-        """First column of each ball joint."""
-        floating = {column + 3 for column in self.floating_base_columns}
-        return tuple(column for column in self.rotation_columns if column not in floating)
-
     @cached_property
     def lower(self) -> Array:
         """(nv,) lower limits [m], [rad]."""
@@ -88,25 +90,6 @@ class Coordinates:
     def upper(self) -> Array:
         """(nv,) upper limits [m], [rad]."""
         return self._coordinate_limits(self.model.upperPositionLimit, np.inf)
-
-    @cached_property
-    def is_translation(self) -> NDArray[np.bool_]:
-        """(nv,) whether a coordinate is a length."""
-        found = np.zeros(len(self.names), dtype=bool)
-        for i in range(1, self.model.njoints):
-            joint = self.model.joints[i]
-            if joint.shortname() == FREE_FLYER:
-                found[joint.idx_v : joint.idx_v + 3] = True
-            found[joint.idx_v] |= joint.shortname().startswith("JointModelP")
-        return found
-
-    @cached_property
-    def is_rotation_vector(self) -> NDArray[np.bool_]:
-        """(nv,) whether a coordinate is a component of a rotation vector."""
-        found = np.zeros(len(self.names), dtype=bool)
-        for column in self.rotation_columns:
-            found[column : column + 3] = True
-        return found
 
     @cached_property
     def characteristic_length(self) -> float:
@@ -191,17 +174,19 @@ class Coordinates:
             q: (nv,).
             columns: Columns that may change; all by default.
         """
-        if not self.rotation_columns:
-            return q
-        out = q.copy()
-        for column in self.rotation_columns:
-            if columns is not None and not np.isin(range(column, column + 3), columns).all():
-                continue
-            r = out[column : column + 3]
-            length = float(np.linalg.norm(r))
-            if length > np.pi:
-                r *= 1 - 2 * np.pi * np.round(length / (2 * np.pi)) / length
-        return out
+        return self.unwrap_rotations(q, np.zeros(len(q)), columns)
+
+    def scaled_distances(self, first: Array, second: Array) -> Array:
+        """(nv,) distances of two configurations by coordinate, full revolutions ignored."""
+        off = (first - second) / self.units
+        turned = np.remainder(off + np.pi, 2 * np.pi) - np.pi
+        return np.abs(np.where(self.is_translation, off, turned))
+
+    def within_limits(self, q: Array, tolerance: float) -> NDArray[np.bool_]:
+        """(nv,) whether coordinates are within their limits, up to a scaled tolerance."""
+        slack = tolerance * self.units
+        inside: NDArray[np.bool_] = (q >= self.lower - slack) & (q <= self.upper + slack)
+        return inside
 
     def cardan_angles(self, q: Array) -> tuple[Array, Array]:
         """Coordinates (nv,) with Cardan angles R = R_x R_y R_z in place of rotation vectors.
@@ -213,15 +198,10 @@ class Coordinates:
         out, rates = q.copy(), np.eye(len(q))
         for column in self.rotation_columns:
             rotation = slice(column, column + 3)
-            first, second, third = out[rotation] = cardan_angles(pin.exp3(q[rotation]))
-            s, c = np.sin(third), np.cos(third)
-            # columns: axes of the three angles in the axes of the child
-            axes = [
-                [c * np.cos(second), s, 0],
-                [-s * np.cos(second), c, 0],
-                [np.sin(second), 0, 1],
-            ]
-            rates[rotation, rotation] = np.linalg.pinv(axes)
+            out[rotation] = angles = cardan_angles(pin.exp3(q[rotation]))
+            # roll, pitch and yaw of the inverse rotation are the same angles, negative
+            inverse_rates = pin.rpy.computeRpyJacobian(-np.array(angles), pin.WORLD)
+            rates[rotation, rotation] = np.linalg.pinv(inverse_rates)
         return out, rates
 
     def has_partial_rotations(self, columns: Indices) -> bool:
@@ -231,10 +211,18 @@ class Coordinates:
             for column in self.rotation_columns
         )
 
-    def unwrap_rotations(self, q: Array, nearby: Array) -> Array:
-        """The same configuration (nv,) with the rotation vectors nearest to those of another."""
+    def unwrap_rotations(self, q: Array, nearby: Array, columns: Indices | None = None) -> Array:
+        """The same configuration (nv,) with the rotation vectors nearest to those of another.
+
+        Args:
+            q: (nv,).
+            nearby: (nv,).
+            columns: Columns that may change; all by default.
+        """
         out = q.copy()
         for column in self.rotation_columns:
+            if columns is not None and not np.isin(range(column, column + 3), columns).all():
+                continue
             r, other = out[column : column + 3], nearby[column : column + 3]
             length = float(np.linalg.norm(r))
             axis = r if length else other
@@ -243,18 +231,11 @@ class Coordinates:
         return out
 
     def _coordinate_limits(self, joint_limits: Array, unlimited: float) -> Array:
-        out = np.asarray(joint_limits, dtype=np.float64)[self._configuration_indices].copy()
-        for column in self.floating_base_columns:
-            out[column : column + 3] = unlimited
-        for column in self.rotation_columns:
-            out[column : column + 3] = unlimited
-        return out
+        limits = np.asarray(joint_limits, dtype=np.float64)[self._configuration_indices]
+        return np.where(self._is_composite, unlimited, limits)
 
 
 def cardan_angles(rotation: Array) -> tuple[float, float, float]:
     """Angles a, b, c with rotation = R_x(a) R_y(b) R_z(c), of any rotation matrix (3, 3)."""
-    first = np.arctan2(-rotation[1, 2], rotation[2, 2])
-    sine, cosine = np.sin(first), np.cos(first)
-    second = np.arctan2(rotation[0, 2], cosine * rotation[2, 2] - sine * rotation[1, 2])
-    x, y = cosine * rotation[1, :2] + sine * rotation[2, :2]
-    return float(first), float(second), float(np.arctan2(x, y))
+    first, second, third = (-pin.rpy.matrixToRpy(rotation.T)).tolist()
+    return first, second, third

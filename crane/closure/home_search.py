@@ -203,9 +203,7 @@ def find_cached_home(
 
 def within_limits(equations: LoopEquations, q: Array) -> NDArray[np.bool_]:
     """(nv,) whether joints of a configuration (nq,) are within their limits, up to rounding."""
-    coordinates, slack = equations.coordinates, CLOSED_TOLERANCE * equations.coordinate_units
-    inside: NDArray[np.bool_] = (q >= coordinates.lower - slack) & (q <= coordinates.upper + slack)
-    return inside
+    return equations.coordinates.within_limits(q, CLOSED_TOLERANCE)
 
 
 def _home_problem(

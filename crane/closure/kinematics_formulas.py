@@ -5,14 +5,18 @@ at zero, see `crane.description.rotation_vectors`.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
 
-from crane.closure.loop_equations import LoopEquations, rotation_with_z_axis
+from crane.closure.loop_equations import (
+    LoopEquations,
+    rotation_with_z_axis,
+    supporting_bodies,
+)
 from crane.codegen.symbolic import (
     Scalar,
     Tape,
@@ -25,6 +29,7 @@ from crane.codegen.symbolic import (
     max_abs,
     maximum,
     scale_vector,
+    solve_linear_system,
     subtract_vectors,
     transpose,
     where_positive,
@@ -139,6 +144,35 @@ def coordinate_rates(
     return out
 
 
+def adjust_motion(
+    geometry: "TreeGeometry",
+    q: Sequence[Scalar],
+    motion: Sequence[Scalar],
+    columns: Sequence[Sequence[Scalar]],
+    steps: Mapping[int, Scalar],
+) -> list[Scalar]:
+    """Add columns of gamma to a motion of the joints so that coordinates change as required.
+
+    Active coordinates that are parts of rotation vectors change by more than the motions of their
+    own joints.
+
+    Args:
+        geometry: Geometry of the machine.
+        q: (nb,).
+        motion: (nb,).
+        columns: (k, nb) columns of gamma.
+        steps: Changes of k coordinates, by joint.
+    """
+    steps_of_motion = coordinate_rates(geometry, q, motion)
+    rates = [coordinate_rates(geometry, q, column) for column in columns]
+    factors, _ = solve_linear_system(
+        [[rate[joint - 1] for rate in rates] for joint in steps],
+        [[step - steps_of_motion[joint - 1]] for joint, step in steps.items()],
+    )
+    additions = (scale_vector(x, column) for (x,), column in zip(factors, columns, strict=True))
+    return add_vectors(motion, *additions)
+
+
 def wrap_rotation_vector(vector: Sequence[Scalar]) -> list[Scalar]:
     """The same rotation with a vector of length pi or less, from one shorter than 2 pi."""
     length = _regularized_norm(vector)
@@ -167,7 +201,7 @@ class TreeGeometry:
         parents: (nb + 1,) parent bodies.
         is_revolute: (nb + 1,) whether the joint is revolute.
         floating_bases: First body of each floating base.
-        ball_joints: First body of each ball joint.
+        rotation_bodies: First of the three bodies of each rotation vector.
         body_rotations: (nb + 1, 3, 3) from the axes of the body here to those of Pinocchio's
             joint.
         constants: (12 (nb + frames) + 1,) rotation and origin of every joint frame in its parent
@@ -178,7 +212,7 @@ class TreeGeometry:
     parents: tuple[int, ...]
     is_revolute: tuple[bool, ...]
     floating_bases: tuple[int, ...]
-    ball_joints: tuple[int, ...]
+    rotation_bodies: tuple[int, ...]
     body_rotations: Array
     constants: Array
     frame_bodies: tuple[int, ...]
@@ -197,14 +231,9 @@ class TreeGeometry:
     @cached_property
     def series_of_body(self) -> dict[int, tuple[int, ...]]:
         """The bodies of the series of each body of a ball joint or floating base."""
-        series = [tuple(range(i, i + 6)) for i in self.floating_bases]
-        series += [tuple(range(i, i + 3)) for i in self.ball_joints]
+        series = [tuple(range(i, i + 3)) for i in self.rotation_bodies]
+        series += [tuple(range(i, i + 6)) for i in self.floating_bases]  # instead of their last 3
         return {i: bodies for bodies in series for i in bodies}
-
-    @property
-    def rotation_bodies(self) -> list[int]:
-        """First of the three bodies of each rotation vector."""
-        return [*(i + 3 for i in self.floating_bases), *self.ball_joints]
 
     @property
     def massless_bodies(self) -> frozenset[int]:
@@ -213,11 +242,13 @@ class TreeGeometry:
 
     def supporting_bodies(self, body: int) -> list[int]:
         """A body and the bodies that carry it, except the world."""
-        found = []
-        while body:
-            found.append(body)
-            body = self.parents[body]
-        return found
+        return supporting_bodies(self.parents, body)
+
+    def partly_active_joints(self, active_joints: Collection[int]) -> list[int]:
+        """Active joints of rotation vectors of which only some are active."""
+        vectors = [{body, body + 1, body + 2} for body in self.rotation_bodies]
+        parts = [sorted(vector.intersection(active_joints)) for vector in vectors]
+        return [joint for part in parts if len(part) < 3 for joint in part]
 
 
 def tree_geometry(equations: LoopEquations) -> TreeGeometry:
@@ -253,7 +284,7 @@ def tree_geometry(equations: LoopEquations) -> TreeGeometry:
         parents,
         tuple(revolute),
         tuple(column + 1 for column in coordinates.floating_base_columns),
-        tuple(column + 1 for column in coordinates.ball_joint_columns),
+        tuple(column + 1 for column in coordinates.rotation_columns),
         np.array([turn.rotation for turn in rotations]),
         np.concatenate([*numbers, [1.0 / equations.characteristic_length]]),
         tuple(body_of_joint[body] for body, _ in frames),
@@ -372,7 +403,7 @@ class PositionKinematics:
             )
         rotation = matmul(self.rotation[parent], turn)
         arm = matvec(self.rotation[parent], place)
-        if i in self.geometry.ball_joints:
+        if i in self.geometry.rotation_bodies:
             return matmul(rotation, rotation_matrix(self.q[i - 1 : i + 2])), arm
         if self.geometry.is_revolute[i]:
             c, s = apply_function("cos", q), apply_function("sin", q)

@@ -179,8 +179,7 @@ class LoopEquations:
         involved = np.vstack([self.sign, self.is_coupled])[:, columns] != 0
         group = np.arange(len(columns), dtype=np.intp)
         for row in involved:
-            connected = np.isin(group, group[row])
-            group[connected] = group[connected].min(initial=len(group))
+            _merge_groups(group, np.flatnonzero(row))
         group = np.unique(group, return_inverse=True)[1]
         return group, np.array(
             [int(group[tie][0]) if tie.any() else -1 for tie in involved], dtype=np.intp
@@ -217,6 +216,13 @@ class LoopEquations:
         except AttributeError:
             self._thread_local.data = self.model.createData()
             return self._thread_local.data
+
+    def _frame_placements(self) -> tuple[Array, Array]:
+        """Rotations (2 l, 3, 3) and origins (2 l, 3) of `frames` in the world, from the data."""
+        data = self.data
+        placements = [data.oMi[joint] * local for joint, local in self.frames]
+        rotations = np.array([placement.rotation for placement in placements])
+        return rotations, np.array([placement.translation for placement in placements])
 
     def _row_geometry(self, rotations: Array, origins: Array) -> tuple[Array, Array, Array, Array]:
         """For every row: axis of frame 1, axis of frame 2, origins of both, each (..., m, 3).
@@ -281,10 +287,7 @@ class LoopEquations:
         data, configuration = self.data, self.coordinates.configuration(q)
         # a vector for a single joint
         jacobian = pin.computeJointJacobians(self.model, data, configuration).reshape(6, -1)
-        placements = [data.oMi[joint] * local for joint, local in self.frames]
-        rotations = np.array([placement.rotation for placement in placements])
-        origins = np.array([placement.translation for placement in placements])
-        self._thread_local.last = a, b, p1, p2 = self._row_geometry(rotations, origins)
+        self._thread_local.last = a, b, p1, p2 = self._row_geometry(*self._frame_placements())
         phi = np.einsum("ij,ij->i", a, np.where(self._is_loop_translation[:, None], p2 - p1, b))
         loop_jacobian = self._row_joint_signs * (self._assemble_wrenches(a, b, p2) @ jacobian)
         if not self.couplings:
@@ -331,15 +334,10 @@ class LoopEquations:
         if not self.loops:
             return None
         pin.forwardKinematics(self.model, self.data, self.coordinates.configuration(q))
-        for index, loop in enumerate(self.loops):
-            aligned = aligned_axes(loop.type)
-            if not aligned:
-                continue
-            (j1, local1), (j2, local2) = self.frames[2 * index : 2 * index + 2]
-            turn1 = (self.data.oMi[j1] * local1).rotation
-            turn2 = (self.data.oMi[j2] * local2).rotation
-            cosines = np.einsum("ik,ik->k", turn1, turn2)
-            if any(cosines[k] < 0 for k in aligned):
+        rotations, _ = self._frame_placements()
+        cosines = np.einsum("lik,lik->lk", rotations[::2], rotations[1::2])
+        for loop, cosines_of_loop in zip(self.loops, cosines, strict=True):
+            if (cosines_of_loop[aligned_axes(loop.type)] < 0).any():
                 return loop.name
         return None
 
@@ -403,32 +401,30 @@ def find_clusters(equations: LoopEquations) -> list[Cluster]:
     Joints on the path between joints that one equation ties together belong to the cluster, too.
     """
     parents = equations.coordinates.parents
-    representative = list(range(len(parents)))
-
-    def root_of(i: int) -> int:
-        while representative[i] != i:
-            i = representative[i]
-        return i
-
+    group = np.arange(len(parents), dtype=np.intp)
     for row in (*equations.sign, *equations.is_coupled):
         tied = (np.flatnonzero(row) + 1).tolist()
         if not tied:
             continue
-        paths = [_path_to_world(parents, parents[joint]) for joint in tied]
-        first, *rest = sorted({*tied, *set().union(*paths)} - paths[0].intersection(*paths[1:]))
-        for joint in rest:
-            one, two = sorted((root_of(first), root_of(joint)))
-            representative[two] = one
+        paths = [{0, *supporting_bodies(parents, parents[joint])} for joint in tied]
+        between = set().union(*paths) - paths[0].intersection(*paths[1:])
+        _merge_groups(group, np.array([*tied, *between], dtype=np.intp))
     members: dict[int, list[int]] = {}
     for i in range(1, len(parents)):
-        members.setdefault(root_of(i), []).append(i)
+        members.setdefault(int(group[i]), []).append(i)
     return [Cluster(parents[joints[0]], tuple(joints)) for joints in members.values()]
 
 
-def _path_to_world(parents: Sequence[int], body: int) -> set[int]:
-    """A body and all bodies that carry it, and the world."""
-    path = {0}
+def _merge_groups(group: Indices, members: Indices) -> None:
+    """Give members, and all others in their groups, the least group index of these."""
+    connected = np.isin(group, group[members])
+    group[connected] = group[connected].min(initial=len(group))
+
+
+def supporting_bodies(parents: Sequence[int], body: int) -> list[int]:
+    """A body and the bodies that carry it, except the world."""
+    found = []
     while body:
-        path.add(body)
+        found.append(body)
         body = parents[body]
-    return path
+    return found

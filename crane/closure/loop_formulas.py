@@ -13,6 +13,7 @@ from crane.closure.kinematics_formulas import (
     PositionKinematics,
     SpatialVector,
     Vector,
+    adjust_motion,
     coordinate_rates,
     largest_scaled_value,
     spatial_dot,
@@ -244,55 +245,26 @@ class LoopFormulas:
         x, _ = self.solve_passive(
             {joint: [0.0] for joint in self.active_joints}, [[-gap] for gap in gaps]
         )
-        motion = {joint: row[0] for joint, row in x.items()}
-        steps = self.coordinate_steps(motion)
-        held = self.partly_active_joints
+        held = self._kinematics.geometry.partly_active_joints(self.active_joints)
         if held and holds_coordinates:
-            motions = self.motions_of_coordinates(held, [-1.0 * steps[joint] for joint in held])
-            steps = self.coordinate_steps(
-                {joint: value + motions[joint] for joint, value in motion.items()}
+            geometry, q, joints = self._kinematics.geometry, self._kinematics.q, sorted(x)
+            motion = adjust_motion(
+                geometry,
+                q,
+                [x[i][0] for i in joints],
+                [[self.gamma[i][self.active_joints.index(k)] for i in joints] for k in held],
+                dict.fromkeys(held, 0.0),
             )
+            x = {i: [value] for i, value in zip(joints, motion, strict=True)}
+        steps = self.coordinate_steps({joint: row[0] for joint, row in x.items()})
         moved = self.passive_joints if holds_coordinates else [*self.passive_joints, *held]
         return {joint: steps[joint] for joint in moved}
-
-    @cached_property
-    def partly_active_joints(self) -> list[int]:
-        """Active joints of rotation vectors of which only some are active."""
-        return [
-            joint
-            for body in self._kinematics.geometry.rotation_bodies
-            if not {body, body + 1, body + 2} <= set(self.active_joints)
-            for joint in range(body, body + 3)
-            if joint in self.active_joints
-        ]
 
     def coordinate_steps(self, motion: dict[int, Scalar]) -> dict[int, Scalar]:
         """Steps of the coordinates along a small motion of the joints, by joint."""
         geometry, q = self._kinematics.geometry, self._kinematics.q
         rates = coordinate_rates(geometry, q, [motion[i] for i in range(1, len(q) + 1)])
         return dict(enumerate(rates, start=1))
-
-    def motions_of_coordinates(
-        self, joints: Sequence[int], steps: Sequence[Scalar]
-    ) -> dict[int, Scalar]:
-        """Motion of all joints along gamma by which coordinates of active joints change.
-
-        Args:
-            joints: Active joints of rotation vectors; the other active joints do not move.
-            steps: Steps of their coordinates.
-        """
-        columns = []
-        for joint in joints:
-            k = self.active_joints.index(joint)
-            columns.append({i: row[k] for i, row in self.gamma.items()})
-        rates = [self.coordinate_steps(column) for column in columns]
-        shares, _ = solve_linear_system(
-            [[rate[joint] for rate in rates] for joint in joints], [[step] for step in steps]
-        )
-        return {
-            i: dot([share[0] for share in shares], [column[i] for column in columns])
-            for i in self.gamma
-        }
 
     def largest_residual(self, redundant: bool = False) -> Scalar:
         """The largest absolute scaled residual of the independent or redundant equations."""

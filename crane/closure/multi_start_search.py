@@ -60,6 +60,42 @@ def damped_step(
     return np.asarray(step * min(1.0, max_step / max(np.abs(step).max(initial=0.0), 1e-300)))
 
 
+def closest_approach(
+    equations: LoopEquations,
+    q: Array,
+    columns: Indices,
+    evaluate: Callable[[Array], tuple[Array, ...]],
+    xtol: float = 1e-8,
+    max_nfev: int | None = None,
+) -> Array:
+    """The configuration (nq,) of least squared residuals near q, where loops need not close.
+
+    Args:
+        equations: The loops.
+        q: (nq,) configuration to start from.
+        columns: (k,) columns that may move.
+        evaluate: Scaled residuals (m,) at a configuration, their Jacobian (m, nv), and more.
+        xtol: See `scipy.optimize.least_squares`.
+        max_nfev: See `scipy.optimize.least_squares`.
+    """
+    from scipy.optimize import least_squares  # slow to import, only needed for open loops
+
+    if not len(columns):
+        return q
+
+    def moved(x: Array) -> Array:
+        return equations.displace(q, columns, x)
+
+    def residual(x: Array) -> Array:
+        return evaluate(moved(x))[0]
+
+    def jacobian(x: Array) -> Array:
+        return evaluate(moved(x))[1][:, columns]
+
+    start = np.zeros(len(columns))
+    return moved(least_squares(residual, start, jacobian, xtol=xtol, max_nfev=max_nfev).x)
+
+
 def low_discrepancy_steps(count: int) -> Array:
     """Steps (count,) of a low-discrepancy sequence of points: multiples of them modulo 1.
 
@@ -239,10 +275,7 @@ class MultiStartSearch:
         for without_limits in (unlimited, movable):
             q, residual = self.minimize_residual(start, movable, without_limits)
             limited = np.setdiff1d(movable, unlimited)
-            slack = _RESIDUAL_TOLERANCE * self._coordinate_units
-            within_limits = (q >= self._coordinates.lower - slack) & (
-                q <= self._coordinates.upper + slack
-            )
+            within_limits = self._coordinates.within_limits(q, _RESIDUAL_TOLERANCE)
             if residual <= tolerance and within_limits[limited].all():
                 return q
             if not np.isfinite(
@@ -275,14 +308,7 @@ class MultiStartSearch:
         joints = self.specified[self._in_loops[self.specified]]
         if not len(joints):
             return 0, 0.0
-        off = (q - self.initial_guess) / self._coordinate_units
-        differences = np.abs(
-            np.where(
-                ~self._coordinates.is_translation,
-                np.remainder(off + np.pi, 2 * np.pi) - np.pi,
-                off,
-            )
-        )[joints]
+        differences = self._coordinates.scaled_distances(q, self.initial_guess)[joints]
         return int(joints[differences.argmax()]), float(differences.max())
 
     def largest_deviation(self, q: Array) -> tuple[int, float]:
@@ -363,8 +389,7 @@ class MultiStartSearch:
                 break
             q, residual, jacobian = accepted
             slow_iterations += int(residual @ residual > _SLOW_PROGRESS_RATIO * cost)
-        periodic = self._periodic.copy()
-        periodic[np.setdiff1d(np.arange(len(q)), movable)] = False
+        periodic = self._periodic & np.isin(np.arange(len(q)), movable)
         q = remove_revolutions(
             q, self.initial_guess, periodic, self._coordinates.lower, self._coordinates.upper
         )

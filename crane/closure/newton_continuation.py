@@ -59,16 +59,12 @@ class NewtonContinuation(ContinuationDiagnosis):
         passive: Indices,
         ranges: Array,
     ):
-        self._equations, self._structure = equations, structure
-        self._active_columns, self._passive_columns, self._active_ranges = active, passive, ranges
+        super().__init__(equations, structure, active, passive)
+        self._active_ranges, units = ranges, equations.coordinate_units
         self._blocks = structure.blocks_by_size()
-        units = self._coordinate_units = equations.coordinate_units
         self._all_columns = np.arange(equations.model.nv)
         self._has_partly_active_rotations = equations.coordinates.has_partial_rotations(active)
         self._gamma_units = units[passive, None] / units[active]
-        model = equations.model
-        places = [*model.jointPlacements, *(frame.placement for frame in model.frames)]
-        self._largest_dimension = max(float(np.abs(place.translation).max()) for place in places)
         home = self.solve_newton(structure.home, structure.home[active], 30)
         if home is None:
             raise MechanismError("the home configuration does not close, change 'home'", "home")
@@ -90,11 +86,7 @@ class NewtonContinuation(ContinuationDiagnosis):
             q[self._active_columns] = q_a
         rounding_scale, previous_residual = self.rounding_scale(q), np.inf
         for _ in range(max_iterations):
-            phi, jacobian = self._equations.evaluate_scaled(q)
-            phi, jacobian = (
-                phi[self._structure.independent_rows],
-                jacobian[self._structure.independent_rows],
-            )
+            phi, jacobian = self._evaluate_rows(q)
             residual = np.abs(phi).max(initial=0.0)
             at_rounding = residual <= 4e-15 * rounding_scale
             stalled = (
@@ -191,21 +183,24 @@ class NewtonContinuation(ContinuationDiagnosis):
 
     def gamma(self, q: Array) -> Array:
         """Derivative (nv, n) of f at a closed configuration (nq,); see `Closure.gamma`."""
-        return self._insert_passive_gamma(self._scaled_jacobian(q), q)
+        return self._insert_passive_gamma(self._evaluate_rows(q)[1], q)
 
     def drift(self, q: Array, v: Array) -> Array:
         """Accelerations (nv,) at a_A = 0; see `Closure.drift`."""
-        return self._drift(self._scaled_jacobian(q), q, v)
+        return self._drift(self._evaluate_rows(q)[1], q, v)
 
     def gamma_velocity_drift(self, q: Array, v_a: Array) -> tuple[Array, Array, Array]:
         """gamma, v = gamma v_A and drift; see `Closure.gamma_velocity_drift`."""
-        jacobian = self._scaled_jacobian(q)
+        jacobian = self._evaluate_rows(q)[1]
         gamma = self._insert_passive_gamma(jacobian, q)
         v = gamma @ v_a
         return gamma, v, self._drift(jacobian, q, v)
 
-    def _scaled_jacobian(self, q: Array) -> Array:
-        return self._equations.evaluate_scaled(q)[1][self._structure.independent_rows]
+    def _evaluate_rows(self, q: Array) -> tuple[Array, Array]:
+        """Scaled residuals and Jacobian of the independent equations."""
+        phi, jacobian = self._equations.evaluate_scaled(q)
+        rows = self._structure.independent_rows
+        return phi[rows], jacobian[rows]
 
     def _insert_passive_gamma(self, jacobian: Array, q: Array) -> Array:
         active, passive = self._active_columns, self._passive_columns
@@ -318,9 +313,8 @@ class NewtonContinuation(ContinuationDiagnosis):
         if corrected is None:
             return None
         correction = np.abs((corrected.q - predicted)[passive] / units[passive]).max(initial=0.0)
-        if correction > 0.02 + 0.5 * predicted_step:
-            return None
-        if not self._continues(current, corrected, float(correction)):
+        is_near = correction <= 0.02 + 0.5 * predicted_step
+        if not is_near or not self._continues(current, corrected, float(correction)):
             return None
         q = self._equations.coordinates.wrap_rotations(corrected.q, self._passive_columns)
         return replace(corrected, q=q)
@@ -345,9 +339,6 @@ class NewtonContinuation(ContinuationDiagnosis):
         largest = np.abs(solution.passive_gamma / self._gamma_units).max(initial=0.0)
         return bool(largest < 1e-3 / SINGULAR_TOLERANCE)
 
-    def _residual(self, q: Array) -> Array:
-        return self._equations.evaluate_scaled(q)[0][self._structure.independent_rows]
-
     def _slope(self, at: ClosedConfiguration, active_rate: Array) -> Array:
         """Derivative (nq,) of the configuration along a rate (n,) of the active coordinates."""
         rate = active_rate / self._coordinate_units[self._active_columns]
@@ -360,7 +351,9 @@ class NewtonContinuation(ContinuationDiagnosis):
         distance = np.abs((other.q - one.q) / self._coordinate_units).max()
         before, behind = ((x.q, self._slope(x, step)) for x in (one, other))
         # sides of a dead centre are on one smooth motion, too, if they are near enough
-        if distance < _MIN_PASSAGE or not is_smooth_passage(before, behind, self._residual):
+        if distance < _MIN_PASSAGE or not is_smooth_passage(
+            before, behind, lambda q: self._evaluate_rows(q)[0]
+        ):
             return False
         if not self._has_warned:
             self._has_warned = True
@@ -382,7 +375,9 @@ class NewtonContinuation(ContinuationDiagnosis):
             found = self.continue_to(solution.q_a, self.home)
         except ClosureError:
             return False
-        return bool(np.abs((found.q - solution.q) / self._coordinate_units).max() < 1e-6)
+        # equal rotations may have several rotation vectors
+        q = self._equations.coordinates.unwrap_rotations(found.q, solution.q)
+        return bool(np.abs((q - solution.q) / self._coordinate_units).max() < 1e-6)
 
     def _interpolate_at(
         self, current: ClosedConfiguration, target: Array
@@ -405,10 +400,11 @@ class NewtonContinuation(ContinuationDiagnosis):
             nodes.append(node)
         q = NEIGHBOUR_WEIGHTS @ np.array([node.q for node in nodes])
         q[self._active_columns] = target
-        if np.abs(self._residual(q)).max() > 10 * CLOSED_TOLERANCE * self.rounding_scale(q):
+        phi, jacobian = self._evaluate_rows(q)
+        if np.abs(phi).max() > 10 * CLOSED_TOLERANCE * self.rounding_scale(q):
             return None
         gamma = np.tensordot(NEIGHBOUR_WEIGHTS, [node.passive_gamma for node in nodes], 1)
-        return ClosedConfiguration(q, target, self._scaled_jacobian(q), gamma, tuple(nodes))
+        return ClosedConfiguration(q, target, jacobian, gamma, tuple(nodes))
 
     def _check_solution(self, solution: ClosedConfiguration, sample: str) -> None:
         """Raise unless every equation holds and the passive joints are determined."""

@@ -1,18 +1,19 @@
 """Predictor of the continuation of closed configurations as symbolic formulas."""
 
-from collections.abc import Mapping, Sequence
-from functools import cached_property
+from collections.abc import Sequence
 
 from crane.closure.coordinates import Indices
 from crane.closure.kinematics_formulas import (
     FormulaConstants,
     TreeGeometry,
+    Vector,
+    adjust_motion,
     coordinate_rates,
     largest_scaled_value,
     wrap_rotation_vector,
 )
 from crane.codegen import Program, Scalar, Tape
-from crane.codegen.symbolic import add_vectors, solve_linear_system, sum_scalars
+from crane.codegen.symbolic import add_vectors, matvec, transpose
 
 
 class PredictorFormulas:
@@ -36,22 +37,26 @@ class PredictorFormulas:
         self._active_columns, self._passive_columns = active, passive
         self._nq, self._n = len(geometry.parents) - 1, len(active)
 
-    @cached_property
-    def _active_rotations(self) -> list[tuple[range, list[int]]]:
-        """Columns of each rotation vector, and the active ones of them."""
-        vectors = [range(body - 1, body + 2) for body in self._geometry.rotation_bodies]
-        active = set(self._active_columns.tolist())
-        return [(columns, [i for i in columns if i in active]) for columns in vectors]
-
     @property
     def wraps_rotations(self) -> bool:
         """Whether there are passive rotation vectors, whose length solutions limit to pi."""
-        return any(not part for _, part in self._active_rotations)
+        return bool(self._passive_rotations)
 
-    @cached_property
-    def has_partly_active_rotations(self) -> bool:
-        """Whether some but not all components of a rotation vector are active."""
-        return any(part and len(part) < len(parts) for parts, part in self._active_rotations)
+    @property
+    def _passive_rotations(self) -> list[slice]:
+        """Columns of each passive rotation vector."""
+        active = set(self._active_columns.tolist())
+        first = (body - 1 for body in self._geometry.rotation_bodies)
+        return [slice(i, i + 3) for i in first if active.isdisjoint(range(i, i + 3))]
+
+    def gamma_rows(self, entries: Sequence[Scalar]) -> list[Vector]:
+        """Gamma (nq, n) from its nonzero entries."""
+        rows: list[Vector] = [[0.0] * self._n for _ in range(self._nq)]
+        for k, column in enumerate(self._active_columns):
+            rows[column][k] = 1.0
+        for (row, k), entry in zip(self._gamma_entry_pairs, entries, strict=True):
+            rows[self._passive_columns[row]][k] = entry
+        return rows
 
     def add_to(self, program: Program) -> None:
         """Add `predict`, `distance` and, with passive rotation vectors, `wrap`.
@@ -67,17 +72,13 @@ class PredictorFormulas:
         q, n = tape.load_vector(1, 0, self._nq), self._n
         target = tape.load_vector(2, 0, n)
         change = [target[k] - q[column] for k, column in enumerate(self._active_columns)]
-        gamma: dict[int, dict[int, Scalar]] = {}  # by column
-        for k, column in enumerate(self._active_columns):
-            gamma[int(column)] = {k: 1.0}
-        for i, (row, k) in enumerate(self._gamma_entry_pairs):
-            column = int(self._passive_columns[row])
-            gamma.setdefault(column, {})[k] = tape.load(1, self._nq + i)
-        change = self._active_motion(q, gamma, change)
-        motion: list[Scalar] = [0.0] * self._nq
-        for column, entries in gamma.items():
-            for k, entry in entries.items():
-                motion[column] = motion[column] + entry * change[k]
+        gamma = self.gamma_rows(tape.load_vector(1, self._nq, len(self._gamma_entry_pairs)))
+        motion = matvec(gamma, change)
+        turning = self._turning_joints(gamma)
+        if turning:
+            columns = transpose(gamma)
+            steps = {self._active_columns[k] + 1: change[k] for k in turning}
+            motion = adjust_motion(self._geometry, q, motion, [columns[k] for k in turning], steps)
         moves = [motion[column] for column in self._passive_columns]
         q = add_vectors(q, coordinate_rates(self._geometry, q, motion))
         for column, value in zip(self._active_columns, target, strict=True):
@@ -100,51 +101,16 @@ class PredictorFormulas:
         )
         if self.wraps_rotations:
             q = Tape().load_vector(0, 0, self._nq)
-            for columns, active in self._active_rotations:
-                part = slice(columns.start, columns.stop)
-                if not active:
-                    q[part] = wrap_rotation_vector(q[part])
+            for part in self._passive_rotations:
+                q[part] = wrap_rotation_vector(q[part])
             program.add_formula("wrap", 1, q)
 
-    def _active_motion(
-        self,
-        q: Sequence[Scalar],
-        gamma: Mapping[int, Mapping[int, Scalar]],
-        change: Sequence[Scalar],
-    ) -> list[Scalar]:
-        """Motion (n,) of the active joints along which their coordinates change.
-
-        It differs from the change of the coordinates for parts of rotation vectors in loops.
-
-        Args:
-            q: (nq,).
-            gamma: Entries by column and active joint.
-            change: (n,) change of the active coordinates.
-        """
-        rotations = {column for _, active in self._active_rotations for column in active}
-        turning = [
-            k
-            for k, column in enumerate(self._active_columns.tolist())
-            if column in rotations and sum(k in row for row in gamma.values()) > 1
-        ]
-        if not turning:
-            return list(change)
-        rates = []
-        for k in range(self._n):
-            column_of_gamma = [gamma.get(i, {}).get(k, 0.0) for i in range(self._nq)]
-            rates.append(coordinate_rates(self._geometry, q, column_of_gamma))
-        columns = self._active_columns.tolist()
-        right = []
-        for j in turning:
-            others = [rates[k][columns[j]] * change[k] for k in range(self._n) if k not in turning]
-            right.append([change[j] - sum_scalars(others)])
-        found, _ = solve_linear_system(
-            [[rates[k][columns[j]] for k in turning] for j in turning], right
-        )
-        out = list(change)
-        for k, (value,) in zip(turning, found, strict=True):
-            out[k] = value
-        return out
+    def _turning_joints(self, gamma: Sequence[Vector]) -> list[int]:
+        """Indices of active joints in rotation vectors that move other joints as well."""
+        turned = {i for body in self._geometry.rotation_bodies for i in range(body - 1, body + 2)}
+        moved = [sum(entry != 0.0 for entry in column) for column in zip(*gamma, strict=True)]
+        columns = enumerate(self._active_columns.tolist())
+        return [k for k, column in columns if column in turned and moved[k] > 1]
 
     def inverse_characteristic_length(self, tape: Tape) -> Scalar:
         """One over the characteristic length, from the geometry constants as first argument."""

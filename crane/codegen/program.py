@@ -4,24 +4,22 @@ A formula reads arrays and writes one, without branches; its operations come fro
 routine adds sequences, loops over samples, conditions and local arrays. `crane.codegen.llvm`
 translates both.
 
-    with program.add_routine("each", counts=("count",), arrays=("inputs", "out")) as r:
-        with r.loop(r.count) as i:
-            r.call("formula", r.inputs.row_pointer(i, 3), r.out.row_pointer(i, 2))
-        r.return_value(r.count)
+    with program.add_loop("each", arrays=("inputs", "out")) as (r, i):
+        r.call("formula", r.inputs.row_pointer(i, 3), r.out.row_pointer(i, 2))
 """
 
 import ctypes
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from ctypes import addressof, c_char
-from functools import partial
 from struct import pack
 from typing import Any
 
 import numpy as np
 
 from crane.codegen.llvm.machine_code import MachineCode
-from crane.codegen.llvm.routine_builder import Routine
+from crane.codegen.llvm.routine_builder import Routine, RoutineValue
+from crane.codegen.llvm.sample_function import SampleFunction, make_sample_function
 from crane.codegen.program_cache import FunctionSignature, ProgramRecord, cache_entry_name
 from crane.codegen.symbolic import Scalar, required_operations
 from crane.codegen.vector_layout import Formula, Layout
@@ -48,11 +46,13 @@ class Program:
     Attributes:
         functions: By name, in the order in which they were added; empty if loaded from the cache.
         max_formula_length: Number of operations of the longest formula.
+        dependent_programs: Programs that call its functions, by what they depend on.
     """
 
     def __init__(self) -> None:
         self.functions: dict[str, Formula | Routine] = {}
         self.max_formula_length = 0
+        self.dependent_programs: dict[tuple, Program] = {}
         self._signatures: dict[str, FunctionSignature] = {}
         self._machine_code: Any = None
 
@@ -135,6 +135,43 @@ class Program:
         self.functions[name] = routine
         self._signatures[name] = len(routine.argument_kinds), None
 
+    @contextmanager
+    def add_loop(
+        self,
+        name: str,
+        *,
+        functions: Sequence[str] = (),
+        arrays: Sequence[str] | Mapping[str, Layout | None],
+    ) -> Iterator[tuple[Routine, RoutineValue]]:
+        """Add a routine that repeats `count` times what is built in the context.
+
+        It returns `count`, or what the context returns. The context gets the index as well.
+        """
+        with self.add_routine(name, counts=("count",), functions=functions, arrays=arrays) as r:
+            with r.loop(r.count) as i:
+                yield r, i
+            r.return_value(r.count)
+
+    def add_formula_loop(
+        self, name: str, formula: str, row_lengths: Mapping[str, int | None]
+    ) -> None:
+        """Add a routine that evaluates a formula `count` times.
+
+        Args:
+            name: Its name.
+            formula: Name of the formula.
+            row_lengths: Length of the rows of each array; None: the same array each time.
+        """
+        with self.add_loop(name, arrays=tuple(row_lengths)) as (r, i):
+            arrays = {array: getattr(r, array) for array in row_lengths}
+            r.call(
+                formula,
+                *(
+                    arrays[array] if length is None else arrays[array].row_pointer(i, length)
+                    for array, length in row_lengths.items()
+                ),
+            )
+
     def formula_outputs(self, name: str) -> Layout:
         """Layout of the outputs of a formula."""
         _, layout = self._signatures[name]
@@ -164,17 +201,25 @@ class Program:
         )
         return result
 
-    def bind(self, name: str, *arguments: "int | np.ndarray") -> partial[int]:
-        """A function with its arguments bound, for many fast calls; see `call`.
+    def sample_function(
+        self, name: str, *arguments: "int | np.ndarray", inputs: Array, output: Array
+    ) -> SampleFunction:
+        """A function of one sample in machine code that Python calls directly.
 
-        Passing one pointer from Python is much faster than passing a dozen.
+        It takes up to k arrays (n,) and returns a new array of the shape of `output`; None where
+        an argument is not a float64 array (n,) of finite numbers, or the routine does not return
+        1. It holds the global interpreter lock; the routine must not call Python.
+
+        Args:
+            name: Name of the routine.
+            arguments: See `call`.
+            inputs: (k, n) that the routine reads, all or rows of it among the arguments.
+            output: Array among the arguments that the routine writes.
         """
-        addresses = np.frombuffer(
-            pack(f"{len(arguments)}q", *map(_argument_address, arguments)), dtype=np.int64
+        addresses = np.array([*map(_argument_address, arguments)], dtype=np.int64)
+        return make_sample_function(
+            self._entry_point(name, arguments), addresses, inputs, output, self, arguments
         )
-        bound = partial(self._entry_point(name, arguments), addresses.ctypes.data)
-        vars(bound)["references"] = self, addresses, arguments  # are kept alive
-        return bound
 
     def _entry_point(self, name: str, arguments: Sequence["int | np.ndarray"]) -> Any:
         expected, _ = self._signatures[name]

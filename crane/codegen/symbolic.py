@@ -249,7 +249,7 @@ def dot_products(vector: Sequence[Scalar], others: Sequence[Sequence[Scalar]]) -
 def solve_linear_system(
     matrix: Sequence[Sequence[Scalar]], right: Sequence[Sequence[Scalar]]
 ) -> tuple[list[list[Scalar]], Scalar]:
-    """Solve A X = B without branches: Cramer's rule to order 2, else Householder reflections.
+    """Solve A X = B without branches: Cramer's rule of order 2, else Householder reflections.
 
     Reflections need no pivoting.
 
@@ -261,9 +261,6 @@ def solve_linear_system(
         X (k, columns), and the determinant of A.
     """
     size = len(matrix)
-    if size == 1:
-        inverse = 1.0 / matrix[0][0]
-        return [[x * inverse for x in right[0]]], matrix[0][0]
     if size == 2:
         (a, b), (c, d) = matrix
         determinant = a * d - b * c
@@ -349,9 +346,7 @@ class LdltFactorization:
         self._unit_lower: Matrix = [[0.0] * size for _ in range(size)]
         self.inverse_diagonal: list[Scalar] = []
         for j in range(size):
-            scaled: list[Scalar] = []
-            for k in range(j):
-                scaled.append(matrix[j][k] - dot(scaled, self._unit_lower[k][:k]))
+            scaled = self.forward_substitute(matrix[j][:j])
             self._unit_lower[j][:j] = [
                 x * d for x, d in zip(scaled, self.inverse_diagonal, strict=True)
             ]
@@ -366,9 +361,9 @@ class LdltFactorization:
             )
 
     def forward_substitute(self, right: Sequence[Scalar]) -> list[Scalar]:
-        """L^-1 b."""
+        """L^-1 b; of the first entries of b the first of it."""
         x: list[Scalar] = []
-        for row, value in zip(self._unit_lower, right, strict=True):
+        for row, value in zip(self._unit_lower, right, strict=False):
             x.append(value - dot(row[: len(x)], x))
         return x
 

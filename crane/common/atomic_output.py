@@ -35,7 +35,7 @@ def replace_file(path: str | Path) -> Iterator[Path]:
             path.parent.mkdir(parents=True, exist_ok=True)
             os.replace(temporary_file, path)
     except OSError as error:
-        raise _cannot_be_written_error(path, error) from error
+        raise writing_error(path, error) from error
 
 
 @contextmanager
@@ -135,7 +135,7 @@ def _temporary_output_folder(
             except OutputError as error:
                 raise OutputError(str(error).replace(str(output_folder), str(folder))) from error
     except OSError as error:
-        raise _cannot_be_written_error(Path(folder), error) from error
+        raise writing_error(Path(folder), error) from error
 
 
 def check_file_is_writable(path: Path, overwrite: bool = True) -> None:
@@ -151,7 +151,7 @@ def check_file_is_writable(path: Path, overwrite: bool = True) -> None:
         if path.exists() and not path.is_file():
             raise OutputError(f"{path}: is no plain file, give another name")
     except OSError as error:  # a name that is too long, or a folder without permission
-        raise _cannot_be_written_error(path, error) from None
+        raise writing_error(path, error) from None
     _check_writable(path.parent)
     if path.exists() and not overwrite:
         raise OutputError(f"{path}: exists already, choose another name or add --force")
@@ -191,7 +191,7 @@ def _check_writable(folder: Path) -> None:
         existing = _nearest_existing(folder)
         is_folder = existing.is_dir()
     except OSError as error:
-        raise _cannot_be_written_error(folder, error) from None
+        raise writing_error(folder, error) from None
     if not is_folder:
         what = "is a file" if existing == folder else f"{existing} is a file"
         raise OutputError(f"{folder}: {what}, give the name of a folder")
@@ -289,6 +289,7 @@ def _folder_in_the_way_error(path: Path) -> OutputError:
     return OutputError(f"{path}: is a folder, remove it or choose another place")
 
 
-def _cannot_be_written_error(path: Path, error: OSError) -> OutputError:
+def writing_error(path: Path, error: OSError) -> OutputError:
+    """An error of the system about a path as one of the package."""
     reason = error.strerror or str(error)
     return OutputError(f"{path}: cannot be written ({reason}), choose another place")

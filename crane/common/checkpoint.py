@@ -10,18 +10,17 @@ import csv
 import hashlib
 import io
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from stat import S_ISREG
 from types import CodeType, FunctionType
 from typing import Any
 
 import numpy as np
 
 import crane
+from crane.common.atomic_output import writing_error
 from crane.common.errors import CraneError, InputError, OutputError, TerminatedWorkerError
 from crane.common.temporary_files import try_lock
 
@@ -70,10 +69,10 @@ class Checkpoint:
                 self._read("".join([_FIRST_LINE, *lines, _csv_line(columns)]).encode())
                 stack.pop_all()
         except OSError as error:
-            raise self._output_error(error) from error
+            raise writing_error(self._path, error) from error
 
     def _read(self, head: bytes) -> None:
-        if not S_ISREG(os.fstat(self._file.fileno()).st_mode):
+        if not self._path.is_file():
             raise InputError(f"{self._path}: is no plain file, give another name")
         if not try_lock(self._file.fileno()):
             raise InputError(f"{self._path}: another process computes this, wait for its end")
@@ -112,7 +111,7 @@ class Checkpoint:
         try:
             self._file.write(_csv_line((*key, *cells)).encode())
         except OSError as error:
-            raise self._output_error(error) from error
+            raise writing_error(self._path, error) from error
         self._has_rows = True
 
     def __enter__(self) -> "Checkpoint":
@@ -125,10 +124,6 @@ class Checkpoint:
                 self._path.unlink()
                 for folder in self._missing_folders:
                     folder.rmdir()
-
-    def _output_error(self, error: OSError) -> OutputError:
-        reason = error.strerror or str(error)
-        return OutputError(f"{self._path}: cannot be written ({reason}), choose another place")
 
 
 _FIRST_LINE = "# unfinished: the command that began this goes on with --resume\n"

@@ -6,7 +6,7 @@ A message is one line that says what is wrong, where, and what to do about it.
 import re
 import warnings
 from collections.abc import Collection, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from difflib import SequenceMatcher, get_close_matches
 from typing import Any
 
@@ -135,6 +135,16 @@ class OutputError(CraneError):
 
 class CraneWarning(UserWarning):
     """Something unusual that is not an error."""
+
+
+def warn(text: str, stacklevel: int = 2) -> None:
+    """Issue a `CraneWarning`; `stacklevel` as for `warnings.warn`."""
+    warnings.warn(text, CraneWarning, stacklevel=stacklevel + 1)
+
+
+def ignore_warnings() -> AbstractContextManager[object]:
+    """Context in which no `CraneWarning` is issued."""
+    return warnings.catch_warnings(action="ignore", category=CraneWarning)
 
 
 _MAX_SEARCHED_NAMES = 2000  # largest number of names to search for a similar one

@@ -9,7 +9,6 @@ folder, or a folder or link on the way to it. Elsewhere nothing is cached.
 import hashlib
 import os
 import stat
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from importlib.util import find_spec
@@ -18,16 +17,14 @@ from pathlib import Path
 from platformdirs import user_cache_path
 
 from crane.common.atomic_output import replace_file
-from crane.common.errors import CraneWarning, OutputError
+from crane.common.errors import OutputError, warn
 
 MAX_CACHE_SIZE = 256 << 20  # [bytes]; the least recently used entries are removed
 _CLEANUPS_PER_CACHE_SIZE = 16  # cleanups per `MAX_CACHE_SIZE` written bytes
 _DIGEST_SIZE = 32  # bytes
-_HAS_OWNERS = hasattr(os, "getuid")  # not on Windows
 _OTHERS_MAY_WRITE = stat.S_IWGRP | stat.S_IWOTH
 _MAX_STEPS = 100  # folders and links on the way to the cache folder
-# neither follow a link nor wait for the other end of a pipe; absent on Windows
-_SAFE_FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+_SAFE_FLAGS = os.O_NOFOLLOW | os.O_NONBLOCK  # nor wait for the other end of a pipe
 _remaining_bytes: dict[Path, int] = {}  # [bytes] that may be written before the next cleanup
 
 
@@ -81,7 +78,7 @@ def read_entry(name: str) -> bytes | None:
                 return None
             data = file.read(MAX_CACHE_SIZE)
             with suppress(OSError):  # a read-only folder can be used
-                os.utime(file.fileno() if os.utime in os.supports_fd else path)
+                os.utime(file.fileno())
     except OSError:
         return None
     content = data[_DIGEST_SIZE:]
@@ -117,8 +114,8 @@ def _is_trusted_file(status: os.stat_result) -> bool:
 
 
 def _is_own(status: os.stat_result) -> bool:
-    """Whether this user or root owns a file, as far as the system reports."""
-    return not _HAS_OWNERS or status.st_uid in (0, os.getuid())
+    """Whether this user or root owns a file."""
+    return status.st_uid in (0, os.getuid())
 
 
 def _is_private(folder: Path) -> bool:
@@ -129,11 +126,9 @@ def _is_private(folder: Path) -> bool:
     """
     place = _changeable_place(folder)
     if place is not None:
-        warnings.warn(
+        warn(
             f"nothing is kept in {folder}, because other users can change {place}, and each "
-            "command takes longer: take this right from them (chmod go-w), or set XDG_CACHE_HOME",
-            CraneWarning,
-            stacklevel=2,
+            "command takes longer: take this right from them (chmod go-w), or set XDG_CACHE_HOME"
         )
     return place is None
 
@@ -151,7 +146,7 @@ def _changeable_place(folder: Path) -> str | None:
             target = Path(place).parent / os.readlink(place)
             place, *names = *target.parts, *names
             continue
-        is_shared = _HAS_OWNERS and status.st_mode & _OTHERS_MAY_WRITE
+        is_shared = status.st_mode & _OTHERS_MAY_WRITE
         if not _is_own(status) or (is_shared and not (names and status.st_mode & stat.S_ISVTX)):
             return place
         if not names:

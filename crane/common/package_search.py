@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 
 from crane.common.errors import InputError
@@ -26,7 +27,7 @@ OWN_ARGUMENTS = (URDF_CONSTRAINT, NEAREST_ASSEMBLY)  # that no file need have
 
 _MANIFESTS = ("package.xml", "model.config")
 _NAME_PATTERN = re.compile(rb"<name[^>]*>\s*([^<]*?)\s*</name>")
-_MAX_DEPTH, _MAX_FOLDERS = 4, 2000  # levels below a given folder, and folders searched
+_MAX_DEPTH, _MAX_FOLDERS = 4, 2000  # levels below a given folder, and folders of a level
 # Environment variables with folders, and the subfolder that contains the packages.
 _SEARCH_VARIABLES = {
     "ROS_PACKAGE_PATH": "", "AMENT_PREFIX_PATH": "share", "CMAKE_PREFIX_PATH": "share",
@@ -191,13 +192,13 @@ def _search_package(name: str, folder: Path, packages: Sequence[str]) -> Path | 
             if _is_package(place, name):
                 return place
     own_package = enclosing_package(folder)
-    for top in () if own_package is None else (own_package, own_package.parent):
+    tops = [] if own_package is None else [own_package, own_package.parent]
+    for variable, between in _SEARCH_VARIABLES.items():
+        prefixes = filter(None, os.environ.get(variable, "").split(os.pathsep))
+        tops += [Path(prefix) / between for prefix in prefixes]
+    for top in tops:
         if (found := _search_below(name, top, 2)) is not None:
             return found
-    for variable, between in _SEARCH_VARIABLES.items():
-        for prefix in filter(None, os.environ.get(variable, "").split(os.pathsep)):
-            if (found := _search_below(name, Path(prefix) / between, 2)) is not None:
-                return found
     same_named = (x for above in (folder, *folder.parents) for x in (above, above / name))
     return next((x for x in same_named if x.name == name and x.is_dir()), None)
 
@@ -217,19 +218,11 @@ def _is_package(folder: Path, name: str) -> bool:
 def _search_below(name: str, top: Path, depth: int = _MAX_DEPTH) -> Path | None:
     """The package with a name in a folder, nearest first."""
     level = [top]
-    seen = 0
     for _ in range(depth + 1):
-        for folder in level:
-            if _is_package(folder, name):
-                return folder
-        deeper: list[Path] = []
-        for folder in level:
-            if seen > _MAX_FOLDERS:
-                break
-            inside = _subfolders(str(folder))
-            seen += len(inside)
-            deeper += map(Path, inside)
-        level = deeper
+        if found := next((folder for folder in level if _is_package(folder, name)), None):
+            return found
+        inside = (Path(path) for folder in level for path in _subfolders(str(folder)))
+        level = list(islice(inside, _MAX_FOLDERS))
     return None
 
 

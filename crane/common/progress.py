@@ -88,9 +88,9 @@ class ProgressTracker:
 
     def start_reporting(self, call: FrameType) -> Callable[[float], None] | None:
         """The function by which a call reports its share; None in nested calls and threads."""
-        if not self.is_enabled or threading.current_thread() is not threading.main_thread():
-            return None
-        if self._reporting_call is not None and _is_on_stack(self._reporting_call, call):
+        is_main_thread = threading.current_thread() is threading.main_thread()
+        is_nested = self.finished_share(call) is not None
+        if not self.is_enabled or not is_main_thread or is_nested:
             return None
         self._reporting_call, self._finished_share = call, 0.0
         return self._set_share

@@ -5,8 +5,8 @@ over: the next process that writes to the same path removes it. A folder that wa
 an exchange is moved back if nothing is at its path.
 """
 
-import contextlib
 import errno
+import fcntl
 import os
 import re
 import shutil
@@ -14,11 +14,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-
-try:
-    import fcntl
-except ImportError:  # not Unix: leftovers cannot be recognized
-    fcntl = None  # type: ignore[assignment]
 
 PARTIAL_SUFFIX, REPLACED_SUFFIX = "part", "old"
 _MAX_ATTEMPTS = 100
@@ -46,8 +41,7 @@ def temporary_path(
         yield part
     finally:
         _remove(part)
-        if lock is not None:
-            os.close(lock)
+        os.close(lock)
 
 
 def remove_leftovers(target: Path, parent: Path | None = None) -> None:
@@ -79,36 +73,25 @@ def is_temporary(name: str, target: Path) -> bool:
     return bool(_TEMPORARY_PATTERN.fullmatch(name[len(target.name) + 1 :]))
 
 
-def _create_temporary(target: Path, is_folder: bool) -> tuple[Path, int | None]:
+def _create_temporary(target: Path, is_folder: bool) -> tuple[Path, int]:
     for _ in range(_MAX_ATTEMPTS):
         part = temporary_name(target, PARTIAL_SUFFIX)
         if is_folder:
             part.mkdir()
         else:
             os.close(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
-        if fcntl is None:
-            return part, None
         try:
             lock = os.open(part, os.O_RDONLY)
         except FileNotFoundError:  # another process removed it before it was locked
             continue
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if os.path.lexists(part):
-                return part, lock
-        except BlockingIOError:
-            pass
-        except OSError:  # a file system without locks
-            os.close(lock)
-            return part, None
+        if try_lock(lock) and os.path.lexists(part):
+            return part, lock
         os.close(lock)
     raise OSError(f"no temporary file could be made in {_MAX_ATTEMPTS} attempts")
 
 
 def _acquire_lock(path: Path, wait: bool = False) -> int | None:
     """The lock of a file or folder; None if another process holds it, or without locks."""
-    if fcntl is None:
-        return None
     try:
         lock = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
     except OSError:
@@ -126,14 +109,10 @@ def try_lock(file: int) -> bool:
 
     File systems without locks do not tell.
     """
-    if fcntl is None:
-        return True
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        return True
+    except OSError as error:
+        return not isinstance(error, BlockingIOError)
     return True
 
 
@@ -141,8 +120,7 @@ def _remove(path: Path) -> None:
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
-        with contextlib.suppress(FileNotFoundError):
-            path.unlink()
+        path.unlink(missing_ok=True)
 
 
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux

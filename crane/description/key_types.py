@@ -5,6 +5,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from crane.common.plausible_ranges import PlausibleRange, plausible_range
 
 QUANTITY_UNIT = "unit of the quantity"  # of a number whose unit is that of what is measured
@@ -188,6 +190,7 @@ class SectionSchema:
         values = {}
         for name, key in self.keys.items():
             value = getattr(item, key.attribute or name, key.default)
+            value = value.item() if isinstance(value, np.generic) else value
             if name not in excluded and value not in (key.default, None, "", (), {}):
                 values[name] = _plain_value(value, key)
         return values

@@ -6,7 +6,7 @@ is assembled, see `crane.description.rotation_vectors`.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,12 +17,12 @@ Vector = tuple[float, float, float]
 Placement = tuple[Vector, Vector]  # xyz [m], rpy [rad] as URDF has them: R_z(y) R_y(p) R_x(r)
 Freedom = tuple[str, str, Vector]  # of a composite joint: suffix, kind, axis
 
-_X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+X_AXIS, Y_AXIS, Z_AXIS = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 ROTATIONS: tuple[Freedom, ...] = (
-    ("rx", "revolute", _X), ("ry", "revolute", _Y), ("rz", "revolute", _Z),
+    ("rx", "revolute", X_AXIS), ("ry", "revolute", Y_AXIS), ("rz", "revolute", Z_AXIS),
 )  # fmt: skip
 _TRANSLATIONS: tuple[Freedom, ...] = (
-    ("x", "prismatic", _X), ("y", "prismatic", _Y), ("z", "prismatic", _Z),
+    ("x", "prismatic", X_AXIS), ("y", "prismatic", Y_AXIS), ("z", "prismatic", Z_AXIS),
 )  # fmt: skip
 MULTI_FREEDOM_TYPES = ("floating", "planar", "spherical")  # types of URDF, and ball joints
 NO_LIMIT = 1e9  # a limit of this magnitude in a file, in any unit, means none
@@ -170,9 +170,9 @@ class Tree:
 
     @property
     def root_link(self) -> str:
-        """The link without parent."""
+        """The link without parent, "" if there are no links."""
         parent_joints = self.parent_joints
-        return next(link for link in self.links if link not in parent_joints)
+        return next((link for link in self.links if link not in parent_joints), "")
 
     @property
     def total_mass(self) -> float:
@@ -213,6 +213,22 @@ def body_of(parent_joints: Mapping[str, Joint], link: str) -> str:
     while link in parent_joints and not parent_joints[link].is_movable:
         link = parent_joints[link].parent
     return link
+
+
+def path_to_root(parent_joints: Mapping[str, Joint], link: str) -> list[Joint]:
+    """Return the joints from a link to the root, see `Tree.parent_joints`."""
+    path: list[Joint] = []
+    while link in parent_joints:
+        path.append(parent_joints[link])
+        link = path[-1].parent
+    return path
+
+
+def unique_name(name: str, used_names: Container[str]) -> str:
+    """Return a name that is not used, with underscores appended if necessary."""
+    while name in used_names:
+        name += "_"
+    return name
 
 
 def with_rotor_inertias(tree: Tree, rotor_inertias: Mapping[str, float]) -> Tree:
@@ -281,7 +297,7 @@ def joint_series(
 _ROUNDING_TOLERANCE = 1e-4
 _NEGATIVE_MOMENT_TOLERANCE = 0.05  # of a negative moment, as by rounding to two digits
 _MIN_GYRATION_RADIUS = 1e-10  # [m] of a body with inertia
-_TENSOR_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+TENSOR_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")  # of URDF and SDF
 
 
 @dataclass(frozen=True)
@@ -363,4 +379,4 @@ def format_inertia(tensor: Array) -> str:
     """Return a tensor as attributes of a URDF, in five digits."""
     rounding = float(np.abs(tensor).max()) * 1e-9
     values = [x if abs(x) > rounding else 0.0 for x in tensor[np.triu_indices(3)].tolist()]
-    return " ".join(f'{key}="{x:.5g}"' for key, x in zip(_TENSOR_ATTRIBUTES, values, strict=True))
+    return " ".join(f'{key}="{x:.5g}"' for key, x in zip(TENSOR_ATTRIBUTES, values, strict=True))

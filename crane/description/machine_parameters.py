@@ -32,8 +32,8 @@ from crane.description.sensors import (
     TANK_PRESSURE,
     VALVE_SIGNAL_PREFIX,
     parse_sensor_parameter,
-    quantity_names,
     quantity_unit,
+    quantity_units,
     sensor_parameters,
 )
 from crane.description.specification import Chain, MachineSpec, PIGains
@@ -276,9 +276,7 @@ def names_by_kind(spec: MachineSpec) -> NamesByKind:
             for link in tree.links
         },
         "column": {
-            name: quantity_unit(tree, name) or ""
-            for name in quantity_names(tree)
-            if is_available(name)
+            name: unit for name, unit in quantity_units(tree).items() if is_available(name)
         },
         "parameter": {
             name: f"{value:.6g} {parameter_unit(tree, name)}".rstrip()

@@ -33,8 +33,8 @@ from crane.description.rotation_vectors import convert_locked_rotations
 from crane.description.sensors import (
     SENSOR_PREFIX,
     parse_sensor_parameter,
-    quantity_names,
     quantity_unit,
+    quantity_units,
     with_sensor_parameters,
 )
 from crane.description.specification import Coupling, Drive, MachineSpec, Task
@@ -147,7 +147,7 @@ def _check_change(
     if name.startswith(SENSOR_PREFIX):
         quantity, _ = parse_sensor_parameter(name)
         if quantity_unit(spec.tree, quantity) is None and quantity not in spec.sensors:
-            hint = suggest_names(quantity_names(spec.tree), quantity)
+            hint = suggest_names(quantity_units(spec.tree), quantity)
             raise InputError(f"'{name}' is of no quantity of '{spec.name}', {hint}")
     elif name not in names:
         raise InputError(unknown_parameter_text(spec, names, name))

@@ -30,6 +30,7 @@ from crane.description.kinematic_tree import (
     body_of,
     joint_freedoms,
     joint_series,
+    path_to_root,
 )
 from crane.description.specification import MachineSpec
 
@@ -113,9 +114,7 @@ def _is_unconstrained(spec: MachineSpec, series: list[Joint]) -> bool:
 
 
 def _carries_link(parent_joints: Mapping[str, Joint], link: str, body: str) -> bool:
-    while link != body and link in parent_joints:
-        link = parent_joints[link].parent
-    return link == body
+    return any(joint.child == body for joint in path_to_root(parent_joints, link))
 
 
 def with_rotation_vectors(spec: MachineSpec) -> MachineSpec:

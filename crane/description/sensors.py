@@ -25,6 +25,7 @@ T = TypeVar("T", float, Array)
 SENSOR_PREFIX = "sensor."  # of parameter names
 TIME, VELOCITY_SUFFIX, FORCE_SUFFIX = "time", "_velocity", "_force"
 INCLINATION_PREFIX, VALVE_SIGNAL_PREFIX, PRESSURE_PREFIX = "inclination_", "voltage_", "pressure_"
+_VALVE_UNITS = {VALVE_SIGNAL_PREFIX: "V", "spool_": ""}
 SUPPLY_PRESSURE, TANK_PRESSURE = "pressure_supply", "pressure_tank"
 VELOCITY_UNITS = {"rad": "rad/s", "m": "m/s"}
 FORCE_UNITS = {"rad": "N m", "m": "N"}
@@ -96,43 +97,26 @@ class Sensor:
         return {name: getattr(self, name) for name in SENSOR_PARAMETERS}
 
 
+def quantity_units(tree: Tree) -> dict[str, str]:
+    """Return the SI units of all quantities that sensors of a machine can measure, by name."""
+    joints = {x.name: "m" if x.kind == "prismatic" else "rad" for x in tree.moving_joints}
+    named = [(TIME, "s"), (SUPPLY_PRESSURE, "Pa"), (TANK_PRESSURE, "Pa")]
+    for x, unit in joints.items():
+        named += [(x, unit), (x + VELOCITY_SUFFIX, VELOCITY_UNITS[unit])]
+        named.append((x + FORCE_SUFFIX, FORCE_UNITS[unit]))
+    named += [(f"{PRESSURE_PREFIX}{x}_{side}", "Pa") for x in joints for side in "ab"]
+    named += [(head + x, unit) for x in joints for head, unit in _VALVE_UNITS.items()]
+    rates = ("", "rad"), (VELOCITY_SUFFIX, VELOCITY_UNITS["rad"])
+    named += [(INCLINATION_PREFIX + x + end, unit) for x in tree.links for end, unit in rates]
+    units = dict(reversed(named))  # of equal names the first counts
+    return {name: units[name] for name, _ in named}
+
+
 def quantity_unit(tree: Tree, name: str) -> str | None:
     """Return the SI unit of a quantity of a machine, None if it is unknown."""
-    fixed_units = {TIME: "s", SUPPLY_PRESSURE: "Pa", TANK_PRESSURE: "Pa"}
-    if name in fixed_units:
-        return fixed_units[name]
-    joint_units = {x.name: "m" if x.kind == "prismatic" else "rad" for x in tree.moving_joints}
-    if name in joint_units:
-        return joint_units[name]
-    for suffix, units in ((VELOCITY_SUFFIX, VELOCITY_UNITS), (FORCE_SUFFIX, FORCE_UNITS)):
-        if (joint := name.removesuffix(suffix)) != name and joint in joint_units:
-            return units[joint_units[joint]]
-    if (link_name := name.removeprefix(INCLINATION_PREFIX)) != name:
-        if link_name in tree.links:
-            return "rad"
-        return "rad/s" if link_name.removesuffix(VELOCITY_SUFFIX) in tree.links else None
-    for prefix, unit, suffixes in (
-        (PRESSURE_PREFIX, "Pa", ("_a", "_b")),
-        (VALVE_SIGNAL_PREFIX, "V", ("", "_b")),
-        ("spool_", "", ("", "_b")),
-    ):
-        if name.startswith(prefix) and any(
-            name == f"{prefix}{joint}{suffix}" for joint in joint_units for suffix in suffixes
-        ):
-            return unit
-    return None
-
-
-def quantity_names(tree: Tree) -> list[str]:
-    """Return the names of all quantities that sensors of a machine can measure."""
-    joints = [joint.name for joint in tree.moving_joints]
-    names = [TIME, SUPPLY_PRESSURE, TANK_PRESSURE]
-    names += [x + end for x in joints for end in ("", VELOCITY_SUFFIX, FORCE_SUFFIX)]
-    names += [f"{PRESSURE_PREFIX}{x}_{side}" for x in joints for side in "ab"]
-    names += [head + x for x in joints for head in (VALVE_SIGNAL_PREFIX, "spool_")]
-    return names + [
-        INCLINATION_PREFIX + link + end for link in tree.links for end in ("", VELOCITY_SUFFIX)
-    ]
+    units = quantity_units(tree)
+    is_valve = name.startswith(tuple(_VALVE_UNITS))
+    return units.get(name, units.get(name.removesuffix("_b") if is_valve else name))
 
 
 def parse_sensor_parameter(name: str) -> tuple[str, str]:

@@ -343,10 +343,8 @@ class Phase:
 
 DEFAULT_RAMP_TIME = 0.3  # [s] in which a hand moves a lever from neutral to its end
 TIP_COORDINATES = ("x", "y", "z")  # coordinates of tasks of the tip
-ATTITUDE_COORDINATES = (
-    ("inclination",),
-    ("roll", "pitch", "yaw"),
-)  # and of how its frame is turned
+# and of how its frame is turned
+ATTITUDE_COORDINATES = ("inclination",), ("roll", "pitch", "yaw")
 
 
 @dataclass(frozen=True)
@@ -402,44 +400,51 @@ class PayloadSpec:
 STANDARD_GRAVITY = (0.0, 0.0, -9.81)  # [m/s2]
 
 
-@dataclass(frozen=True)
-class MachineSpec:
-    """A machine as described by its file; see docs/machine_file.md for the keys."""
+@dataclass(frozen=True, eq=False, repr=False)
+class MachineParts:
+    """What the description of a machine and the assembled machine have in common.
+
+    `crane.machine.machine.Machine` has the meaning of each part.
+    """
 
     name: str
     source: str
     path: Path
     chains: tuple[Chain, ...]
-    tree: Tree  # all chains hung onto each other
-    loops: tuple[LoopSpec, ...] = ()
-    active: tuple[str, ...] | None = None  # None: every joint of the tree; (): not named
-    home: Mapping[str, float] = field(default_factory=dict)
+    tree: Tree
     friction: Mapping[str, Friction] = field(default_factory=dict)
     forces: tuple[ForceElement, ...] = ()
     gas_springs: tuple[GasSpring, ...] = ()
+    ropes: tuple[Rope, ...] = ()
     end_stops: tuple[EndStop, ...] = ()
     tip: str | None = None
     tasks: Mapping[str, Task] = field(default_factory=dict)
     control: Mapping[str, PIGains] = field(default_factory=dict)
     hydraulics: Hydraulics | None = None
-    couplings: tuple[Coupling, ...] = ()
-    source_locations: Mapping[str, str] = field(default_factory=dict)  # section -> "file:line"
-    payload: PayloadSpec | None = None  # what payload.mass hangs on the tip; None: a point mass
-    free: tuple[str, ...] = ()  # independent coordinates that nothing drives
-    drives: tuple[Drive, ...] = ()  # what the format says motors act on; (): the active joints
-    ropes: tuple[Rope, ...] = ()
-    sensors: Mapping[str, Sensor] = field(default_factory=dict)  # by quantity
+    free: tuple[str, ...] = ()
+    sensors: Mapping[str, Sensor] = field(default_factory=dict)
     estimation: EstimationSettings = EstimationSettings()
-    external_forces: tuple[ExternalForce, ...] = ()  # forces from outside
-    supports: tuple[str, ...] = ()  # links that it stands on
-    pin_capacities: Mapping[str, float] = field(
-        default_factory=dict
-    )  # by joint or loop, most force [N]
-    gravity: tuple[float, ...] = STANDARD_GRAVITY  # (3,) [m/s2]
-    # numbers as they are written, by the keys and names that lead to them in the machine file
+    external_forces: tuple[ExternalForce, ...] = ()
+    supports: tuple[str, ...] = ()
+    pin_capacities: Mapping[str, float] = field(default_factory=dict)
     written_numbers: Mapping[KeyPath, WrittenNumber] = field(default_factory=dict)
 
     @property
     def force_elements(self) -> tuple[AnyForceElement, ...]:
-        """Its force elements, gas springs and ropes, along joints and between frames."""
+        """Force elements, gas springs and ropes, along joints and between frames."""
         return (*self.forces, *self.gas_springs, *self.ropes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MachineSpec(MachineParts):
+    """A machine as described by its file; see docs/machine_file.md for the keys."""
+
+    loops: tuple[LoopSpec, ...] = ()
+    active: tuple[str, ...] | None = None  # None: every joint of the tree; (): not named
+    home: Mapping[str, float] = field(default_factory=dict)
+    couplings: tuple[Coupling, ...] = ()
+    source_locations: Mapping[str, str] = field(default_factory=dict)  # section -> "file:line"
+    payload: PayloadSpec | None = None  # what payload.mass hangs on the tip; None: a point mass
+    drives: tuple[Drive, ...] = ()  # what the format says motors act on; (): the active joints
+    gravity: tuple[float, ...] = STANDARD_GRAVITY  # (3,) [m/s2]
+    is_complete: bool = True  # whether all elements have unique names, so that none is missing

@@ -1,12 +1,10 @@
 """Equations of motion and their derivatives as machine code of one machine."""
 
 from collections.abc import Callable
-from functools import partial
-from typing import Any
 
 import numpy as np
 
-from crane.closure.compiled_closure import CompiledClosure, ContinuationCursor
+from crane.closure.compiled_closure import CompiledClosure, ContinuedFunction
 from crane.closure.gamma_derivatives import GammaDerivatives
 from crane.closure.kinematics_formulas import FormulaConstants, folding_pattern
 from crane.codegen import Program, Scalar, SymbolicExpression, Tape, max_abs
@@ -80,9 +78,7 @@ _ANALYTIC_DERIVATIVES: dict[str, _AnalyticDerivatives] = {
 }
 # before a quantity: its derivatives by q_A, v_A and the second argument
 DERIVATIVES_OF = "derivatives of "
-_FLOAT = np.dtype(np.float64)
-# of one sample: second argument, v_A, q_A (n,), result (size,), and what evaluates them
-_SampleBuffers = tuple[Array, Array, Array, Array, partial[int]]
+MATRIX_QUANTITIES = "mass matrix", "regressor"  # with a row per active joint
 
 
 class CompiledQuantity:
@@ -98,6 +94,8 @@ class CompiledQuantity:
     Attributes:
         size: Length of the result of one sample.
         solves_mass_matrix: Whether the result is not finite where the mass matrix is singular.
+        sample_function: Its `value` is this thread's function of q_A, v_A and x (n,), as far as
+            the quantity depends on them.
 
     Raises:
         FormulaTooLongError: It would take too long to compile.
@@ -120,44 +118,22 @@ class CompiledQuantity:
                 program, quantity, fast, constant_pattern, n, formula_structure
             ),
         )
-        result_size = self.size = program.formula_outputs("formula").size
-        self._shape = (n,)
+        self.size = program.formula_outputs("formula").size
         self.solves_mass_matrix = _solves_mass_matrix(quantity)
+        shape = (n, self.size // n) if quantity in MATRIX_QUANTITIES else (self.size,)
 
-        def create_workspace() -> tuple[ContinuationCursor, Array, _SampleBuffers]:
-            cursor, q, target = fast.new_cursor(), np.zeros(nq), np.zeros(n)
-            inputs, out = np.zeros(2 * n), np.zeros(result_size)
-            arrays = *constants, target, inputs, cursor.state, q, out
-            once = program.bind("once", fast.follow_address, *arrays, fast.tolerances)
-            return cursor, q, (inputs[n:], inputs[:n], target, out, once)
+        def create_function() -> ContinuedFunction:
+            cursor, q = fast.new_cursor(), np.zeros(nq)
+            inputs, out = np.zeros((3, n)), np.zeros(shape)
+            arrays = *constants, inputs[0], inputs[1:], cursor.state, q, out, fast.tolerances
+            return ContinuedFunction(
+                cursor,
+                program.sample_function(
+                    "each", 1, fast.follow_address, *arrays, inputs=inputs, output=out
+                ),
+            )
 
-        self._workspace = ThreadLocal(create_workspace)
-
-    @property
-    def cursor(self) -> ContinuationCursor:
-        """Continuation cursor of this thread."""
-        return self._workspace.value[0]
-
-    def evaluate_sample(self, q_a: Any, v_a: Any, x: Any) -> Array | None:
-        """The quantity of one sample, or None where arguments need to be checked first.
-
-        Args:
-            q_a: (n,).
-            v_a: (n,), or None if the quantity does not depend on it.
-            x: (n,), or None if the quantity does not depend on it.
-        """
-        shape = self._shape
-        second, first, target, out, once = self._workspace.value[2]
-        for buffer, array in ((second, x), (first, v_a), (target, q_a)):
-            if array is not None:
-                if (
-                    array.__class__ is not np.ndarray
-                    or array.shape != shape
-                    or array.dtype != _FLOAT
-                ):
-                    return None
-                buffer[:] = array
-        return out.copy() if once() == 1 else None
+        self.sample_function = ThreadLocal(create_function)
 
     def evaluate_closed(self, q: Array, inputs: Array) -> Array:
         """The quantity at closed configurations.
@@ -185,8 +161,9 @@ class CompiledQuantity:
         Returns:
             Number of evaluated samples.
         """
-        fast, (cursor, q, _) = self._compiled_closure, self._workspace.value
-        arrays = *self._constants, targets, inputs, cursor.state, q, out, fast.tolerances
+        fast, state = self._compiled_closure, self.sample_function.value.cursor.state
+        q = np.empty_like(state)  # longer than needed
+        arrays = *self._constants, targets, inputs, state, q, out, fast.tolerances
         return self._program.call("each", len(targets), fast.follow_address, *arrays)
 
 
@@ -232,10 +209,6 @@ def _build_quantity(
         if base_quantity != quantity:
             outputs = _state_derivatives(formulas, outputs, x)
     program.add_formula("formula", 4, outputs)
-    tape = Tape()  # arguments that are not finite are left to the checks that name them
-    program.add_formula(
-        "scan", 2, [max_abs([*tape.load_vector(0, 0, n), *tape.load_vector(1, 0, 2 * n)])]
-    )
     tape = Tape()
     program.add_formula("check", 1, [max_abs(tape.load_vector(0, 0, len(outputs)))])
     _add_evaluation_routines(program, len(q), n, _solves_mass_matrix(quantity))
@@ -351,45 +324,26 @@ def _add_evaluation_routines(
 ) -> None:
     """Add the routines that evaluate a quantity.
 
-    "each" closes the loops and evaluates sample by sample; "once" does so for one finite sample;
-    "closed_each" evaluates at closed configurations. Like `follow` of `CompiledClosure`, "each"
-    stops at the first sample that is too far from the previous one, or whose result is not finite.
+    "each" closes the loops and evaluates sample by sample; "closed_each" evaluates at closed
+    configurations. Like `follow` of `CompiledClosure`, "each" stops at the first sample that is
+    too far from the previous one, or whose result is not finite.
     """
     arrays = ("geometry", "constants", "targets", "inputs", "cursor", "q", "out", "tolerances")
     outputs = program.formula_outputs("formula").size
-    with program.add_routine("each", counts=("count",), functions=("follow",), arrays=arrays) as r:
+    with program.add_loop("each", functions=("follow",), arrays=arrays) as (r, i):
         checked = r.local_array("checked", program.formula_outputs("check"))
-        with r.loop(r.count) as i:
-            got = r.call(
-                "follow", 1, r.geometry, r.targets.row_pointer(i, n), r.cursor, r.q, r.tolerances
-            )
-            with r.if_then(got < 1):
+        got = r.call(
+            "follow", 1, r.geometry, r.targets.row_pointer(i, n), r.cursor, r.q, r.tolerances
+        )
+        with r.if_then(got < 1):
+            r.return_value(i)
+        out = r.out.row_pointer(i, outputs)
+        r.call("formula", r.geometry, r.constants, r.q, r.inputs.row_pointer(i, 2 * n), out)
+        if stops_where_infinite:
+            r.call("check", out, checked)
+            with r.if_then(~(checked["all"] < np.inf)):
                 r.return_value(i)
-            out = r.out.row_pointer(i, outputs)
-            r.call("formula", r.geometry, r.constants, r.q, r.inputs.row_pointer(i, 2 * n), out)
-            if stops_where_infinite:
-                r.call("check", out, checked)
-                with r.if_then(~(checked["all"] < np.inf)):
-                    r.return_value(i)
-        r.return_value(r.count)
-    closed = ("geometry", "constants", "configurations", "inputs", "out")
-    with program.add_routine("closed_each", counts=("count",), arrays=closed) as r:
-        with r.loop(r.count) as i:
-            q, inputs, out = (
-                r.configurations.row_pointer(i, nq),
-                r.inputs.row_pointer(i, 2 * n),
-                r.out.row_pointer(i, outputs),
-            )
-            r.call("formula", r.geometry, r.constants, q, inputs, out)
-        r.return_value(r.count)
-    with program.add_routine("once", functions=("follow",), arrays=arrays) as r:
-        scanned = r.local_array("scanned", program.formula_outputs("scan"))
-        r.call("scan", r.targets, r.inputs, scanned)
-        with r.if_then(~(scanned["all"] < np.inf)):
-            r.return_value(0)
-        r.return_value(
-            r.call(
-                "each", 1, r.follow, r.geometry, r.constants, r.targets, r.inputs, r.cursor, r.q,
-                r.out, r.tolerances,
-            )
-        )  # fmt: skip
+    row_lengths = {
+        "geometry": None, "constants": None, "configurations": nq, "inputs": 2 * n, "out": outputs,
+    }  # fmt: skip
+    program.add_formula_loop("closed_each", "formula", row_lengths)

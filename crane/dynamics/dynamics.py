@@ -16,23 +16,10 @@ from crane.common.samples import (
 from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.dynamics.compiled_dynamics import DERIVATIVES_OF, WITH_FRICTION
 from crane.dynamics.frame_jacobians import FrameJacobians
-from crane.dynamics.quantity_evaluator import QuantityEvaluator
+from crane.dynamics.quantity_evaluator import QUANTITY_ARGUMENTS, QuantityEvaluator
 from crane.machine.massless_motions import hold_coordinates
 
 _IDLE_FORCE_SHARE = 1e-9  # of the largest force, that counts as rounding
-
-QUANTITY_ARGUMENTS = {  # arguments of the quantities of `derivatives`
-    "inverse": ("q_a", "v_a", "a_a"),
-    "forward": ("q_a", "v_a", "tau_a"),
-    "mass_matrix": ("q_a",),
-    "bias": ("q_a", "v_a"),
-    "gravity": ("q_a",),
-    "friction": ("q_a", "v_a"),
-    "passive": ("q_a", "v_a"),
-    "energy": ("q_a", "v_a"),
-    "regressor": ("q_a", "v_a", "a_a"),
-    "statics": ("q_a",),
-}
 
 
 class Dynamics(QuantityEvaluator):
@@ -94,9 +81,7 @@ class Dynamics(QuantityEvaluator):
         Returns:
             tau_A, (n,) or (N, n) [N], [N m].
         """
-        return self._evaluate(
-            "inverse with friction" if friction else "inverse", (), q_a, v_a, a_a, "a_a"
-        )
+        return self._evaluate("inverse with friction" if friction else "inverse", q_a, v_a, a_a)
 
     def forward(
         self, q_a: ArrayLike, v_a: ArrayLike, tau_a: ArrayLike, friction: bool = False
@@ -117,9 +102,7 @@ class Dynamics(QuantityEvaluator):
             SingularMassMatrixError: Some motion moves no inertia there.
             InputError: A force acts on an idle motion; otherwise as for other quantities.
         """
-        a_a = self._evaluate(
-            "forward with friction" if friction else "forward", (), q_a, v_a, tau_a, "tau_a"
-        )
+        a_a = self._evaluate("forward with friction" if friction else "forward", q_a, v_a, tau_a)
         if self.machine.held:
             self._check_idle_forces(q_a, v_a, tau_a, a_a, friction)
         return a_a
@@ -187,7 +170,7 @@ class Dynamics(QuantityEvaluator):
         Returns:
             (n, n) or (N, n, n) [kg], [kg m], [kg m2].
         """
-        return self._evaluate("mass matrix", (self._mobility, self._mobility), q_a)
+        return self._evaluate("mass matrix", q_a)
 
     def bias(self, q_a: ArrayLike, v_a: ArrayLike) -> Array:
         """Active forces at zero acceleration: gamma^T (rnea(q, v, drift) - f).
@@ -199,7 +182,7 @@ class Dynamics(QuantityEvaluator):
         Returns:
             (n,) or (N, n) [N], [N m].
         """
-        return self._evaluate("bias", (), q_a, v_a)
+        return self._evaluate("bias", q_a, v_a)
 
     def gravity(self, q_a: ArrayLike) -> Array:
         """Active forces that balance gravity: gamma^T g(q), without passive forces.
@@ -210,7 +193,7 @@ class Dynamics(QuantityEvaluator):
         Returns:
             (n,) or (N, n) [N], [N m].
         """
-        return self._evaluate("gravity", (), q_a)
+        return self._evaluate("gravity", q_a)
 
     def friction(self, q_a: ArrayLike, v_a: ArrayLike) -> Array:
         """Active forces that overcome friction of all joints: gamma^T tau_F(gamma v_A).
@@ -222,7 +205,7 @@ class Dynamics(QuantityEvaluator):
         Returns:
             (n,) or (N, n) [N], [N m].
         """
-        return self._evaluate("friction", (), q_a, v_a)
+        return self._evaluate("friction", q_a, v_a)
 
     def passive(self, q_a: ArrayLike, v_a: ArrayLike) -> Array:
         """Passive forces at the active joints: gamma^T f(q, gamma v_A).
@@ -234,7 +217,7 @@ class Dynamics(QuantityEvaluator):
         Returns:
             (n,) or (N, n) [N], [N m].
         """
-        return self._evaluate("passive", (), q_a, v_a)
+        return self._evaluate("passive", q_a, v_a)
 
     def project_wrenches(self, q_a: ArrayLike, wrenches: Mapping[str, ArrayLike]) -> Array:
         """External wrenches at the active joints: gamma^T sum J^T w.
@@ -282,7 +265,7 @@ class Dynamics(QuantityEvaluator):
         Returns:
             Two arrays, () or (N,) [J].
         """
-        both = self._evaluate("energy", (), q_a, v_a)
+        both = self._evaluate("energy", q_a, v_a)
         return both[..., 0], both[..., 1]
 
     def regressor(self, q_a: ArrayLike, v_a: ArrayLike, a_a: ArrayLike) -> Array:
@@ -296,9 +279,7 @@ class Dynamics(QuantityEvaluator):
         Returns:
             (n, 10 nb + nr) or (N, n, 10 nb + nr), columns in the order of `parameters`.
         """
-        model = self.machine.model
-        size = 10 * (model.njoints - 1) + np.count_nonzero(model.armature)
-        return self._evaluate("regressor", (self._mobility, size), q_a, v_a, a_a, "a_a")
+        return self._evaluate("regressor", q_a, v_a, a_a)
 
     def derivatives(
         self,
@@ -349,23 +330,19 @@ class Dynamics(QuantityEvaluator):
             raise InputError(
                 f"'{quantity}' is without friction or with its own, leave friction out"
             )
-        rows: dict[str, Array] = {}
-        for name, given in zip(arguments, (q_a, v_a, x), strict=False):
-            if given is None:
+        given: dict[str, ArrayLike] = {}
+        for name, value in zip(arguments, (q_a, v_a, x), strict=False):
+            if value is None:
                 raise InputError(f"derivatives of '{quantity}' need {name}, give it")
-            rows[name] = as_samples(given, n, name, self.machine.active)
+            given[name] = value
         by = arguments if by is None else by
         parameters = [name for name in by if name not in ("q_a", "v_a", "a_a", "tau_a")]
         for name in by:
             if name not in (*arguments, *parameters):
                 hint = suggest_names(arguments, name)
                 raise InputError(f"'{quantity}' does not depend on '{name}', {hint}")
-        length = stack_length(rows.values())
-        count = 1 if length is None else length
-        q = self.machine.closure.solve(np.broadcast_to(rows["q_a"], (count, n)))
-        inputs = np.zeros((count, 2 * n))
-        for i, name in enumerate(arguments[1:]):
-            inputs[:, i * n : (i + 1) * n] = rows[name]
+        targets, inputs, length = self._stack_arguments(given)
+        q, count = self.machine.closure.solve(targets), len(targets)
         key = quantity.replace("_", " ") + (WITH_FRICTION if friction else "")
         shape, found = self.result_shape(quantity), dict[str, Array]()
         if len(parameters) < len(by):

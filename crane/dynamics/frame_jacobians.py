@@ -39,53 +39,38 @@ class FrameJacobians:
 
     def frame_origins(self, q: Array, links: Sequence[str]) -> Array:
         """Origins (N, k, 3) of k links' frames in the world, at configurations (N, nq) [m]."""
-        placements = [frame_placement(self._machine, link) for link in links]
-        joints = [joint for joint, _ in placements]
-        local_origins = np.array([placement.translation for _, placement in placements]).reshape(
-            -1, 3
-        )
-        rotations, origins = (
-            np.empty((len(q), len(placements), 3, 3)),
-            np.empty((len(q), len(placements), 3)),
-        )
-        configuration = self._machine.coordinates.configuration
-        for i, one in enumerate(q):
-            pin.forwardKinematics(self._model, self._data, configuration(one))
-            for k, joint in enumerate(joints):
-                placed = self._data.oMi[joint]
-                rotations[i, k], origins[i, k] = placed.rotation, placed.translation
-        return np.asarray(origins + np.einsum("ikab,kb->ika", rotations, local_origins))
+        frames = [self._machine.frame(link) for link in links]
+        out = np.empty((len(q), len(frames), 3))
+        for i, at in enumerate(self._machine.coordinates.configuration(q)):
+            pin.forwardKinematics(self._model, self._data, at)
+            for k, frame in enumerate(frames):
+                out[i, k] = pin.updateFramePlacement(self._model, self._data, frame).translation
+        return out
 
     def frame_pose(self, link: str) -> pin.SE3:
         """Pose of a link's frame in the world."""
-        joint, placement = frame_placement(self._machine, link)
-        return self._data.oMi[joint] * placement
+        frame = self._machine.frame(link)
+        return pin.updateFramePlacement(self._model, self._data, frame).copy()
 
     def jacobian(self, link: str) -> Array:
         """(6, nv) Jacobian of a frame's origin and angular velocity, in the world's axes."""
-        joint, placement = frame_placement(self._machine, link)
-        if not joint:
-            return np.zeros((6, self._model.nv))
-        return point_jacobian(self._model, self._data, joint, placement.translation)
+        return frame_jacobian(self._model, self._data, self._machine.frame(link))
 
 
-def point_jacobian(model: pin.Model, data: pin.Data, joint: int, point: Array) -> Array:
-    """Jacobian (6, nv) of a point of a body, from the joint Jacobians in `data`.
+def frame_jacobian(model: pin.Model, data: pin.Data, frame: int) -> Array:
+    """Jacobian (6, nv) of a frame, from the joint Jacobians in `data`.
 
     Args:
         model: The tree.
         data: Its data.
-        joint: Pinocchio's joint that moves the body.
-        point: (3,) the point in the joint's frame [m].
+        frame: Index of the frame.
 
     Returns:
-        Rows of the point's velocity and the body's angular velocity, in the world's axes.
+        Rows of the velocity of its origin and of its angular velocity, in the world's axes.
     """
     world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     # a vector if the model has a single joint
-    columns: Array = pin.getJointJacobian(model, data, joint, world).reshape(6, -1).copy()
-    columns[:3] -= pin.skew(data.oMi[joint].rotation @ point) @ columns[3:]
-    return columns
+    return np.asarray(pin.getFrameJacobian(model, data, frame, world).reshape(6, -1))
 
 
 FramePair = tuple[str, str]  # names of links
@@ -112,14 +97,13 @@ class FrameDistances:
     """
 
     def __init__(self, machine: Machine, pairs: Sequence[FramePair]):
-        self.pairs, self._coordinates = tuple(pairs), machine.coordinates
+        self.pairs = tuple(pairs)
         placements = [[frame_placement(machine, link) for link in pair] for pair in self.pairs]
         self.end_points = [
             [(joint, placement.translation) for joint, placement in pair] for pair in placements
         ]
         if self.pairs:
-            self._model = pin.Model(machine.model)
-            self._workspace = ThreadLocal(self._model.createData)
+            self._jacobians = FrameJacobians(machine)
 
     def evaluate(self, q: Array) -> tuple[Array, Array]:
         """Lengths and their derivatives.
@@ -135,21 +119,12 @@ class FrameDistances:
         jacobians = np.zeros((*q.shape[:-1], count, q.shape[-1]))
         if not count:
             return lengths, jacobians
+        frames = self._jacobians
         for i in np.ndindex(q.shape[:-1]):
-            pin.computeJointJacobians(
-                self._model, self._workspace.value, self._coordinates.configuration(q[i])
-            )
-            for k, (one, two) in enumerate(self.end_points):
-                (p1, j1), (p2, j2) = self._point(*one), self._point(*two)
-                vector = p2 - p1
+            frames.set_configuration(q[i])
+            for k, (one, two) in enumerate(self.pairs):
+                vector = frames.frame_pose(two).translation - frames.frame_pose(one).translation
                 lengths[(*i, k)] = length = float(np.linalg.norm(vector))
-                jacobians[(*i, k)] = vector / max(length, MIN_LENGTH) @ (j2 - j1)
+                rates = frames.jacobian(two)[:3] - frames.jacobian(one)[:3]
+                jacobians[(*i, k)] = vector / max(length, MIN_LENGTH) @ rates
         return lengths, jacobians
-
-    def _point(self, joint: int, local_point: Array) -> tuple[Array, Array]:
-        """A point of a body in the world (3,), and its Jacobian (3, nv)."""
-        if not joint:
-            return local_point, np.zeros((3, self._model.nv))
-        data = self._workspace.value
-        point: Array = data.oMi[joint].act(local_point)
-        return point, point_jacobian(self._model, data, joint, local_point)[:3]

@@ -4,9 +4,12 @@ from collections.abc import Callable, Sequence
 from functools import cached_property
 
 from crane.closure.kinematics_formulas import (
+    ZERO_VECTOR,
     SpatialVector,
     Vector,
+    add_spatial,
     coordinate_rates,
+    scale_spatial,
 )
 from crane.codegen.symbolic import (
     LdltFactorization,
@@ -128,19 +131,14 @@ class InertialForceFormulas(JointForceFormulas):
 
         Linear at the reference origin, angular; the world accelerates with -gravity.
         """
-        added_accelerations: list[SpatialVector] = [([0.0] * 3, [0.0] * 3)]
+        added_accelerations = [ZERO_VECTOR]
         for i in range(1, self._body_count):
-            linear, angular = (
-                scale_vector(joint_accelerations[i], part)
-                for part in self.kinematics.joint_axes[i]
-            )
             before = added_accelerations[self.formula_structure.motion_parents[i]]
-            added_accelerations.append(
-                (add_vectors(before[0], linear), add_vectors(before[1], angular))
-            )
+            added = scale_spatial(joint_accelerations[i], self.kinematics.joint_axes[i])
+            added_accelerations.append(add_spatial(before, added))
         accelerations = [
-            (add_vectors(a, more), add_vectors(e, turned))
-            for (a, e), (more, turned) in zip(
+            add_spatial(bias, added)
+            for bias, added in zip(
                 self._carrier_velocities.bias_accelerations, added_accelerations, strict=True
             )
         ]

@@ -10,13 +10,14 @@ import pinocchio as pin
 from crane.common.errors import SingularMassMatrixError
 from crane.common.samples import Array, solve_linear
 from crane.common.threads import ThreadLocal
-from crane.dynamics.frame_jacobians import frame_placement, point_jacobian
+from crane.dynamics.frame_jacobians import frame_jacobian
 from crane.dynamics.joint_forces import REST_VELOCITY, JointForces
 from crane.machine.machine import Machine
 from crane.machine.massless_motions import (
     MIN_INERTIA_SHARE,
     describe_massless_motion,
     hold_coordinates,
+    is_definite,
 )
 
 
@@ -93,7 +94,7 @@ class PinocchioDynamics:
         self._coordinates, self._carrier_bodies = machine.coordinates, motion_parents
         self._held, self._tree = machine.held, machine.tree
         self._least_inertias = machine.least_inertias
-        self._tip = None if machine.tip is None else frame_placement(machine, machine.tip)
+        self._tip = None if machine.tip is None else machine.frame(machine.tip)
 
     @cached_property
     def _workspace(self) -> ThreadLocal[tuple[pin.Data, list[_Subtree]]]:
@@ -210,10 +211,9 @@ class PinocchioDynamics:
         ]
         out.append(gamma.T @ self._joint_forces.passive_forces(q, state.v))
         if self._tip is not None:
-            joint, place = self._tip[0], self._tip[1].translation
             pin.computeJointJacobians(model, data, self._coordinates.configuration(q))
-            out.append(data.oMi[joint].act(place))
-            out.append(point_jacobian(model, data, joint, place)[:3] @ gamma)
+            out.append(pin.updateFramePlacement(model, data, self._tip).translation)
+            out.append(frame_jacobian(model, data, self._tip)[:3] @ gamma)
         return np.concatenate([np.ravel(part) for part in out])
 
     def _accelerations_with_stick_slip(
@@ -280,13 +280,10 @@ class PinocchioDynamics:
     ) -> SingularMassMatrixError | None:
         """The error where M_A, without held coordinates, is singular as in `LdltFactorization`."""
         active = self._closure.active
-        least = self._least_inertias[active] + MIN_INERTIA_SHARE * np.diag(mass)
-        try:
-            factor = np.linalg.cholesky(np.delete(np.delete(mass, self._held, 0), self._held, 1))
-            if (np.diag(factor) ** 2 > margin * np.delete(least, self._held)).all():
-                return None
-        except np.linalg.LinAlgError:
-            pass
+        least = margin * (self._least_inertias[active] + MIN_INERTIA_SHARE * np.diag(mass))
+        moving = np.delete(np.arange(len(mass)), self._held)
+        if is_definite(mass[np.ix_(moving, moving)], least[moving]):
+            return None
         place = self._coordinates.format_values(active, state.q[active])
         motion = describe_massless_motion(
             self._model, self._closure, self._tree, state.q, state.gamma, mass

@@ -1,6 +1,6 @@
 """Evaluation of the quantities of a machine's dynamics, compiled or by Pinocchio."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +21,8 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, apply_per_sample, as_samples, stack_length
 from crane.description.machine_parameters import unknown_parameter_text
 from crane.dynamics.compiled_dynamics import (
+    MATRIX_QUANTITIES,
+    WITH_FRICTION,
     CompiledParameterDerivatives,
     CompiledQuantity,
 )
@@ -30,7 +32,7 @@ from crane.dynamics.pinocchio_dynamics import PinocchioDynamics
 from crane.formats.machine_loading import MachineVariants
 from crane.machine.machine import Machine
 from crane.machine.machine_checks import has_mass
-from crane.machine.massless_motions import MIN_INERTIA_SHARE
+from crane.machine.massless_motions import MIN_INERTIA_SHARE, is_definite
 
 UNIT_OF_ZERO_PARAMETER = 0.1  # magnitude assumed for a parameter that is 0
 _RELATIVE_STEP = 1e-3  # step as a fraction of the parameter
@@ -124,6 +126,18 @@ class ConstantDerivatives:
 
 
 BACKENDS = ("compiled", "pinocchio")
+QUANTITY_ARGUMENTS = {  # arguments of the quantities of `derivatives`
+    "inverse": ("q_a", "v_a", "a_a"),
+    "forward": ("q_a", "v_a", "tau_a"),
+    "mass_matrix": ("q_a",),
+    "bias": ("q_a", "v_a"),
+    "gravity": ("q_a",),
+    "friction": ("q_a", "v_a"),
+    "passive": ("q_a", "v_a"),
+    "energy": ("q_a", "v_a"),
+    "regressor": ("q_a", "v_a", "a_a"),
+    "statics": ("q_a",),
+}
 
 
 class QuantityEvaluator(OneLineRepr):
@@ -165,21 +179,19 @@ class QuantityEvaluator(OneLineRepr):
         self._parameter_derivatives: dict[
             tuple[str, tuple[str, ...]], CompiledParameterDerivatives
         ] = {}
-        self.formula_constants = np.zeros(0)
+        layout = self.formula_structure.constants_layout
+        self.formula_constants = np.zeros(layout.size)
         if self.backend == "compiled":
             geometry = machine.closure.compiled_closure.geometry
-            self.formula_constants = np.ascontiguousarray(
-                dynamics_constants(machine, geometry, self.forces, machine.least_inertias)
+            self.formula_constants[:] = dynamics_constants(
+                machine, geometry, self.forces, machine.least_inertias
             )
         # constants to fold into formulas; NaN for those that change with the motion
         self.constant_pattern = self.formula_constants.copy()
         self._mode_indices = self.formula_structure.stick_slip_mode_indices
-        self._circuit_friction_indices = self.formula_structure.constants_layout[
-            "circuit_friction"
-        ]
-        if self.backend == "compiled":
-            self.constant_pattern[self._mode_indices] = np.nan
-            self.constant_pattern[self._circuit_friction_indices] = np.nan
+        self._circuit_friction_indices = layout["circuit_friction"]
+        self.constant_pattern[self._mode_indices] = np.nan
+        self.constant_pattern[self._circuit_friction_indices] = np.nan
 
     def backend_of(self, quantity: str = "forward") -> str:
         """The backend that computes a quantity of `compiled_dynamics.QUANTITIES`."""
@@ -212,15 +224,10 @@ class QuantityEvaluator(OneLineRepr):
 
     def check_free_block(self, q_a: ArrayLike, free_block: Array) -> None:
         """Raise the error of a singular mass matrix of the free joints (..., k, k)."""
-        try:
-            pivots = np.diagonal(np.linalg.cholesky(free_block), axis1=-2, axis2=-1) ** 2
-            least = MIN_INERTIA_SHARE * np.diagonal(free_block, axis1=-2, axis2=-1)
-            machine = self.machine
-            least = least + machine.least_inertias[machine.closure.active][~machine.is_driven]
-            is_singular = bool((pivots <= least).any())
-        except np.linalg.LinAlgError:
-            is_singular = True
-        if is_singular:
+        machine = self.machine
+        least = machine.least_inertias[machine.closure.active][~machine.is_driven]
+        rounding = MIN_INERTIA_SHARE * np.diagonal(free_block, axis1=-2, axis2=-1)
+        if not is_definite(free_block, least + rounding):
             self.check_mass_matrices(self.machine.closure.solve(np.atleast_2d(q_a)))
 
     def check_mass_matrices(self, q: Array) -> None:
@@ -256,11 +263,8 @@ class QuantityEvaluator(OneLineRepr):
         They only affect the quantities of the integration, `STICK_SLIP_QUANTITIES`.
         """
         self.forces.set_stick_slip_modes(slip_sign, is_held, inverse_velocity, is_moving)
-        if self.backend == "compiled":
-            self.formula_constants[self._mode_indices] = [
-                *np.column_stack([slip_sign, is_held, inverse_velocity]).ravel(),
-                is_moving,
-            ]
+        modes = np.column_stack([slip_sign, is_held, inverse_velocity])
+        self.formula_constants[self._mode_indices] = [*modes.ravel(), is_moving]
 
     def set_circuit_friction(self, circuit_friction: Array) -> None:
         """Set the circuit friction; see `JointForces.set_circuit_friction`.
@@ -268,8 +272,7 @@ class QuantityEvaluator(OneLineRepr):
         It only affects the quantities of the integration, `STICK_SLIP_QUANTITIES`.
         """
         self.forces.set_circuit_friction(circuit_friction)
-        if self.backend == "compiled":
-            self.formula_constants[self._circuit_friction_indices] = circuit_friction
+        self.formula_constants[self._circuit_friction_indices] = circuit_friction
 
     def result_shape(self, quantity: str) -> tuple[int, ...]:
         """Shape of one sample of a quantity of `derivatives`."""
@@ -342,42 +345,40 @@ class QuantityEvaluator(OneLineRepr):
         code = self._parameter_derivatives[key]
         return np.array([code.evaluate_closed(*row) for row in zip(q, inputs, strict=True)])
 
-    def _evaluate(
-        self,
-        quantity: str,
-        shape: tuple[int, ...],
-        q_a: ArrayLike,
-        v_a: ArrayLike | None = None,
-        x: ArrayLike | None = None,
-        x_name: str = "",
-    ) -> Array:
-        """A quantity of samples or stacks; single samples apply to every row of a stack.
-
-        `shape` is that of one result, () for a vector.
-        """
+    def _evaluate(self, quantity: str, *arguments: ArrayLike) -> Array:
+        """A quantity of samples or stacks; single samples apply to every row of a stack."""
         formula = self._compiled_quantities.get(quantity)
-        if formula is not None and (out := formula.evaluate_sample(q_a, v_a, x)) is not None:
-            return out.reshape(shape) if shape else out
-        names, n = self.machine.active, self._mobility
-        q_a = as_samples(q_a, n, "q_a", names)
-        checked = [
-            as_samples(value, n, what, names)
-            for what, value in (("v_a", v_a), (x_name, x))
-            if value is not None
-        ]
-        length = stack_length((q_a, *checked))
+        if (
+            formula is not None
+            and (out := formula.sample_function.value.evaluate_sample(*arguments)) is not None
+        ):
+            return out
+        name = quantity.removesuffix(WITH_FRICTION).replace(" ", "_")
+        given = dict(zip(QUANTITY_ARGUMENTS[name], arguments, strict=True))
+        targets, rows, length = self._stack_arguments(given)
+        out = self._evaluate_stack(quantity, targets, rows, np.ndim(arguments[0]) == 2)
+        if quantity in MATRIX_QUANTITIES:
+            out = out.reshape(len(targets), self._mobility, -1)
+        return out[0] if length is None else out
+
+    def _stack_arguments(
+        self, arguments: Mapping[str, ArrayLike]
+    ) -> tuple[Array, Array, int | None]:
+        """q_A (N, n), the other arguments (N, 2 n), and N, None for a single sample.
+
+        Args:
+            arguments: Samples or stacks by name, q_A first.
+        """
+        n, names = self._mobility, self.machine.active
+        q_a, *others = (as_samples(x, n, name, names) for name, x in arguments.items())
+        length = stack_length((q_a, *others))
         count = 1 if length is None else length
         if count == 0:
             raise InputError("the stack is empty, give at least one sample")
         rows = np.zeros((count, 2 * n))
-        for i, array in enumerate(checked):
+        for i, array in enumerate(others):
             rows[:, i * n : (i + 1) * n] = array
-        out = self._evaluate_stack(
-            quantity, np.ascontiguousarray(np.broadcast_to(q_a, (count, n))), rows, q_a.ndim == 2
-        )
-        if shape:
-            return out.reshape(shape if length is None else (count, *shape))
-        return out[0] if length is None else out
+        return np.ascontiguousarray(np.broadcast_to(q_a, (count, n))), rows, length
 
     def _evaluate_stack(self, quantity: str, targets: Array, rows: Array, is_stack: bool) -> Array:
         closure, n = self.machine.closure, self._mobility
@@ -388,7 +389,9 @@ class QuantityEvaluator(OneLineRepr):
 
         def reach(i: int) -> None:
             sample = f" (sample {i})" if is_stack else ""
-            q = closure.continue_from_home(formula.cursor, targets[i], sample)
+            q = closure.continue_from_home(
+                formula.sample_function.value.cursor, targets[i], sample
+            )
             out[i] = self._evaluate_beside_change_point(formula, q, rows[i], sample)
             error = None if np.isfinite(out[i]).all() else self.singular_mass_error(q, sample)
             if error is not None and formula.solves_mass_matrix:

@@ -2,12 +2,13 @@
 
 import dataclasses
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crane.codegen import Layout
+from crane.codegen import Layout, run_with_fallback
 from crane.common.errors import ClosureError, InputError
 from crane.common.samples import Array
 from crane.dynamics.dynamics import Dynamics
@@ -87,20 +88,19 @@ class StaticsEvaluator:
             Configurations (N, nq), and whether each is closed on the branch of home (N,).
         """
         closure = self.machine.closure
-        q = np.array(q, order="C")
-        done, is_closed = 0, np.zeros(len(q), dtype=bool)
-        while done < len(q):
-            if closure.is_compiled:
-                count = closure.compiled_closure.close_in_place(q[done:])
-                is_closed[done : done + count] = True
-                done += count + 1
-                continue
-            try:
-                q[done] = closure.solve(q[done, closure.active], initial_guess=q[done])
-                is_closed[done] = True
-            except ClosureError:
-                pass
-            done += 1
+        q, is_closed = np.array(q, order="C"), np.ones(len(q), dtype=bool)
+        compiled = closure.compiled_closure if closure.is_compiled else None
+
+        def close(i: int) -> None:
+            is_closed[i] = False
+            if compiled is None:
+                with suppress(ClosureError):
+                    q[i] = closure.solve(q[i, closure.active], initial_guess=q[i])
+                    is_closed[i] = True
+
+        run_with_fallback(
+            len(q), None if compiled is None else lambda i: compiled.close_in_place(q[i:]), close
+        )
         return q, is_closed
 
     def coordinate_derivatives(self, q: Array) -> StaticQuantities:

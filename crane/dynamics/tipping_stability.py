@@ -8,7 +8,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from crane.common.errors import InputError
-from crane.common.samples import Array, as_samples
+from crane.common.samples import Array
 from crane.common.threads import ThreadLocal
 from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.description.ground_contact import Contact
@@ -118,10 +118,7 @@ class TippingStability:
         Args:
             q_a: (n,) or (N, n) [m], [rad].
         """
-        machine = self.machine
-        q = machine.closure.solve(
-            np.atleast_2d(as_samples(q_a, len(machine.active), "q_a", machine.active))
-        )
+        q = np.atleast_2d(self.machine.closure.solve(q_a))
         return self.tipping_margins(q, self.ground_wrench(q))
 
     def tipping_load(self, q_a: ArrayLike, frame: str | None = None) -> tuple[Array, list[str]]:
@@ -139,9 +136,7 @@ class TippingStability:
         link = machine.tip if frame is None else frame
         if link is None:
             raise InputError(f"'{machine.name}' has no tip, name the frame that a load hangs from")
-        q = machine.closure.solve(
-            np.atleast_2d(as_samples(q_a, len(machine.active), "q_a", machine.active))
-        )
+        q = np.atleast_2d(machine.closure.solve(q_a))
         moments = self.tipping_margins(q, self.ground_wrench(q)).moments
         hanging = self._frame_jacobians.frame_origins(q, [link])[:, 0]
         levers = self._moments_about_lines(

@@ -1,8 +1,5 @@
 """Errors and warnings about the home configuration and about other assembly modes of a machine."""
 
-import warnings
-from collections.abc import Sequence
-
 import numpy as np
 import pinocchio as pin
 
@@ -11,7 +8,7 @@ from crane.closure.closure import Closure
 from crane.closure.constraint_structure import OpenLoopError
 from crane.closure.constraint_tolerances import CLOSED_TOLERANCE
 from crane.closure.home_search import HomeSearchResult
-from crane.common.errors import CraneWarning, MechanismError
+from crane.common.errors import MechanismError, warn
 from crane.common.package_search import NEAREST_ASSEMBLY, own_argument
 from crane.common.samples import Array
 from crane.description.findings import report_error
@@ -54,9 +51,9 @@ def check_home(
                 )
             )
         else:
-            warnings.warn(_home_search_text(spec, closure, search), CraneWarning, stacklevel=3)
+            warn(_home_search_text(spec, closure, search), stacklevel=3)
     if message := _rounding_text(spec, closure):
-        warnings.warn(message, CraneWarning, stacklevel=3)
+        warn(message, stacklevel=3)
 
 
 def add_remedy(
@@ -149,7 +146,7 @@ def _coordinate_text(closure: Closure, column: int, value: float, verb: str = ""
     return f"{coordinates.names[column]}{verb} {value:.3g} {unit}"
 
 
-def _list_names(names: Sequence[str]) -> str:
+def _list_names(names: list[str]) -> str:
     remaining = len(names) - _MAX_LISTED
     return ", ".join(names[:_MAX_LISTED]) + (f" and {remaining} more" if remaining > 0 else "")
 
@@ -185,9 +182,7 @@ def warn_about_assembly_modes(
         remainder = f"; {len(alternatives) - 1} more such: crane check lists them"
         alternatives = alternatives[:1]
     for alternative in alternatives:
-        warnings.warn(
-            _alternative_text(spec, closure, alternative) + remainder, CraneWarning, stacklevel=3
-        )
+        warn(_alternative_text(spec, closure, alternative) + remainder, stacklevel=3)
 
 
 def alternative_configurations(machine: Machine) -> list[Array]:
@@ -217,16 +212,14 @@ def _alternative_text(spec: MachineSpec, closure: Closure, alternative: Assembly
     )
     names = closure.equations.coordinates.names
     deviation_text = _coordinate_text(closure, *alternative.largest_deviation)
-    home_text = "outside of limits"
-    if not alternative.home_outside_limits:
-        home_text = f"{_coordinate_text(closure, *alternative.home_deviation)} off what it says"
+    deviation = f"{_coordinate_text(closure, *alternative.home_deviation)} off what it says"
+    home_text = "outside of limits" if alternative.home_outside_limits else deviation
     columns = [int(i) for i in alternative.changed_columns]
     if len(columns) > _MAX_COORDINATES:  # with the largest differences
         differences = np.abs(closure.home - alternative.q)[columns]
         columns = [columns[i] for i in np.argsort(-differences, kind="stable")[:_MAX_LISTED]]
-    pattern = "{}: {:.4g}"
-    if spec.path.suffix in (".urdf", ".xacro"):
-        pattern = '<joint name="{}" value="{:.4g}"/>'
+    is_urdf = spec.path.suffix in (".urdf", ".xacro")
+    pattern = '<joint name="{}" value="{:.4g}"/>' if is_urdf else "{}: {:.4g}"
     home_values, alternative_values = (
         ", ".join(pattern.format(names[i], q[i]) for i in columns)
         for q in (closure.home, alternative.q)

@@ -1,10 +1,9 @@
 """Warnings about parts of a file that a conversion between formats leaves out or changes."""
 
-import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from crane.common.errors import CraneWarning
+from crane.common.errors import warn
 
 
 class ConversionNotes:
@@ -45,7 +44,7 @@ class ConversionNotes:
 
     def warn(self, text: str) -> None:
         """Issue a warning about the file."""
-        warnings.warn(f"{self.file.name}: {text}", CraneWarning, stacklevel=3)
+        warn(f"{self.file.name}: {text}", stacklevel=3)
 
     def _names_text(self, names: Iterable[str]) -> str:
         listed = list(dict.fromkeys(filter(None, names)))

@@ -2,18 +2,15 @@
 
 import re
 import shutil
-import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
-from xml.parsers import expat
 
 import numpy as np
 import yaml
+from lxml import etree
 
 from crane.common.atomic_output import check_file_is_writable, replace_file
-from crane.common.errors import CraneError, CraneWarning, OutputError
+from crane.common.errors import CraneError, OutputError, ignore_warnings
 from crane.common.package_search import NEAREST_ASSEMBLY
 from crane.common.unit_conversions import WrittenNumber
 from crane.description.machine_lookup import bundled_machines, example_robots
@@ -25,7 +22,12 @@ TextEdit = tuple[int, int, str]  # start, end, new text
 
 _SAME_HOME_TOLERANCE = 1e-9
 _BYTE_ORDER_MARK = "\ufeff"
-_TAG_PATTERN = re.compile(r"""<(?:[^>"']|"[^"]*"|'[^']*')*>""")
+# comments and the like, which have no name, and tags
+_TAG_PATTERN = re.compile(
+    r"""<!--.*?-->|<!\[CDATA\[.*?\]\]>|<\?.*?\?>"""
+    r"""|<(?P<slash>/?)(?P<name>[^\s/>]+)(?:[^>"']|"[^"]*"|'[^']*')*>""",
+    re.DOTALL,
+)
 _VALUE_PATTERN = re.compile(r"""(?<=\s)value\s*=\s*(?:"[^"]*"|'[^']*')""")
 
 
@@ -57,8 +59,7 @@ def write_home(
         OutputError: The file belongs to a package, is SDF or MJCF, or cannot be written.
         CraneError: As `load`.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
+    with ignore_warnings():
         machine = load(
             name,
             active=active,
@@ -83,7 +84,7 @@ def write_home(
             edited = edited[:start] + new + edited[end:]
         _replace_text(path, _BYTE_ORDER_MARK * text.startswith(_BYTE_ORDER_MARK) + edited)
         try:
-            _check_written_home(path, machine)
+            _check_written_home(path, machine, arguments)
         except CraneError:
             _replace_text(path, text)
             raise
@@ -96,20 +97,11 @@ def _replace_text(path: Path, text: str) -> None:
         shutil.copymode(path, temporary_file)
 
 
-def _without_lenience(machine: Machine) -> Machine:
-    return replace(
-        machine,
-        arguments=MappingProxyType(
-            {x: value for x, value in machine.arguments.items() if x != NEAREST_ASSEMBLY}
-        ),
-    )
-
-
 def _check_is_writable(machine: Machine, path: Path) -> None:
-    search = machine.closure.home_search
+    search, command_line = machine.closure.home_search, machine.command_line_arguments
     if search is None or not search.is_far:
-        machine = _without_lenience(machine)
-    copy_hint = f"write it into a copy: crane convert {machine.command_line_arguments} FOLDER"
+        command_line = command_line.replace(f" --arg {NEAREST_ASSEMBLY}:=true", "")
+    copy_hint = f"write it into a copy: crane convert {command_line} FOLDER"
     packaged_files = {
         place.resolve() for place in (*bundled_machines().values(), *example_robots().values())
     }
@@ -121,14 +113,16 @@ def _check_is_writable(machine: Machine, path: Path) -> None:
     check_file_is_writable(path)
 
 
-def _check_written_home(path: Path, expected: Machine) -> None:
+def _check_written_home(
+    path: Path, expected: Machine, arguments: Mapping[str, object] | None
+) -> None:
     try:
         machine = load(
             path,
             active=expected.chosen_joints.get("active"),
             free=expected.chosen_joints.get("free"),
             packages=expected.packages,
-            arguments=_without_lenience(expected).arguments,
+            arguments=arguments,
             trust_xacro=expected.trusts_xacro,
         )
     except CraneError as error:
@@ -147,41 +141,33 @@ def _yaml_edits(text: str, home: Mapping[str, float | str]) -> list[TextEdit]:
     top = yaml.compose(text, yaml.SafeLoader)
     assert isinstance(top, yaml.MappingNode), "it was read before"
     home_node = next((value for key, value in top.value if key.value == "home"), None)
-    if home_node is not None:
-        return _mapping_edits(text, home_node, home, line_break)
-    end = top.end_mark.index
-    if top.flow_style:
-        return [(end - 1, end - 1, f", home: {{{_flow_text(home)}}}")]
-    separator = "" if text[:end].endswith("\n") else line_break
-    return [(end, end, f"{separator}home:{_block_text(home, '  ', line_break)}{line_break}")]
-
-
-def _mapping_edits(
-    text: str, home_node: yaml.MappingNode, home: Mapping[str, float | str], line_break: str
-) -> list[TextEdit]:
+    if home_node is None and top.flow_style:
+        end = top.end_mark.index - 1
+        return [(end, end, f", home: {{{_flow_text(home)}}}")]
+    if home_node is None:
+        end = top.end_mark.index
+        separator = "" if text[:end].endswith("\n") else line_break
+        return [(end, end, f"{separator}home:{_block_text(home, '  ', line_break)}{line_break}")]
     span = range(home_node.start_mark.index, home_node.end_mark.index)
     has_shared_values = any(value.start_mark.index not in span for _, value in home_node.value)
     if has_shared_values or "&" in text[span.start : span.stop]:
         raise OutputError(
             "'home' shares values with other keys (&, *), write its numbers out first"
         )
-    edits: list[TextEdit] = [
-        (value.start_mark.index, value.end_mark.index, _yaml_text(home[key.value]))
-        for key, value in home_node.value
-    ]
-    missing = {
-        joint: home[joint] for joint in home if joint not in {k.value for k, _ in home_node.value}
-    }
-    if not missing:
-        return edits
-    if home_node.flow_style:
-        comma = ", " if home_node.value else ""
-        end = text.rindex("}", 0, home_node.end_mark.index)
-        return [*edits, (end, end, comma + _flow_text(missing))]
-    key, last = home_node.value[-1]
-    after = text.find("\n", last.end_mark.index)
-    end = len(text) if after < 0 else after - text[:after].endswith("\r")
-    return [*edits, (end, end, _block_text(missing, " " * key.start_mark.column, line_break))]
+    edits: list[TextEdit] = []
+    missing = dict(home)
+    for key, value in home_node.value:
+        new = _yaml_text(missing.pop(key.value))
+        edits.append((value.start_mark.index, value.end_mark.index, new))
+    if missing and home_node.flow_style:
+        end = text.rindex("}", 0, span.stop)
+        edits.append((end, end, (", " if home_node.value else "") + _flow_text(missing)))
+    elif missing:
+        key, last = home_node.value[-1]
+        after = text.find("\n", last.end_mark.index)
+        end = len(text) if after < 0 else after - text[:after].endswith("\r")
+        edits.append((end, end, _block_text(missing, " " * key.start_mark.column, line_break)))
+    return edits
 
 
 def _block_text(home: Mapping[str, float | str], indent: str, line_break: str) -> str:
@@ -201,71 +187,31 @@ def _yaml_text(value: str | float) -> str:
 
 
 def _xml_edits(text: str, home: Mapping[str, float | str]) -> list[TextEdit]:
-    data = text.encode("utf-8")
     line_break = "\r\n" if "\r\n" in text else "\n"
-    home_elements: list[tuple[int, int]] = []  # start of the start tag and of the end tag
-    joints: dict[str, int] = {}
-    is_home_element: list[bool] = []  # for each open element
-    end = 0
-    parser = expat.ParserCreate()
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        name = attributes.get("name", "").strip()
-        if is_home_element and is_home_element[-1] and tag == "joint":
-            joints[name] = parser.CurrentByteIndex
-        is_home_element.append(
-            len(is_home_element) == 1 and tag == "group_state" and name == "home"
-        )
-        if is_home_element[-1]:
-            home_elements.append((parser.CurrentByteIndex, -1))
-
-    def finish(_: str) -> None:
-        nonlocal end
-        if is_home_element.pop():
-            home_elements[-1] = (home_elements[-1][0], parser.CurrentByteIndex)
-        end = parser.CurrentByteIndex
-
-    parser.StartElementHandler, parser.EndElementHandler = start, finish
-    parser.Parse(data, True)
-
-    def place(index: int) -> int:
-        return len(data[:index].decode("utf-8"))
-
-    edits = []
-    for joint, index in joints.items():
-        tag = _TAG_PATTERN.match(text, place(index))
-        old = None if tag is None else _VALUE_PATTERN.search(text, tag.start(), tag.end())
+    tags = [tag for tag in _TAG_PATTERN.finditer(text) if tag["name"]]
+    start_tags = [tag for tag in tags if not tag["slash"]]
+    root = etree.fromstring(text.encode("utf-8"))
+    tag_of_element = dict(zip(root.iter(etree.Element), start_tags, strict=True))
+    states = [x for x in root.iterfind("group_state") if x.get("name", "").strip() == "home"]
+    edits: list[TextEdit] = []
+    missing = dict(home)
+    for element in (x for state in states for x in state.iterfind("joint")):
+        tag = tag_of_element[element]
+        old = _VALUE_PATTERN.search(text, tag.start(), tag.end())
         assert old is not None, "it was read before"
-        edits.append((old.start(), old.end(), f'value="{home[joint]!r}"'))
-    missing = {joint: home[joint] for joint in home if joint not in joints}
-    if not missing:
-        return edits
-    if not home_elements:
-        new_element = (
-            f'  <group_state name="home" group="all">{_joint_elements(missing, line_break)}'
-        )
-        return [*edits, (*(place(end),) * 2, f"{new_element}  </group_state>{line_break}")]
-    first, last = map(place, home_elements[0])
-    tag = _TAG_PATTERN.match(text, first)
-    assert tag is not None, "it was parsed"
-    if tag[0].endswith("/>"):
-        return [
-            *edits,
-            (
-                tag.start(),
-                tag.end(),
-                f"{tag[0][:-2].rstrip()}>{_joint_elements(missing, line_break)}  </group_state>",
-            ),
-        ]
-    return [*edits, (last, last, f"{_joint_elements(missing, line_break).lstrip()}  ")]
-
-
-def _joint_elements(home: Mapping[str, float | str], line_break: str) -> str:
-    from xml.sax.saxutils import quoteattr  # slow to import
-
-    return line_break + "".join(
-        (
-            f'    <joint name={quoteattr(x)} value="{value!r}"/>{line_break}'
-            for x, value in home.items()
-        )
-    )
+        value = missing.pop(element.get("name", "").strip())
+        edits.append((old.start(), old.end(), f'value="{value!r}"'))
+    joints = (etree.Element("joint", name=x, value=repr(value)) for x, value in missing.items())
+    texts = [etree.tostring(joint, encoding="unicode") for joint in joints]
+    new = "".join(f"{line_break}    {joint}" for joint in texts)
+    if missing and not states:
+        state = f'  <group_state name="home" group="all">{new}{line_break}  </group_state>'
+        end = tags[-1].start()
+        edits.append((end, end, f"{state}{line_break}"))
+    elif missing:
+        tag = tag_of_element[states[0]]
+        is_empty = tag[0].endswith("/>")
+        start = tag.end() - 2 * is_empty
+        end_tag = f">{new}{line_break}  </group_state>" if is_empty else new
+        edits.append((start, tag.end(), end_tag))
+    return edits

@@ -1,18 +1,24 @@
 """Load machines: read a description, assemble it and close its loops."""
 
 import json
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import fields
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import pinocchio as pin
 
 from crane.closure.closure import Closure
 from crane.closure.constraint_structure import OpenLoopError
-from crane.common.errors import CraneWarning, DescriptionError, InputError, summarize_warnings
+from crane.common.errors import (
+    DescriptionError,
+    InputError,
+    ignore_warnings,
+    summarize_warnings,
+)
 from crane.common.package_search import (
     check_argument_values,
     check_package_folders,
@@ -105,8 +111,9 @@ def load(
     ):
         chosen_joints = _check_chosen_joints(active=active, free=free)
         changes = _with_gravity(changes or {}, gravity)
-        spec = _read_spec(name, chosen_joints, floating)
-        return _assemble_machine(spec, changes, lock, chosen_joints, floating)
+        return _assemble_machine(
+            _read_spec(name, chosen_joints, floating), changes, lock, chosen_joints, floating
+        )
 
 
 def _with_gravity(
@@ -128,6 +135,8 @@ def _with_gravity(
 
 
 ClosureProvider = Callable[[pin.Model, Sequence[LoopSpec], Sequence[Coupling]], Closure | None]
+# fields that a machine has as its description has them
+_DESCRIBED_FIELDS = {x.name for x in fields(Machine)} - {"active", "free", "external_forces"}
 _MAX_KNOWN_CLOSURES = 3  # of variants, kept for reuse
 # Descriptions of machines before changes and locks, so that `MachineVariants` can reuse them
 _SPEC_BEFORE_CHANGES: WeakKeyDictionary[Closure, MachineSpec] = WeakKeyDictionary()
@@ -178,8 +187,7 @@ class MachineVariants:
 
         No warnings are issued; see `Closure.perturbed_machine`.
         """
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", CraneWarning)
+        with ignore_warnings():
             return self._build_variant(changes, self._machine.closure.with_perturbed_model)
 
     def _build_variant(
@@ -242,28 +250,18 @@ def _assemble_machine(
     check_frame_elements(spec, closure)
     coordinates = closure.equations.coordinates
     lower, upper = coordinates.lower, coordinates.upper
+    described: dict[str, Any] = {
+        name: MappingProxyType(dict(value)) if isinstance(value, Mapping) else value
+        for name, value in vars(spec).items()
+        if name in _DESCRIBED_FIELDS
+    }
     machine = Machine(
-        name=spec.name,
-        source=spec.source,
-        path=spec.path,
-        chains=spec.chains,
-        tree=spec.tree,
+        **described,
         model=model,
         closure=closure,
         active=closure.active_names,
         lower=read_only_copy(lower[closure.active]),
         upper=read_only_copy(upper[closure.active]),
-        friction=MappingProxyType(dict(spec.friction)),
-        forces=spec.forces,
-        gas_springs=spec.gas_springs,
-        ropes=spec.ropes,
-        end_stops=spec.end_stops,
-        estimation=spec.estimation,
-        tip=spec.tip,
-        tasks=MappingProxyType(dict(spec.tasks)),
-        control=MappingProxyType(dict(spec.control)),
-        hydraulics=spec.hydraulics,
-        sensors=MappingProxyType(dict(spec.sensors)),
         chosen_joints=MappingProxyType(dict(chosen_joints)),
         floating_base=floating,
         packages=load_options().packages,
@@ -274,11 +272,8 @@ def _assemble_machine(
         ),
         free=select_free_joints(spec, closure.active_names, held),
         external_forces=(),
-        supports=spec.supports,
-        pin_capacities=MappingProxyType(dict(spec.pin_capacities)),
         explicit_drives=select_motors(spec, closure.active_names),
         locked_joints=MappingProxyType({name: float(value) for name, value in lock.items()}),
-        written_numbers=MappingProxyType(dict(spec.written_numbers)),
     )
     return machine.with_external_forces(*spec.external_forces) if spec.external_forces else machine
 

@@ -2,9 +2,10 @@
 
 import dataclasses
 import re
+from itertools import permutations
 from pathlib import Path
 
-from crane.common.errors import DescriptionError, suggest_names
+from crane.common.errors import DescriptionError
 from crane.common.package_search import read_plain_file
 from crane.description.key_types import (
     Key,
@@ -15,11 +16,11 @@ from crane.description.key_types import (
 )
 from crane.description.kinematic_tree import Joint, Link, Tree, joint_series
 from crane.description.specification import Chain, Drive, LoopSpec, MachineSpec, source_locations
-from crane.formats.machine_file.structure_sections import TreeBuilder, read_home
+from crane.formats.machine_file.structure_sections import TreeBuilder, links_by_name, read_home
 from crane.formats.machine_file.yaml_section import YamlSection
 from crane.formats.machine_file.yaml_text import MAX_FILE_SIZE, format_value
 from crane.formats.urdf.link_joint_elements import MOVABLE_TYPES
-from crane.formats.urdf.urdf_reader import UrdfModel, read_urdf
+from crane.formats.urdf.urdf_reader import read_urdf
 from crane.formats.xml_file import XmlFile
 
 URDF_FILE = "robot.urdf"
@@ -39,8 +40,10 @@ _CONVENTION_PATTERN = re.compile(r"^(closed_loop|name_mot)\s*:", re.MULTILINE)
 _MACHINE_FILE_PATTERN = re.compile(r"^(chains|name)\s*:", re.MULTILINE)
 _LOOP_TYPES = {"3d": "spherical", "6d": "fixed"}
 _AXES = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
-_JOINT_TYPES = ("SPHERICAL", "FIXED", "UJOINT_XY", "UJOINT_YZ", "UJOINT_ZX", "CARDAN")
-_UNIVERSAL_PATTERN = re.compile(r"UJOINT_([XYZ])([XYZ])")
+_UNIVERSAL_AXES = {"CARDAN": ("X", "Y")} | {
+    f"UJOINT_{first}{second}": (first, second) for first, second in permutations("XYZ", 2)
+}
+_JOINT_TYPES = ("SPHERICAL", "FIXED", *_UNIVERSAL_AXES)
 
 
 def is_parallel_robot(file: Path) -> bool:
@@ -69,24 +72,17 @@ def read_parallel_robot(path: Path) -> MachineSpec:
     replaced_types = _replaced_joint_types(top)
     urdf = read_urdf(file, lambda xml: _replace_joint_types(xml, replaced_types, top))
     for joint, kind in replaced_types.items():
-        if kind not in ("SPHERICAL", "FIXED"):
-            universal_axes = _UNIVERSAL_PATTERN.fullmatch(kind)
-            urdf = _split_universal_joint(
-                urdf,
-                joint,
-                (universal_axes[1], universal_axes[2]) if universal_axes else ("X", "Y"),
-            )
+        if kind in _UNIVERSAL_AXES:
+            urdf = _split_universal_joint(urdf, joint, _UNIVERSAL_AXES[kind])
     if urdf.loops:
         raise DescriptionError(
             f"{urdf.loops[0].source_location}: the loops stand in {path.name}, keep <loop> or "
             "closed_loop"
         )
-    chain = Chain(urdf.name, file, None, path.name, urdf.moving_joints)
-    tree = TreeBuilder()
-    tree.add_chain(chain, urdf)
+    tree = TreeBuilder(urdf.tree, urdf.is_complete)
     if not tree.joints:
         raise DescriptionError(f"{file.name}: no joint moves in this file, add one")
-    loops = _read_loops(top, urdf, tree)
+    loops = _read_loops(top, tree)
     motors = top.names("name_mot")
     for joint in motors:
         if joint not in tree.joints and joint in replaced_types:
@@ -100,19 +96,16 @@ def read_parallel_robot(path: Path) -> MachineSpec:
     locations["active"] = top.source_location("name_mot")
     if "home" in top:
         locations["home"] = top.source_location("home")
-    return MachineSpec(
-        name=urdf.name,
+    return dataclasses.replace(
+        urdf,
         source=path.name,
         path=path,
-        chains=(chain,),
-        tree=tree.tree,
+        chains=(Chain(urdf.name, file, None, path.name, tuple(tree.joints)),),
         loops=loops,
         active=motors,
         home=home,
         drives=tuple(Drive(joint, {joint: 1.0}) for joint in motors),
-        friction=urdf.friction,
         tip=tree.single_leaf_link(),
-        couplings=urdf.couplings,
         source_locations=locations,
     )
 
@@ -127,24 +120,14 @@ def _replaced_joint_types(top: YamlSection) -> dict[str, str]:
             "joint_type", f"{len(types)} joint types for {len(names)} joints, give one of each"
         )
     for kind in types:
-        universal_axes = _UNIVERSAL_PATTERN.fullmatch(kind)
-        if kind not in _JOINT_TYPES and (
-            universal_axes is None or universal_axes[1] == universal_axes[2]
-        ):
-            raise top.error_at(
-                "joint_type",
-                f"joint type '{kind}' is unknown, {suggest_names(_JOINT_TYPES, kind)}",
-            )
+        top.check_name("joint_type", kind, _JOINT_TYPES, f"joint type '{kind}' is unknown")
     return dict(zip(names, types, strict=True))
 
 
 def _replace_joint_types(xml: XmlFile, replaced_types: dict[str, str], top: YamlSection) -> None:
     joints = {joint.get("name", "").strip(): joint for joint in xml.root.iterfind("joint")}
     for name, kind in replaced_types.items():
-        if name not in joints:
-            raise top.error_at(
-                "joint_name", f"joint '{name}' is unknown, {suggest_names(joints, name)}"
-            )
+        top.check_name("joint_name", name, joints, f"joint '{name}' is unknown")
         joint = joints[name]
         if joint.get("type") not in MOVABLE_TYPES:
             raise top.error_at(
@@ -157,7 +140,7 @@ def _replace_joint_types(xml: XmlFile, replaced_types: dict[str, str], top: Yaml
         joint.attrib.pop("independent", None)
 
 
-def _split_universal_joint(urdf: UrdfModel, name: str, axes: tuple[str, str]) -> UrdfModel:
+def _split_universal_joint(urdf: MachineSpec, name: str, axes: tuple[str, str]) -> MachineSpec:
     """Return the URDF with a universal joint as two joints, the first at the parent."""
     parts: list[Link | Joint] = []
     for part in urdf.tree:
@@ -177,7 +160,7 @@ def _split_universal_joint(urdf: UrdfModel, name: str, axes: tuple[str, str]) ->
     return dataclasses.replace(urdf, tree=Tree({}, {}).with_parts(*parts))
 
 
-def _read_loops(top: YamlSection, urdf: UrdfModel, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
+def _read_loops(top: YamlSection, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
     """Return the loops between the frames of `closed_loop`: spherical or fixed."""
     pairs: list[list[str]] = []
     if "closed_loop" in top:
@@ -197,21 +180,14 @@ def _read_loops(top: YamlSection, urdf: UrdfModel, tree: TreeBuilder) -> tuple[L
         raise top.error_at(
             "type", f"{len(kinds)} types for {len(pairs)} closed loops, give each one"
         )
-    child_links = {joint.name: joint.child for joint in urdf.tree.joints.values()}
+    link_of_name = links_by_name(tree.tree)
     loops: dict[str, LoopSpec] = {}
     for pair, kind in zip(pairs, kinds, strict=True):
         if kind.lower() not in _LOOP_TYPES:
             raise top.error_at("type", f"a closed loop has the type '{kind}', write 3d or 6d")
-        links = [name if name in tree.links else child_links.get(name, "") for name in pair]
-        unknown_frames = [name for name, link in zip(pair, links, strict=True) if not link]
-        if unknown_frames:
-            raise top.error_at(
-                "closed_loop",
-                (
-                    f"the frame '{unknown_frames[0]}' is unknown, "
-                    f"{suggest_names(tree.links, unknown_frames[0])}"
-                ),
-            )
+        for frame in pair:
+            problem = f"the frame '{frame}' is unknown"
+            top.check_name("closed_loop", frame, link_of_name, problem)
         name = f"{pair[0]}_{pair[1]}"
         if name in loops:
             raise top.error_at(
@@ -220,8 +196,8 @@ def _read_loops(top: YamlSection, urdf: UrdfModel, tree: TreeBuilder) -> tuple[L
         loop = LoopSpec(
             name,
             _LOOP_TYPES[kind.lower()],
-            links[0],
-            links[1],
+            link_of_name[pair[0]],
+            link_of_name[pair[1]],
             (0.0, 0.0, 1.0),
             top.source_location("closed_loop"),
         )

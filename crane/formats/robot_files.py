@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +10,12 @@ from typing import Any
 
 from lxml import etree
 
-from crane.common.errors import CraneWarning, DescriptionError, InputError, suggest_names
+from crane.common.errors import (
+    DescriptionError,
+    InputError,
+    ignore_warnings,
+    suggest_names,
+)
 from crane.common.optional_libraries import installation_hint
 from crane.common.package_search import OWN_ARGUMENTS, load_options, use_load_options
 from crane.description.force_elements import ForceElement
@@ -36,8 +40,9 @@ def _expand_xacro(xml: XmlFile) -> XmlFile:
     """
     answer = _run_xacro_process(xml.file)
     if "missing" in answer:
-        hint = installation_hint("xacro")
-        raise DescriptionError(f"{xml.file.name}: is written with xacro, {hint}")
+        raise DescriptionError(
+            f"{xml.file.name}: is written with xacro, {installation_hint('xacro')}"
+        )
     if "wrong" in answer:
         location = Path(answer.get("file") or xml.file).name
         location += f":{answer['line']}" if "line" in answer else ""
@@ -53,7 +58,9 @@ def _expand_xacro(xml: XmlFile) -> XmlFile:
                 f"{xml.file.name} has no argument '{name}', "
                 f"{suggest_names(answer['arguments'], name)}"
             )
-    parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
+    parser = etree.XMLParser(
+        resolve_entities=False, no_network=True, remove_comments=True, remove_pis=True
+    )
     root = etree.fromstring(answer["text"].encode("utf-8"), parser)
     locations = {xml.file.name: 0}
     for element in root.iter(etree.Element):
@@ -93,8 +100,7 @@ def open_robot(file: Path) -> tuple[XmlFile, tuple[ForceElement, ...]]:
     """
     xml = XmlFile(file)
     if file.suffix.lower() == ".xacro" or any(
-        isinstance(element.tag, str) and element.tag.startswith("{") and "xacro" in element.tag
-        for element in xml.root.iter()
+        element.tag.startswith("{") and "xacro" in element.tag for element in xml.root.iter()
     ):
         xml = _expand_xacro(xml)
     if file.suffix.lower() in _SDF_SUFFIXES and xml.root.tag not in ("sdf", "robot"):
@@ -136,8 +142,7 @@ def open_robots(machine: Machine, chains: Iterable[str] | None = None) -> Iterat
     """
     chain_names = None if chains is None else set(chains)
     with use_load_options(machine.packages, machine.arguments, trust_xacro=machine.trusts_xacro):
-        with warnings.catch_warnings():  # they were issued when it was loaded
-            warnings.simplefilter("ignore", CraneWarning)
+        with ignore_warnings():  # they were issued when it was loaded
             documents = [
                 open_robot(chain.urdf)[0]
                 for chain in machine.chains

@@ -5,19 +5,21 @@ Reading expands no entities, has no network access, and names source locations i
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
 from lxml import etree
 
-from crane.common.errors import DescriptionError, suggest_names
+from crane.common.errors import DescriptionError, check_name, suggest_names, warn
 from crane.common.number_text import parse_float
 from crane.common.package_search import read_plain_file
 from crane.description.findings import report_error
 from crane.description.kinematic_tree import (
     NO_LIMIT,
+    TENSOR_ATTRIBUTES,
+    X_AXIS,
     Inertial,
     Joint,
     Limits,
@@ -27,9 +29,7 @@ from crane.description.kinematic_tree import (
 )
 from crane.description.specification import AXISLESS_TYPES, unit_vector
 
-TENSOR_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 MAX_FILE_SIZE = 50_000_000  # bytes
-_X = (1.0, 0.0, 0.0)
 _ROOT_ELEMENTS = {  # by suffix, if not a <robot>
     ".sdf": "an <sdf>", ".world": "an <sdf>", ".mjcf": "a <mujoco>",
     ".xml": "a <robot>, an <sdf> or a <mujoco>",
@@ -130,6 +130,16 @@ class XmlFile:
         """Return an error with the source location of an element."""
         return DescriptionError(f"{self.source_location(element)}: {problem}")
 
+    def check_name(
+        self, element: etree._Element, name: str, names: Collection[str], problem: str
+    ) -> None:
+        """Raise for a name in an element that is not among some."""
+        check_name(name, names, f"{self.source_location(element)}: {problem}", DescriptionError)
+
+    def warn(self, element: etree._Element, problem: str) -> None:
+        """Warn with the source location of an element."""
+        warn(f"{self.source_location(element)}: {problem}", stacklevel=4)
+
     def report(self, element: etree._Element, problem: str, harmless: bool = False) -> None:
         """Raise an error with the source location of an element, or record it.
 
@@ -162,8 +172,6 @@ class XmlFile:
         self._check_attributes(element, attributes.get(element.tag, set()), closed_elements)
         tags = children.get(element.tag, set())
         for child in element:
-            if not isinstance(child.tag, str):  # an entity, not expanded
-                continue
             if child.tag not in tags:
                 self._check_unknown_child(element, child, children)
             if child.tag in tags:  # possibly after a correction
@@ -291,12 +299,12 @@ class XmlFile:
             DescriptionError: It is zero or malformed.
         """
         if element.get("type") in AXISLESS_TYPES:
-            return _X
+            return X_AXIS
         axis = self.single_child(element, "axis", label)
         xyz = default if axis is None else self.vector(axis, "xyz", f"the axis of {label}", 3)
         if (unit := unit_vector(xyz)) is None:
             self.report(axis, f"the axis of {label} is zero, give a direction")
-            return _X
+            return X_AXIS
         return unit
 
     def placement(self, element: etree._Element, label: str) -> Placement:
@@ -313,6 +321,14 @@ class XmlFile:
             self.vector(origin, key, f"the origin of {label}", 3, zero) for key in ("xyz", "rpy")
         )
         return (x, y, z), (roll, pitch, yaw)
+
+
+def parse_attribute(element: etree._Element, key: str) -> list[float]:
+    """Return the numbers of an attribute, none if it is malformed, which others report."""
+    try:
+        return [parse_float(word) for word in element.get(key, "").split()]
+    except ValueError:
+        return []
 
 
 def format_numbers(values: Sequence[float] | np.ndarray) -> str:

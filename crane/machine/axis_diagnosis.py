@@ -63,7 +63,12 @@ def find_wrong_axis(
             column = loop_columns[odd] if odd < len(loop_columns) else None
             if column is not None and not model.existJointName(names[column]):
                 continue  # a floating base has no axes
-            frame = _axis_frame(model, data, loop if column is None else names[column])
+            # axes of the frame in which the axis is written
+            frame = (
+                pin.updateFramePlacement(model, data, frame_id(model, loop.predecessor))
+                if column is None
+                else data.oMi[model.getJointId(names[column])]
+            ).rotation
             corrected_axis = _corrected_axis(
                 frame.T @ axes[odd][0], frame.T @ normal, is_rotation[odd]
             )
@@ -82,17 +87,6 @@ def find_wrong_axis(
                 spec, labels[odd], axes[odd][0], normal, corrected_axis, is_rotation[odd], others
             )
     return None
-
-
-def _axis_frame(model: pin.Model, data: pin.Data, element: LoopSpec | str) -> Array:
-    """Axes (3, 3) of the frame in which the axis of a loop or joint is written."""
-    if isinstance(element, LoopSpec):
-        link = model.frames[frame_id(model, element.predecessor)]
-        frame: Array = data.oMi[link.parentJoint].rotation @ link.placement.rotation
-    else:
-        joint = model.getJointId(element)
-        frame = data.oMi[model.parents[joint]].rotation @ model.jointPlacements[joint].rotation
-    return frame
 
 
 def _misaligned_axes(axes: list[list[Array]], is_rotation: list[bool]) -> list[tuple[int, Array]]:

@@ -15,6 +15,7 @@ coordinates of driven joints are tried like lengths.
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -23,7 +24,9 @@ from numpy.typing import NDArray
 from crane.closure.constraint_tolerances import FILE_PRECISION
 from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
+from crane.closure.multi_start_search import closest_approach
 from crane.common.samples import Array
+from crane.description.kinematic_tree import path_to_root
 from crane.description.machine_parameters import tree_parameters, value_at
 from crane.description.specification import LoopSpec, MachineSpec
 from crane.machine.drive_selection import specified_active_joints
@@ -104,11 +107,9 @@ def diagnose_closure(spec: MachineSpec, model: pin.Model, guess: Array) -> Closu
     passive = np.setdiff1d(np.arange(model.nv), active)
     in_loops = (equations.sign != 0).any(axis=0)[passive]
     specified = np.isin(names, list(spec.home))[passive]
-    guess = _nearest(
-        equations,
-        guess,
-        passive[in_loops & ~specified],
-        lambda q, _: (*equations.evaluate_scaled(q), guess),
+    undecided = passive[in_loops & ~specified]
+    guess = closest_approach(
+        equations, guess, undecided, equations.evaluate_scaled, max_nfev=_MAX_EVALUATIONS
     )
     phi, size = equations.evaluate(guess)[0], equations.characteristic_length
     loop_rows = [
@@ -141,8 +142,8 @@ def diagnose_closure(spec: MachineSpec, model: pin.Model, guess: Array) -> Closu
     )
 
 
-# from q (nq,) and the scaled change of a parameter: phi (m,), dphi/dq, dphi/dp, all scaled
-ChangedResidual = Callable[[Array, float], tuple[Array, Array, Array]]
+# from the scaled change of a parameter and q (nq,): phi (m,), dphi/dq, dphi/dp, all scaled
+ChangedResidual = Callable[[float, Array], tuple[Array, Array, Array]]
 
 
 def _parameters_in_loops(
@@ -156,28 +157,6 @@ def _parameters_in_loops(
     joints = {joint for loop in loops for joint in _joints(spec, loop)}
     size = equations.characteristic_length
 
-    def length(other: LoopEquations) -> ChangedResidual:
-        def changed(q: Array, change: float) -> tuple[Array, Array, Array]:
-            (phi, jacobian), (other_phi, other_jacobian) = equations.evaluate(q), other.evaluate(q)
-            units = equations.residual_units
-            jacobian = (
-                (jacobian + change * (other_jacobian - jacobian))
-                / units[:, None]
-                * equations.coordinate_units
-            )
-            return (phi + change * (other_phi - phi)) / units, jacobian, (other_phi - phi) / units
-
-        return changed
-
-    def drive(column: int) -> ChangedResidual:
-        def changed(q: Array, change: float) -> tuple[Array, Array, Array]:
-            moved = q.copy()
-            moved[column] += change * equations.coordinate_units[column]
-            phi, jacobian = equations.evaluate_scaled(moved)
-            return phi, jacobian, jacobian[:, column]
-
-        return changed
-
     for name, part, path in tree_parameters(spec.tree, spec.chains):
         if path[0] != "xyz" or part.name not in joints or not (value := value_at(part, path)):
             continue
@@ -185,26 +164,49 @@ def _parameters_in_loops(
         x, y, z = (x + size * (i == path[1]) for i, x in enumerate(joint.xyz))
         joint = dataclasses.replace(joint, xyz=(x, y, z))
         moved = assemble_tree(dataclasses.replace(spec, tree=spec.tree.with_parts(joint)))
-        yield name, value, size, False, length(LoopEquations(moved, spec.loops, spec.couplings))
+        other = LoopEquations(moved, spec.loops, spec.couplings)
+        yield name, value, size, False, partial(_evaluate_with_length, equations, other)
     for column in active:
         name = equations.coordinates.names[column]
         if name in joints and name in spec.home:
             unit = float(equations.coordinate_units[column])
             is_angle = not equations.coordinates.is_translation[column]
-            yield f"home {name}", float(guess[column]), unit, is_angle, drive(column)
+            moved_drive = partial(_evaluate_with_drive, equations, column)
+            yield f"home {name}", float(guess[column]), unit, is_angle, moved_drive
+
+
+def _evaluate_with_length(
+    equations: LoopEquations, other: LoopEquations, change: float, q: Array
+) -> tuple[Array, Array, Array]:
+    """`ChangedResidual` of a length, which is one characteristic length more in `other`."""
+    (phi, jacobian), (other_phi, other_jacobian) = equations.evaluate(q), other.evaluate(q)
+    units = equations.residual_units
+    jacobian = (
+        (jacobian + change * (other_jacobian - jacobian))
+        / units[:, None]
+        * equations.coordinate_units
+    )
+    return (phi + change * (other_phi - phi)) / units, jacobian, (other_phi - phi) / units
+
+
+def _evaluate_with_drive(
+    equations: LoopEquations, column: int, change: float, q: Array
+) -> tuple[Array, Array, Array]:
+    """`ChangedResidual` of the home coordinate of a driven joint."""
+    moved = q.copy()
+    moved[column] += change * equations.coordinate_units[column]
+    phi, jacobian = equations.evaluate_scaled(moved)
+    return phi, jacobian, jacobian[:, column]
 
 
 def _joints(spec: MachineSpec, loop: LoopSpec) -> set[str]:
     """Joints of the tree in a loop, including fixed ones."""
-    above = {joint.child: joint for joint in spec.tree.joints.values()}
-    paths = []
-    for link in (loop.predecessor, loop.successor):
-        path = set()
-        while link in above:
-            path.add(above[link].name)
-            link = above[link].parent
-        paths.append(path)
-    return paths[0] ^ paths[1]
+    above = spec.tree.parent_joints
+    one, two = (
+        {joint.name for joint in path_to_root(above, link)}
+        for link in (loop.predecessor, loop.successor)
+    )
+    return one ^ two
 
 
 def _closing_change(
@@ -219,7 +221,7 @@ def _closing_change(
     weights = np.append(np.where(specified, 1.0, _FREE_WEIGHT), _FREE_WEIGHT)
     for _ in range(_MAX_ITERATIONS):
         q = equations.displace(guess, passive, x[:-1])
-        gap, jacobian, derivative = changed(q, float(x[-1]))
+        gap, jacobian, derivative = changed(float(x[-1]), q)
         matrix = np.column_stack([jacobian[:, passive], derivative])
         solution = np.linalg.lstsq(matrix / weights, matrix @ x - gap, rcond=1e-12)[0] / weights
         step = np.abs(solution - x).max()
@@ -242,8 +244,9 @@ def _smallest_closing_change(
     """
     q, change = guess.copy(), 0.0
     for _ in range(_MAX_CHANGES):
-        q = _nearest(equations, q, passive, changed, change)
-        phi, _, derivative = changed(q, change)
+        at_change = partial(changed, change)
+        q = closest_approach(equations, q, passive, at_change, max_nfev=_MAX_EVALUATIONS)
+        phi, _, derivative = changed(change, q)
         if np.abs(phi).max() < FILE_PRECISION:
             return change, abs(change)
         lever = float(phi @ derivative)
@@ -251,30 +254,3 @@ def _smallest_closing_change(
             return None
         change -= float(phi @ phi) / lever
     return None
-
-
-def _nearest(
-    equations: LoopEquations,
-    q: Array,
-    free: Indices,
-    changed: ChangedResidual,
-    change: float = 0.0,
-) -> Array:
-    """The configuration of least squared residuals, from one nearby."""
-    from scipy.optimize import least_squares  # slow to import, only needed for open loops
-
-    def configuration(x: Array) -> Array:
-        return equations.displace(q, free, x)
-
-    if not len(free):
-        return q
-
-    def gap(x: Array) -> Array:
-        return changed(configuration(x), change)[0]
-
-    def jacobian(x: Array) -> Array:
-        return changed(configuration(x), change)[1][:, free]
-
-    return configuration(
-        least_squares(gap, np.zeros(len(free)), jacobian, max_nfev=_MAX_EVALUATIONS).x
-    )

@@ -3,9 +3,8 @@
 import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -20,17 +19,8 @@ from crane.common.errors import InputError, LimitError, suggest_names
 from crane.common.one_line_repr import OneLineRepr, format_count
 from crane.common.package_search import LoadOptions
 from crane.common.samples import Array, as_samples, read_only_copy
-from crane.common.unit_conversions import KeyPath, WrittenNumber
 from crane.description.external_forces import ExternalForce, PhasedWrench
-from crane.description.force_elements import (
-    AnyForceElement,
-    EndStop,
-    ForceElement,
-    Friction,
-    GasSpring,
-    Rope,
-)
-from crane.description.kinematic_tree import Tree
+from crane.description.force_elements import EndStop, ForceElement, Friction, GasSpring, Rope
 from crane.description.machine_lookup import (
     CHANGES_SEPARATOR,
     bundled_machines,
@@ -39,17 +29,21 @@ from crane.description.machine_lookup import (
 )
 from crane.description.pinocchio_conversion import add_rigid_load
 from crane.description.sensors import Sensor
-from crane.description.specification import Chain, Drive, EstimationSettings, PIGains, Task
+from crane.description.specification import Drive, EstimationSettings, MachineParts
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.machine.machine_checks import check_force_elements, check_limited
-from crane.machine.massless_motions import IdleMotionProperties
+from crane.machine.massless_motions import (
+    find_idle_motions,
+    least_inertias,
+    select_held_coordinates,
+)
 from crane.machine.payload import Payload
 
 _LIMIT_TOLERANCE = 1e-9  # scaled distance beyond a limit that counts as on it
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Machine(IdleMotionProperties, OneLineRepr):
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Machine(OneLineRepr, MachineParts):
     """A machine with closed kinematic chains, assembled and closed.
 
     Attributes:
@@ -90,31 +84,11 @@ class Machine(IdleMotionProperties, OneLineRepr):
         written_numbers: Numbers of its machine file with their units, by the keys to them.
     """
 
-    name: str
-    source: str
-    path: Path
-    chains: tuple[Chain, ...]
-    tree: Tree
     model: pin.Model
     closure: Closure
     active: tuple[str, ...]
     lower: Array
     upper: Array
-    friction: Mapping[str, Friction]
-    forces: tuple[ForceElement, ...]
-    gas_springs: tuple[GasSpring, ...]
-    ropes: tuple[Rope, ...]
-    end_stops: tuple[EndStop, ...]
-    tip: str | None
-    tasks: Mapping[str, Task]
-    control: Mapping[str, PIGains]
-    hydraulics: Hydraulics | None
-    estimation: EstimationSettings
-    sensors: Mapping[str, Sensor]
-    free: tuple[str, ...]
-    external_forces: tuple[ExternalForce, ...]
-    supports: tuple[str, ...]
-    pin_capacities: Mapping[str, float]
     explicit_drives: tuple[Drive, ...]
     parameter_changes: Mapping[str, float]
     locked_joints: Mapping[str, float]
@@ -122,8 +96,7 @@ class Machine(IdleMotionProperties, OneLineRepr):
     floating_base: bool | tuple[str, ...]
     packages: tuple[str, ...]
     arguments: Mapping[str, str]
-    trusts_xacro: bool = False
-    written_numbers: Mapping[KeyPath, WrittenNumber] = field(default_factory=dict)
+    trusts_xacro: bool
 
     def _one_line(self) -> str:
         words = [
@@ -155,11 +128,6 @@ class Machine(IdleMotionProperties, OneLineRepr):
     def has_traceable_forces(self) -> bool:
         """Whether all external forces can be compiled."""
         return all(force.is_traceable for force in self.external_forces)
-
-    @property
-    def force_elements(self) -> tuple[AnyForceElement, ...]:
-        """Force elements, gas springs and ropes, along joints and between frames."""
-        return (*self.forces, *self.gas_springs, *self.ropes)
 
     @property
     def undriven_joints(self) -> tuple[str, ...]:
@@ -243,6 +211,16 @@ class Machine(IdleMotionProperties, OneLineRepr):
     def joints(self) -> tuple[str, ...]:
         """Names of all coordinates of the tree in the order of q, with those of floating bases."""
         return self.coordinates.names
+
+    @cached_property
+    def held(self) -> tuple[int, ...]:
+        """Indices of active coordinates that are held for idle motions: they keep their speed."""
+        return select_held_coordinates(find_idle_motions(self.model, self.closure))
+
+    @cached_property
+    def least_inertias(self) -> Array:
+        """(nv,) inertia of each joint that counts as none [kg], [kg m2]."""
+        return least_inertias(self.model, self.closure)
 
     def column(self, joint: str) -> int:
         """Index of a joint in q and v.
@@ -402,7 +380,7 @@ class Machine(IdleMotionProperties, OneLineRepr):
         )
 
     def with_external_forces(self, *forces: ExternalForce) -> "Machine":
-        """A copy with additional external forces.
+        """A copy with additional external forces; the machine itself without any.
 
         Raises:
             InputError: Not an external force, an unknown or fixed frame, or a name that exists
@@ -416,7 +394,7 @@ class Machine(IdleMotionProperties, OneLineRepr):
                 raise InputError(f"'{force.frame}' does not move, a load on it does nothing")
             if [other.name for other in every].count(force.name) > 1:
                 raise InputError(f"two loads are called '{force.name}', give them names")
-        return dataclasses.replace(self, external_forces=every)
+        return dataclasses.replace(self, external_forces=every) if forces else self
 
     def with_phase_function(self, clock: Callable[[Array], Array] | None) -> "Machine":
         """A copy whose phased external forces use the clock of a simulation.

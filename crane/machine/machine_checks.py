@@ -46,27 +46,27 @@ def replace_infeasible_inertias(
     infeasible ones if some motion of the machine would have no kinetic energy, are replaced by the
     nearest feasible ones.
     """
-    findings: dict[str, tuple[Link, InertiaProblem]] = {}
-    for link in spec.tree.links.values():
-        body = link.inertial
-        problem = (
-            inertia_problem(body.mass, body.inertia_matrix)
-            if body and body.finding_location
-            else None
-        )
-        if problem is not None:
-            findings[link.name] = link, problem
+    bodies = [
+        (link, body)
+        for link in spec.tree.links.values()
+        if (body := link.inertial) and body.finding_location
+    ]
+    findings = [
+        (link, problem)
+        for link, body in bodies
+        if (problem := inertia_problem(body.mass, body.inertia_matrix))
+    ]
     if not findings:
         return spec, model
-    replaced_links = [link for link, problem in findings.values() if problem.is_negative]
+    replaced_links = [link for link, problem in findings if problem.is_negative]
     spec, model = _replace_by_nearest_feasible(spec, model, replaced_links)
-    others = [link for link, problem in findings.values() if not problem.is_negative]
+    others = [link for link, problem in findings if not problem.is_negative]
     if others and has_mass(model) and _has_massless_motion(model, closure):
         improved = _replace_by_nearest_feasible(spec, model, others)
         if not _has_massless_motion(improved[1], closure):
             (spec, model), replaced_links = improved, [*replaced_links, *others]
     if not is_strict():  # otherwise reported while reading
-        for link, problem in findings.values():
+        for link, problem in findings:
             _warn_about_inertia(link, problem, link in replaced_links)
     return spec, model
 

@@ -16,7 +16,6 @@ along n.
 """
 
 from collections.abc import Iterator
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -101,23 +100,17 @@ def least_inertias(model: pin.Model, closure: Closure) -> Array:
     return np.asarray(MIN_INERTIA_SHARE * np.max(found, axis=0))
 
 
-def massless_motions(mass: Array, extents: Array) -> Array:
-    """Motions (n, k) that move no inertia, orthonormal in units of 1 / sqrt(S_ii).
-
-    Args:
-        mass: M_A (n, n).
-        extents: S_ii (n,).
-    """
-    scale = 1 / np.sqrt(np.where(extents > 0, extents, 1.0))
-    values, vectors = np.linalg.eigh(mass * scale * scale[:, None])
-    return np.asarray(vectors[:, ~(values > MIN_INERTIA_SHARE)] * scale[:, None])
-
-
 def massless_motions_at(model: pin.Model, closure: Closure, q: Array) -> Array:
-    """`massless_motions` (n, k) at a closed configuration (nq,)."""
+    """Motions (n, k) that move no inertia at a closed configuration (nq,).
+
+    They are orthonormal in units of 1 / sqrt(S_ii).
+    """
     gamma = closure.continuation.gamma(q)
     extents = extent_inertias(model, closure, q, gamma)
-    return massless_motions(project_mass_matrix(model, closure, q, gamma), extents)
+    scale = 1 / np.sqrt(np.where(extents > 0, extents, 1.0))
+    mass = project_mass_matrix(model, closure, q, gamma)
+    values, vectors = np.linalg.eigh(mass * scale * scale[:, None])
+    return np.asarray(vectors[:, ~(values > MIN_INERTIA_SHARE)] * scale[:, None])
 
 
 class IdleMotion(NamedTuple):
@@ -125,7 +118,7 @@ class IdleMotion(NamedTuple):
 
     Attributes:
         q: (nq,) closed configuration.
-        basis: (n, k), see `massless_motions`.
+        basis: (n, k), see `massless_motions_at`.
     """
 
     q: Array
@@ -141,8 +134,10 @@ def find_idle_motions(model: pin.Model, closure: Closure) -> list[IdleMotion]:
     found = [IdleMotion(closure.home, massless_motions_at(model, closure, closure.home))]
     if not found[0].basis.shape[1]:
         return []
-    for q in _configurations_about_home(closure):
-        found.append(IdleMotion(q, massless_motions_at(model, closure, q)))
+    found += [
+        IdleMotion(q, massless_motions_at(model, closure, q))
+        for q in _configurations_about_home(closure)
+    ]
     count = min(motion.basis.shape[1] for motion in found)
     idle = [motion for motion in found if motion.basis.shape[1] == count]
     return idle if count and _moves_no_body(model, closure, idle[-1]) else []
@@ -208,6 +203,15 @@ def describe_massless_motion(
     )
 
 
+def is_definite(mass: Array, least: Array) -> bool:
+    """Whether all pivots of mass matrices M (..., n, n) are above the least inertias (..., n)."""
+    try:
+        pivots = np.diagonal(np.linalg.cholesky(mass), axis1=-2, axis2=-1) ** 2
+    except np.linalg.LinAlgError:
+        return False
+    return bool((pivots > least).all())
+
+
 def hold_coordinates(mass: Array, held: tuple[int, ...]) -> Array:
     """M (..., n, n) with the rows and columns of held coordinates those of the unit matrix."""
     out = mass.copy()
@@ -215,25 +219,3 @@ def hold_coordinates(mass: Array, held: tuple[int, ...]) -> Array:
         out[..., i, :] = out[..., :, i] = 0.0
         out[..., i, i] = 1.0
     return out
-
-
-class IdleMotionProperties:
-    """What the masses of a machine say of its coordinates; base class of `Machine`.
-
-    Attributes:
-        model: Its tree.
-        closure: Its loops.
-    """
-
-    model: pin.Model
-    closure: Closure
-
-    @cached_property
-    def held(self) -> tuple[int, ...]:
-        """Indices of active coordinates that are held for idle motions: they keep their speed."""
-        return select_held_coordinates(find_idle_motions(self.model, self.closure))
-
-    @cached_property
-    def least_inertias(self) -> Array:
-        """(nv,) inertia of each joint that counts as none [kg], [kg m2]."""
-        return least_inertias(self.model, self.closure)

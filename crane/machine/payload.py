@@ -8,7 +8,8 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import InputError
 from crane.common.one_line_repr import OneLineRepr
-from crane.common.samples import as_number, as_sample, as_samples
+from crane.common.samples import as_sample, as_samples
+from crane.description.force_elements import as_nonnegative_number
 from crane.description.kinematic_tree import inertia_problem
 
 
@@ -37,9 +38,7 @@ class Payload(OneLineRepr):
         """
         com = as_sample(self.com, 3, "the payload's com")
         tensor = as_samples(self.inertia, 3, "the payload's inertia")
-        mass = as_number(self.mass, "the payload's mass", "kg")
-        if mass < 0:
-            raise InputError(f"the payload's mass is {mass:g} kg, it must not be negative")
+        mass = as_nonnegative_number(self.mass, "the payload's mass", "kg")
         asymmetry = np.abs(tensor - tensor.T).max() if tensor.shape == (3, 3) else np.inf
         if asymmetry > 1e-9 * np.abs(tensor).max():
             raise InputError("the payload's inertia is not a symmetric (3, 3) matrix")

@@ -6,6 +6,7 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import InputError
 from crane.common.samples import Array
+from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.machine.machine import Machine
 from crane.motion.trajectory import AttitudeTrajectory, via_points
 
@@ -71,16 +72,15 @@ class InclinationCoordinate:
     names: tuple[str, ...] = (INCLINATION,)
 
     def __init__(self, machine: Machine, frame: str):
-        model, data = machine.model, machine.model.createData()
-        pin.framesForwardKinematics(model, data, machine.coordinates.configuration(machine.home))
-        rotation = data.oMf[machine.frame(frame)].rotation
+        frames = FrameJacobians(machine)
+        frames.set_configuration(machine.home)
+        rotation = frames.frame_pose(frame).rotation
         parent_joints = {joint.child: joint for joint in machine.tree.joints.values()}
         link, axis = frame, None
         while link in parent_joints and axis is None:
             joint = parent_joints[link]
             if joint.kind == "revolute":
-                child_rotation = data.oMf[machine.frame(joint.child)].rotation
-                axis = rotation.T @ child_rotation @ np.array(joint.axis)
+                axis = rotation.T @ frames.frame_pose(joint.child).rotation @ np.array(joint.axis)
             link = joint.parent
         axis_candidates = [
             i for i in (1, 2) if axis is not None and 1 - abs(axis[i]) < _AXIS_TOLERANCE**2
@@ -98,13 +98,8 @@ class InclinationCoordinate:
                 f"{message_prefix}the joint that turns it is upright at home, not level, give "
                 "roll, pitch and yaw"
             )
-        pin.computeJointJacobians(model, data, machine.coordinates.configuration(machine.home))
-        tree_jacobian = pin.getFrameJacobian(
-            model, data, machine.frame(frame), pin.LOCAL_WORLD_ALIGNED
-        )
-        angular_velocities = (
-            tree_jacobian.reshape(6, -1)[3:] @ machine.closure.gamma(machine.home)
-        )[:, machine.is_driven]
+        gamma = machine.closure.gamma(machine.home)[:, machine.is_driven]
+        angular_velocities = frames.jacobian(frame)[3:] @ gamma
         axis_tilts = np.cross(angular_velocities, rotation_axis, axisa=0) @ self._up
         speeds = np.linalg.norm(angular_velocities, axis=0)
         if (np.abs(axis_tilts) > _MAX_AXIS_TILT * speeds).any():

@@ -14,7 +14,7 @@ from crane.closure.kinematics_formulas import FormulaConstants, PositionKinemati
 from crane.closure.loop_formulas import LoopFormulas, VelocityKinematics
 from crane.codegen import FormulaTooLongError, Program, Scalar, Tape
 from crane.codegen.symbolic import add_vectors, cross, dot, matvec, scale_vector, subtract_vectors
-from crane.common.errors import ClosureError, InputError, suggest_names
+from crane.common.errors import ClosureError, InputError, check_name
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, apply_per_sample, as_samples
 from crane.common.threads import ThreadLocal
@@ -93,13 +93,8 @@ class CompiledPoint:
     def _build_program(self, program: Program) -> None:
         nq, n = self._nq, self._n
         size = program.add_formula("formula", 4, self._output_expressions(Tape())).size
-        with program.add_routine(
-            "rows", counts=("count",), arrays=("geometry", "place", "q", "v", "out")
-        ) as r:
-            with r.loop(r.count) as i:
-                rows = r.q.row_pointer(i, nq), r.v.row_pointer(i, n), r.out.row_pointer(i, size)
-                r.call("formula", r.geometry, r.place, *rows)
-            r.return_value(r.count)
+        row_lengths = {"geometry": None, "place": None, "q": nq, "v": n, "out": size}
+        program.add_formula_loop("rows", "formula", row_lengths)
 
 
 class CompiledFrame(CompiledPoint):
@@ -282,10 +277,7 @@ class FrameKinematics(OneLineRepr):
         Raises:
             InputError: The name is unknown, or the drives cannot set them.
         """
-        if name not in ATTITUDE_NAMES:
-            raise InputError(
-                f"attitude '{name}' is unknown, {suggest_names(ATTITUDE_NAMES, name)}"
-            )
+        check_name(name, ATTITUDE_NAMES, f"attitude '{name}' is unknown")
         if name in self._attitudes:
             return self._attitudes[name]
         coordinates: AttitudeCoordinates = RotationCoordinates()

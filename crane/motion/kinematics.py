@@ -41,6 +41,7 @@ class Kinematics(FrameKinematics):
         position: ArrayLike,
         initial_guess: ArrayLike | None = None,
         attitude: ArrayLike | None = None,
+        time: Array | None = None,
     ) -> Array:
         """Active coordinates, within their limits, of a position of the frame.
 
@@ -57,6 +58,7 @@ class Kinematics(FrameKinematics):
             attitude: Attitude of the frame: inclination () or (N,) [rad]; or roll, pitch and yaw
                 (3,) or (N, 3) [rad], R_z(yaw) R_y(pitch) R_x(roll); or rotation matrices (3, 3) or
                 (N, 3, 3).
+            time: (N,) times of the samples for error messages [s].
 
         Returns:
             q_A, (n,) or (N, n) [m], [rad].
@@ -66,16 +68,6 @@ class Kinematics(FrameKinematics):
                 attitude.
             UnreachableTipError: The position is not reachable, or not in this attitude.
         """
-        return self.inverse_along_path(position, initial_guess, attitude)
-
-    def inverse_along_path(
-        self,
-        position: ArrayLike,
-        initial_guess: ArrayLike | None = None,
-        attitude: ArrayLike | None = None,
-        time: Array | None = None,
-    ) -> Array:
-        """`inverse` with error messages that include the times (N,) [s] of the samples."""
         targets = as_samples(position, 3, "position", ("x", "y", "z"))
         attitude_coordinates = None
         if attitude is not None:

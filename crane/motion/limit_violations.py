@@ -77,9 +77,6 @@ def passive_limit_violation_message(
     passive = np.delete(np.arange(len(machine.joints)), closure.active)
     lower, upper = machine.coordinates.lower, machine.coordinates.upper
 
-    def passive_coordinates(times: Array) -> Array:
-        return closure.solve(reference.position(times))[:, passive]
-
     def joint_velocities(times: Array) -> Array:
         gamma = closure.gamma(closure.solve(reference.position(times)))
         return np.asarray(np.einsum("nij,nj->ni", gamma, reference.velocity(times)))
@@ -87,7 +84,7 @@ def passive_limit_violation_message(
     try:
         violation = _LimitViolation.find(
             times,
-            passive_coordinates,
+            lambda times: closure.solve(reference.position(times))[:, passive],
             lower[passive],
             upper[passive],
             limit_tolerances(machine)[passive],

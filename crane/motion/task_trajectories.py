@@ -13,6 +13,7 @@ from crane.common.errors import (
     InputError,
     LimitError,
     RecordingError,
+    check_name,
     prefix_location,
     suggest_names,
 )
@@ -93,7 +94,7 @@ def tip_trajectory(
             name, attitude_targets = INCLINATION, attitude_targets[:, 0]
         x_rate = np.hstack([x_rate, rate])
         x_acceleration = np.hstack([x_acceleration, acceleration])
-    q_a = kinematics.inverse_along_path(x, initial_guess, attitude_targets, time)
+    q_a = kinematics.inverse(x, initial_guess, attitude_targets, time)
     if machine.is_driven.sum() > x_rate.shape[1]:
         from scipy.interpolate import make_interp_spline  # slow to import
 
@@ -136,10 +137,7 @@ def task_trajectory(machine: Machine, task: str) -> Trajectory:
         UnreachableTipError: The path of the tip is not reachable.
         LimitError: The trajectory leaves the limits of an active joint.
     """
-    if task not in machine.tasks:
-        raise InputError(
-            f"machine '{machine.name}' has no task '{task}', {suggest_names(machine.tasks, task)}"
-        )
+    check_name(task, machine.tasks, f"machine '{machine.name}' has no task '{task}'")
     task_spec = machine.tasks[task]
     if task_spec.space == "joystick":
         raise InputError(f"task '{task}' moves levers, it has no trajectory")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, as_number, as_sample
 from crane.description.external_forces import WRENCH_COMPONENTS
@@ -192,10 +192,7 @@ class Transmission(OneLineRepr):
         """
         gamma, f_a = self._known_gamma(), np.zeros(len(self.actuators))
         for joint, value in effort.items():
-            if joint not in self.actuators:
-                raise InputError(
-                    f"'{joint}' is not active, {suggest_names(self.actuators, joint)}"
-                )
+            check_name(joint, self.actuators, f"'{joint}' is not active")
             f_a[self.actuators.index(joint)] = as_number(value, f"effort of {joint}", "")
         joint_indices = [self._joint_index(joint) for joint in joints]
         units = self.machine.closure.units
@@ -248,8 +245,7 @@ class Transmission(OneLineRepr):
         return self._gamma
 
     def _joint_index(self, joint: str) -> int:
-        if joint not in self.joints:
-            raise InputError(f"joint '{joint}' is unknown, {suggest_names(self.joints, joint)}")
+        check_name(joint, self.joints, f"joint '{joint}' is unknown")
         return self.joints.index(joint)
 
 

@@ -11,7 +11,7 @@ from crane.common.errors import InputError
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.units import format_quantity
-from crane.dynamics.statics import StaticQuantities, StaticsEvaluator
+from crane.dynamics.statics import StaticQuantities
 from crane.machine.machine import Machine
 from crane.motion.workspaces.workspace_patch import fill_patch, last_closed_configuration
 from crane.motion.workspaces.workspace_section import WorkspaceSection
@@ -23,7 +23,6 @@ from crane.ratings.strokes import (
     InstantaneousRotation,
     Strokes,
     bucket_and_arm_strokes,
-    check_drives,
     find_pivot,
     find_toggle,
     instantaneous_rotation,
@@ -197,7 +196,7 @@ def breakout(
         InputError: No joint moves a bucket, a frame or joint is unknown, or nothing limits a
             force.
     """
-    strokes = Strokes(StaticsEvaluator(check_drives(machine), frame))
+    strokes = Strokes(machine, frame)
     bucket_stroke, arm_stroke = bucket_and_arm_strokes(strokes, bucket, arm)
     held_coordinates = machine.home[machine.closure.active].copy()
     bucket_force, lever = _largest_breakout_force(

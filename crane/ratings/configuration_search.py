@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from crane.common.errors import InputError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
-from crane.dynamics.statics import StaticQuantities, StaticsEvaluator
+from crane.dynamics.statics import StaticQuantities
+from crane.machine.machine import Machine
 from crane.motion.workspaces.workspace_patch import WorkspacePatch, fill_patch
 from crane.ratings.grid_points import grid_points_in_patch
 from crane.ratings.strokes import Strokes
@@ -74,7 +75,8 @@ class ConfigurationSearch(Strokes):
     them.
 
     Args:
-        statics: Evaluates the machine and the frame.
+        machine: The machine.
+        frame: A link; the tip by default.
 
     Attributes:
         position_strokes: Indices of the two strokes among the active joints.
@@ -86,9 +88,9 @@ class ConfigurationSearch(Strokes):
         InputError: Fewer than two strokes move the frame in its section, or more than four.
     """
 
-    def __init__(self, statics: StaticsEvaluator):
-        super().__init__(statics)
-        machine, moving = self.machine, self.moving
+    def __init__(self, machine: Machine, frame: str | None = None):
+        super().__init__(machine, frame)
+        moving, statics = self.moving, self.statics
         if not 2 <= len(moving) <= len(_LEVELS_BY_COUNT) + 1:
             names = ", ".join(machine.active[i] for i in moving)
             lock_hint = "fewer" if len(moving) < 2 else "some: --lock"

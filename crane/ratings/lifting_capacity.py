@@ -20,11 +20,7 @@ from crane.ratings.capacity_report import LoadTable, load_table, to_markdown
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.drive_force_limits import DriveForceLimits, PinForces, drive_force_limits
 from crane.ratings.limiting_factors import RatingConditions
-from crane.ratings.rating_chart import (
-    RatingChart,
-    compute_chart,
-    configuration_search,
-)
+from crane.ratings.rating_chart import RatingChart, compute_chart
 from crane.ratings.rating_rules import MAX_GROUND_SLOPE, Rule, find_rule, gravity_action
 from crane.ratings.strokes import find_pivot
 
@@ -221,7 +217,7 @@ def capacity(
         abs(as_number(slope, "the slope", "rad", max_magnitude=MAX_GROUND_SLOPE)),
         rule.min_ground_slope,
     )
-    search = configuration_search(machine, frame)
+    search = ConfigurationSearch(machine, frame)
     if raising is None:
         raising = (
             [find_raising_joint(search)] if rule.only_raising_drive else machine.driven_joints
@@ -326,8 +322,7 @@ def torques(
         InputError: No drive raises a load, or the frame does not reach the radius.
     """
     radius = as_number(radius, "the radius", "m", greater_than=0.0)
-    statics = StaticsEvaluator(machine, frame)
-    search = ConfigurationSearch(statics)
+    search = ConfigurationSearch(machine, frame)
     joint = find_raising_joint(search)
     limits = {
         x.joint: x
@@ -337,14 +332,14 @@ def torques(
     }
     if joint not in limits:
         raise InputError(f"nothing limits '{joint}', give it a cylinder, or an effort in <limit>")
-    pivot_joint = find_pivot(machine, statics.frame, machine.active.index(joint))
+    pivot_joint = find_pivot(machine, search.statics.frame, machine.active.index(joint))
     gross_torque, stroke = _gross_torque(search, limits[joint], pivot_joint)
-    slewing, slewing_torque = find_slewing_joint(machine, statics.frame), np.nan
+    slewing, slewing_torque = find_slewing_joint(machine, search.statics.frame), np.nan
     if slewing is not None and machine.active[slewing[0]] in limits:
         drive = limits[machine.active[slewing[0]]]
         slewing_torque = min(drive.max_force, -drive.min_force)
     load, height = _largest_load_at_radius(
-        machine, statics.frame, radius, search.section_positions,
+        machine, search.statics.frame, radius, search.section_positions,
         rule=rule, raising=raising, slews=slews, slope=slope, friction=friction,
     )  # fmt: skip
     weight = float(np.linalg.norm(machine.model.gravity.linear))

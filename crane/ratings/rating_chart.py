@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_number, as_sample
-from crane.dynamics.statics import StaticQuantities, StaticsEvaluator
+from crane.dynamics.statics import StaticQuantities
 from crane.machine.machine import Machine
 from crane.ratings.configuration_search import ConfigurationSearch, ValueFunction
 from crane.ratings.limiting_factors import (
@@ -26,7 +26,6 @@ from crane.ratings.rating_derivatives import (
     rating_derivatives,
 )
 from crane.ratings.rating_rules import slew_angles
-from crane.ratings.strokes import check_drives
 from crane.recordings.timeseries import Table, write_table
 
 # largest number of cells along the larger extent, by the number of free strokes
@@ -163,16 +162,6 @@ class RatingChart(RatingConditions):
 ChartType = TypeVar("ChartType", bound=RatingChart)
 
 
-def configuration_search(machine: Machine, frame: str | None) -> ConfigurationSearch:
-    """Return the search for configurations of a frame that can be rated.
-
-    Raises:
-        InputError: The drives of the machine are not its active joints; or see
-            `ConfigurationSearch`.
-    """
-    return ConfigurationSearch(StaticsEvaluator(check_drives(machine), frame))
-
-
 def compute_chart(
     chart_class: type[ChartType],
     conditions: RatingConditions,
@@ -208,7 +197,7 @@ def compute_chart(
     values_by_factor = np.full((*shape, len(limits.factors)), np.nan)
     q_a = np.full((*shape, len(machine.active)), np.nan)
     slewing_joint, active = search.section.slewing_joint, machine.closure.active
-    angles = slew_angles(machine, conditions.frame, search.section, slew_coordinates)
+    angles = slew_angles(machine, search.section, slew_coordinates)
     for k, slew_coordinate in enumerate(slew_coordinates):
         evaluate = partial(_values_by_factor, conditions, limits, slew_coordinate, angles[k])
         best, _ = search.select_best(configurations, axes, partial(_smallest_values, evaluate))

@@ -83,7 +83,7 @@ def rating_derivatives(
     at_rest = statics.evaluate(q)
     by_coordinates = statics.coordinate_derivatives(q)
     by_parameters = statics.parameter_derivatives(q, parameter_names)
-    angles = slew_angles(conditions.machine, conditions.frame, conditions.section, slews)
+    angles = slew_angles(conditions.machine, conditions.section, slews)
     limits = conditions.load_limits()
     bound_magnitudes, by_q, by_p = _bound_derivatives(
         limits, (at_rest, by_coordinates, by_parameters), limits.pin_loads(at_rest, angles, q),

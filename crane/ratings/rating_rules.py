@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from crane.common.errors import InputError, check_name
 from crane.common.samples import Array, as_number
-from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.dynamics.statics import StaticQuantities
 from crane.machine.machine import Machine
 from crane.motion.workspaces.workspace_section import WorkspaceSection
@@ -186,27 +186,18 @@ def gravity_action(machine: Machine) -> FixedUnitAction:
 
 def rotate_about_axis(vectors: Array, axis: Array, angles: Array) -> Array:
     """Rotate vectors (N, 3) by angles (N,) [rad] about a unit vector (3,)."""
-    cosine, sine = np.cos(angles)[:, None], np.sin(angles)[:, None]
-    axial_part = (vectors @ axis)[:, None] * axis
-    return np.asarray(
-        axial_part + cosine * (vectors - axial_part) + sine * np.cross(axis, vectors)
-    )
+    return np.asarray(Rotation.from_rotvec(angles[:, None] * axis).apply(np.array(vectors)))
 
 
-def slew_angles(
-    machine: Machine, frame: str, section: WorkspaceSection, slew_coordinates: Array
-) -> Array:
+def slew_angles(machine: Machine, section: WorkspaceSection, slew_coordinates: Array) -> Array:
     """Return rotations (N,) about the vertical from home [rad]; 0 without a slewing joint.
 
     Args:
         machine: The machine.
-        frame: A link that the slewing joint carries.
-        section: Section of the frame.
+        section: Section of a frame that the slewing joint carries.
         slew_coordinates: (N,) coordinates of the slewing joint [rad].
     """
     if section.slewing_joint is None:
         return np.zeros(len(slew_coordinates))
-    frames, column = FrameJacobians(machine), machine.closure.active[section.slewing_joint]
-    frames.set_configuration(machine.home)
-    rotation_sign = np.sign(frames.jacobian(frame)[3:, column] @ machine.up_direction)
-    return np.asarray(rotation_sign * (slew_coordinates - machine.home[column]))
+    home = machine.home[machine.closure.active[section.slewing_joint]]
+    return section.slewing_sign * (slew_coordinates - home)

@@ -31,11 +31,12 @@ class Strokes:
     frame.
 
     Args:
-        statics: Evaluates the machine and the frame.
+        machine: The machine.
+        frame: A link; the tip by default.
 
     Attributes:
         machine: The machine.
-        statics: As given.
+        statics: Evaluates the machine and the frame.
         section: Section of the frame: radius and height.
         low: (n,) lower limits of the active joints.
         high: (n,) upper limits.
@@ -44,12 +45,17 @@ class Strokes:
             then the others, both in the order of the machine.
 
     Raises:
-        InputError: A joint is free.
+        InputError: A joint is free, or the drives are not the active joints.
     """
 
-    def __init__(self, statics: StaticsEvaluator):
+    def __init__(self, machine: Machine, frame: str | None = None):
+        drives = machine.explicit_drives or ()
+        if any(x.name not in machine.active or len(x.factors) > 1 for x in drives):
+            raise InputError(
+                f"the drives of '{machine.name}' are not its active joints, choose them: --active"
+            )
+        statics = self.statics = StaticsEvaluator(machine, frame)
         machine = self.machine = statics.machine
-        self.statics = statics
         frame, active = statics.frame, machine.closure.active
         self.low, self.high = stroke_limits(machine)
         self.span = np.where(self.high > self.low, self.high - self.low, 1.0)
@@ -81,22 +87,6 @@ class Strokes:
         strokes = [i for i in strokes if motion[i] > _MOTION_TOLERANCE * motion[strokes].max()]
         order = sorted(strokes, key=lambda i: -motion[i])
         self.moving = [*sorted(order[:2]), *sorted(order[2:])]
-
-
-def check_drives(machine: Machine) -> Machine:
-    """Return the machine if its drives are its active joints.
-
-    Raises:
-        InputError: They are not.
-    """
-    if any(
-        drive.name not in machine.active or len(drive.factors) > 1
-        for drive in machine.explicit_drives or ()
-    ):
-        raise InputError(
-            f"the drives of '{machine.name}' are not its active joints, choose them: --active"
-        )
-    return machine
 
 
 def find_pivot(machine: Machine, frame: str, stroke_index: int) -> str:

@@ -14,11 +14,7 @@ from crane.machine.machine import Machine
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.drive_force_limits import drive_force_limits
 from crane.ratings.limiting_factors import RatingConditions
-from crane.ratings.rating_chart import (
-    RatingChart,
-    compute_chart,
-    configuration_search,
-)
+from crane.ratings.rating_chart import RatingChart, compute_chart
 from crane.ratings.rating_rules import (
     FixedUnitAction,
     PathUnitAction,
@@ -97,33 +93,15 @@ class ToolForce(RatingChart):
         """Return unit vectors (s, b, a, 2) of the tool force in the section; NaN out of reach."""
         out = np.full((*self.values.shape, 2), np.nan)
         s, b, a = np.nonzero(np.isfinite(self.q_a[..., 0]))
-        angles = slew_angles(self.machine, self.frame, self.section, self.slews[s])
+        angles = slew_angles(self.machine, self.section, self.slews[s])
         statics = StaticsEvaluator(self.machine, self.frame).evaluate(
             self.machine.closure.solve(self.q_a[s, b, a])
         )
-        unit_vectors = -rotate_about_axis(
-            self.action.unit_vectors(statics, angles), self.machine.up_direction, -angles
-        )
-        first_directions = np.broadcast_to(self.section.first_direction, unit_vectors.shape)
-        if self.section.is_radial:  # outwards from the axis at each position
-            first_directions = statics.tip_positions - self.section.origin
-            first_directions = (
-                first_directions
-                - (first_directions @ self.section.second_direction)[:, None]
-                * self.section.second_direction
-            )
-            first_directions = rotate_about_axis(
-                first_directions, self.machine.up_direction, -angles
-            )
-            first_directions /= np.maximum(
-                np.linalg.norm(first_directions, axis=1, keepdims=True), 1e-300
-            )
-        out[s, b, a] = np.column_stack(
-            [
-                (unit_vectors * first_directions).sum(axis=1),
-                unit_vectors @ self.section.second_direction,
-            ]
-        )
+        # the section stands at home: directions and positions are turned back
+        up, origin = self.machine.up_direction, self.section.origin
+        directions = -rotate_about_axis(self.action.unit_vectors(statics, angles), up, -angles)
+        points = origin + rotate_about_axis(statics.tip_positions - origin, up, -angles)
+        out[s, b, a] = self.section.section_jacobian(points, directions[:, :, None])[:, :, 0]
         return out
 
 
@@ -169,7 +147,7 @@ def tool_force(
         InputError: A direction, frame or joint is unknown, nothing limits the force, or the frame
             is not moved by two to four strokes in a plane through the slewing axis.
     """
-    search = configuration_search(machine, frame)
+    search = ConfigurationSearch(machine, frame)
     action, single_joint = _direction_action(search, direction, joint)
     if working is None:
         working = machine.driven_joints if single_joint is None else [single_joint]

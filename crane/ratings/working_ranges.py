@@ -8,10 +8,9 @@ import numpy as np
 from crane.common.errors import InputError, check_name
 from crane.common.result import Result
 from crane.common.samples import as_number
-from crane.dynamics.statics import StaticsEvaluator
 from crane.machine.machine import Machine
 from crane.motion.workspaces import Workspace, workspace
-from crane.ratings.strokes import Strokes, bucket_and_arm_strokes, check_drives, find_pivot
+from crane.ratings.strokes import Strokes, bucket_and_arm_strokes, find_pivot
 from crane.ratings.working_range_dimensions import Dimension, DimensionFinder
 from crane.recordings.timeseries import Table, write_table
 
@@ -119,7 +118,7 @@ def working_range(
             "drawn in one: name another frame"
         )
     joint = pivot_joint = None
-    strokes = Strokes(StaticsEvaluator(check_drives(machine), frame))
+    strokes = Strokes(machine, frame)
     try:
         i = bucket_and_arm_strokes(strokes, bucket)[0]
         joint, pivot_joint = machine.active[i], find_pivot(machine, reach.frame, i)

@@ -13,6 +13,7 @@ import numpy as np
 
 from crane.common.errors import ClosureError, MechanismError, RecordingError
 from crane.common.samples import Array
+from crane.description.kinematic_tree import path_to_root
 from crane.description.sensors import INCLINATION_PREFIX, VELOCITY_SUFFIX, VELOCITY_UNITS
 from crane.machine.machine import Machine
 from crane.recordings.rotation_columns import body_rates
@@ -317,15 +318,9 @@ def _find_unknown_angles(machine: Machine, table: Table) -> tuple[tuple[str, ...
 
 def _inclining_joints(machine: Machine, name: str) -> list[str]:
     """Joints from a link to the ground that change its inclination at home."""
-    parent_joints = {joint.child: joint for joint in machine.tree.joints.values()}
-    link, home, rate, found = (
-        name.removeprefix(INCLINATION_PREFIX),
-        machine.home[None],
-        name + VELOCITY_SUFFIX,
-        [],
-    )
-    while link in parent_joints:
-        joint = parent_joints[link]
+    link = name.removeprefix(INCLINATION_PREFIX)
+    home, rate, found = machine.home[None], name + VELOCITY_SUFFIX, []
+    for joint in path_to_root(machine.tree.parent_joints, link):
         if joint.name in machine.joints:
             direction = np.zeros_like(home)
             direction[0, machine.column(joint.name)] = 1.0
@@ -334,7 +329,6 @@ def _inclining_joints(machine: Machine, name: str) -> list[str]:
                 > _MIN_DERIVATIVE
             ):
                 found.append(joint.name)
-        link = joint.parent
     return found
 
 

@@ -30,8 +30,8 @@ from crane.description.sensors import (
     VALVE_SIGNAL_PREFIX,
     Sensor,
     parse_sensor_parameter,
-    quantity_names,
     quantity_unit,
+    quantity_units,
     sensor_parameters,
     with_sensor_parameters,
 )
@@ -115,7 +115,7 @@ def _read_table(path: str | Path, machine: Machine | None, columns: str | Path |
 
 
 def _check_names(machine: Machine, table: Table, columns: str | Path) -> None:
-    names = quantity_names(machine.tree)
+    names = quantity_units(machine.tree)
     nodes = [] if machine.hydraulics is None else machine.hydraulics.node_names
     # similar to the names of cylinder pressures
     own = {f"{PRESSURE_PREFIX}{node.replace('.', '_')}" for node in nodes}

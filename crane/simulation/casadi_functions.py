@@ -20,9 +20,10 @@ from crane.common.optional_libraries import import_optional_library
 from crane.control.valve_commands import ValveSignals
 from crane.control.valve_drive import ValveDrive
 from crane.dynamics.compiled_dynamics import QUANTITIES, WITH_FRICTION
-from crane.dynamics.dynamics import QUANTITY_ARGUMENTS, Dynamics
+from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.dynamics_formulas import DynamicsFormulas
 from crane.dynamics.joint_forces import find_stick_slip_columns
+from crane.dynamics.quantity_evaluator import QUANTITY_ARGUMENTS
 from crane.formats.machine_loading import load
 from crane.hydraulics.circuit_states import BALANCE_UNITS
 from crane.machine.machine import Machine

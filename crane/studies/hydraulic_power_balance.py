@@ -235,10 +235,7 @@ def _evaluate_powers(circuit: CircuitEquations, rows: Array) -> tuple[list[str],
             powers[f"{joint}.{_FRICTION_FORCE}"] = friction_force
         program.add_formula("powers", 1, {name: [power] for name, power in powers.items()})
         size = program.formula_outputs("powers").size
-        with program.add_routine("along", counts=("count",), arrays=("rows", "out")) as r:
-            with r.loop(r.count) as i:
-                r.call("powers", r.rows.row_pointer(i, column_count), r.out.row_pointer(i, size))
-            r.return_value(r.count)
+        program.add_formula_loop("along", "powers", {"rows": column_count, "out": size})
 
     dependencies = (
         "power account",

@@ -21,7 +21,7 @@ from crane.view.machine_facts import MachineFact, machine_facts
 from crane.view.page.html_document import html_table
 from crane.view.page.report_page import report_html
 from crane.view.plots.figure_style import FIGURE_STYLE, image_tag, svg_tag
-from crane.view.result_files import figure_function, notebook_figures, result_files
+from crane.view.result_files import notebook_figures, result_files, view_function
 from crane.view.sketches.sketch_figure import sketch_figure
 
 _FRAME_SHARE = (
@@ -88,7 +88,7 @@ def _figure_images(value: Any) -> Iterator[str]:
             if isinstance(value, Machine):
                 yield svg_tag(sketch_figure(value), f"sketch of {value.name}")
             for name in notebook_figures(value):
-                result = figure_function(name)(value)
+                result = view_function(name)(value)
                 yield from (
                     image_tag(figure, repr(value))
                     for figure in (result if isinstance(result, list) else [result])[:_MAX_FIGURES]
@@ -105,7 +105,8 @@ def _text_blocks(value: Any) -> Iterator[str]:
         return _split_blocks(summarize(value).to_markdown(), _render_markdown)
     if hasattr(value, "to_markdown"):
         return _split_blocks(value.to_markdown(), _render_markdown)
-    return _split_blocks(value.to_text() if hasattr(value, "to_text") else "", _preformatted)
+    text = value.to_text() if hasattr(value, "to_text") else ""
+    return _split_blocks(text, lambda block: f"<pre>{escape(block)}</pre>")
 
 
 def _fact_tables(facts: list[MachineFact]) -> Iterator[str]:
@@ -137,10 +138,6 @@ def _render_markdown(text: str) -> str:
         .enable(["backticks", "emphasis", "heading", "list", "table"])
         .render(text)
     )
-
-
-def _preformatted(text: str) -> str:
-    return f"<pre>{escape(text)}</pre>"
 
 
 def _note_paragraph(text: str) -> str:

@@ -37,7 +37,7 @@ class _CellProgressBar:
         if self._monitor is not None:
             self._monitor.stop()
         if self._display_handle is not None:
-            self._display_handle.update(_HtmlLine(""))
+            self._display_handle.update(_html_line(""), raw=True)
         self._monitor = self._display_handle = None
         PROGRESS.reset()
 
@@ -47,21 +47,15 @@ class _CellProgressBar:
         share = PROGRESS.finished_share(frame)
         value = "" if share is None else f' value="{share:.3f}"'
         share_text = "" if share is None else f"{share:.0%}, "
-        line = _HtmlLine(f"<progress{value}></progress> {activity}, {share_text}{seconds:.0f} s")
+        text = f"<progress{value}></progress> {activity}, {share_text}{seconds:.0f} s"
         if self._display_handle is None:
             from IPython.display import display
 
-            self._display_handle = display(line, display_id=True)
+            self._display_handle = display(_html_line(text), raw=True, display_id=True)
         else:
-            self._display_handle.update(line)
+            self._display_handle.update(_html_line(text), raw=True)
 
 
-class _HtmlLine:
-    def __init__(self, html: str):
-        self._html = html
-
-    def __repr__(self) -> str:
-        return ""
-
-    def _repr_html_(self) -> str:
-        return self._html
+def _html_line(html: str) -> dict[str, str]:
+    """Return what is displayed: HTML, and nothing where only text can be."""
+    return {"text/html": html, "text/plain": ""}

@@ -40,7 +40,7 @@ class ResultFiles:
     Attributes:
         summary: File of the summary; "" if the summary is only returned.
         tables: Methods of the result that write a table, by file.
-        figures: Functions of `crane.view.plots` that draw a figure, as "module.function", by file.
+        figures: Functions of `crane.view` that draw a figure, as "module.function", by file.
         documents: Functions of `crane.view` that write a document, likewise.
         text: The summary of a result, with the options that concern it.
         more: Writes files that depend on options or on the result into a folder.
@@ -90,7 +90,7 @@ def write_result(
         for name, function in files.figures.items():
             _write_figure(part / name, function, result)
         for name, function in files.documents.items():
-            _view_function(function)(result, part / name)
+            view_function(function)(result, part / name)
         if files.more is not None:
             files.more(result, part, **options)
     return text
@@ -115,7 +115,7 @@ def plot_result(result: Any, path: str | Path) -> None:
 
 
 def notebook_figures(value: Any) -> tuple[str, ...]:
-    """Functions of `crane.view.plots` that draw an object, as "module.function"."""
+    """Functions of `crane.view` that draw an object, as "module.function"."""
     files = result_files(value) or ResultFiles()
     return files.notebook_figures or tuple(files.figures.values())
 
@@ -131,12 +131,8 @@ def _checked_files(result: Result, options: Mapping[str, Any]) -> ResultFiles:
     return files
 
 
-def figure_function(name: str) -> Callable[..., Any]:
-    """A function of `crane.view.plots` by its name "module.function"."""
-    return _view_function(f"plots.{name}")
-
-
-def _view_function(name: str) -> Callable[..., Any]:
+def view_function(name: str) -> Callable[..., Any]:
+    """A function of `crane.view` by its name "module.function"."""
     module, _, function = name.rpartition(".")
     return getattr(import_module(f"crane.view.{module}"), function)
 
@@ -144,15 +140,11 @@ def _view_function(name: str) -> Callable[..., Any]:
 def _write_figure(path: Path, function: str, *arguments: Any) -> None:
     from crane.view.plots.figure_style import write_figure
 
-    write_figure(path, lambda: figure_function(function)(*arguments))
+    write_figure(path, lambda: view_function(function)(*arguments))
 
 
 def _recording_text(recording: Recording, **_: object) -> str:
     return f"# {heading(recording)}\n\n{summarize(recording).to_markdown()}"
-
-
-def _recorded_motion(recording: Recording) -> tuple[Machine, Recording]:
-    return load_from_expression(recording.machine), recording
 
 
 def _write_recording(
@@ -163,12 +155,8 @@ def _write_recording(
     else:
         recording.to_csv(folder / RECORDING)
     if views:
-        _write_views(recording, folder)
-
-
-def _write_views(recording: Recording, folder: Path) -> None:
-    plot_result(recording, folder / FIGURE)
-    _write_page(recording, folder)
+        plot_result(recording, folder / FIGURE)
+        _write_page(recording, folder)
 
 
 def _write_page(result: Any, folder: Path) -> None:
@@ -197,7 +185,7 @@ def _write_comparison(comparison: Any, folder: Path, npz: bool = False) -> None:
         _write_recording(run, folder, npz)
     if comparison.channels:
         _write_figure(
-            folder / "comparison.png", "calibration_figure.comparison_figure", comparison
+            folder / "comparison.png", "plots.calibration_figure.comparison_figure", comparison
         )
 
 
@@ -214,7 +202,7 @@ def _write_capacity_derivatives(
 
 def _write_modes(model: Any, folder: Path, models: Sequence[Any] = ()) -> None:
     if models:
-        _write_figure(folder / "over.png", "modes_figure.parameter_modes_figure", models)
+        _write_figure(folder / "over.png", "plots.modes_figure.parameter_modes_figure", models)
     _write_page(model, folder)
 
 
@@ -229,7 +217,7 @@ def _power_comparison_text(comparison: Any, **_: object) -> str:
 
 def _write_design(result: Any, folder: Path) -> None:
     for name, chart in zip(("before", "after"), result.capacity_charts() or (), strict=False):
-        _write_figure(folder / f"{name}.png", "rating_figures.capacity_figure", chart)
+        _write_figure(folder / f"{name}.png", "plots.rating_figures.capacity_figure", chart)
     _write_machine(
         lambda: write_machine(result.variant(), folder / MACHINE_FOLDER),
         "the machine is not written, take its numbers from design.md",
@@ -292,7 +280,7 @@ def _write_orifices(
     sides = {f"recording {i + 1}": x for i, x in enumerate(result.training_sides)}
     sides |= {f"validation {i + 1}" if i else "validation": x for i, x in enumerate(validation)}
     _write_figure(
-        folder / "orifices.png", "identification_figures.equation_sides_figure", sides, unit
+        folder / "orifices.png", "plots.identification_figures.equation_sides_figure", sides, unit
     )
 
 
@@ -301,18 +289,22 @@ def _text_with_unit(result: Any, unit: str = "m") -> str:
 
 
 def _write_valve(result: Any, folder: Path, unit: str = "m") -> None:
-    _write_figure(folder / "valve.png", "identification_figures.valve_curve_figure", result, unit)
+    _write_figure(
+        folder / "valve.png", "plots.identification_figures.valve_curve_figure", result, unit
+    )
 
 
 def _write_friction(result: Any, folder: Path, unit: str = "m") -> None:
-    _write_figure(folder / "friction.png", "identification_figures.friction_figure", result, unit)
+    _write_figure(
+        folder / "friction.png", "plots.identification_figures.friction_figure", result, unit
+    )
 
 
 RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
     "Breakout": ResultFiles(summary="breakout.md"),
     "Calibration": ResultFiles(
         summary="calibration.md",
-        figures={"calibration.png": "calibration_figure.calibration_figure"},
+        figures={"calibration.png": "plots.calibration_figure.calibration_figure"},
         documents={REPORT: "page.calibration_page.write_calibration_report"},
         more=_write_calibrated_machine,
         more_files=(_MACHINE,),
@@ -322,15 +314,15 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         summary="capacity.md",
         tables={"capacity.csv": "to_csv"},
         figures={
-            "capacity.png": "rating_figures.capacity_figure",
-            "sheet.pdf": "capacity_sheet.capacity_sheet_figure",
+            "capacity.png": "plots.rating_figures.capacity_figure",
+            "sheet.pdf": "plots.capacity_sheet.capacity_sheet_figure",
         },
         documents={"capacity.html": "page.capacity_page.write_capacity_page"},
         text=_capacity_text,
         more=_write_capacity_derivatives,
         more_files=("slopes.csv",),
         options=("torques", "parameters"),
-        notebook_figures=("rating_figures.capacity_figure",),
+        notebook_figures=("plots.rating_figures.capacity_figure",),
     ),
     "Comparison": ResultFiles(
         summary="comparison.md",
@@ -339,7 +331,7 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         more_files=(RECORDING, RECORDING_NPZ, SUMMARY, "comparison.png"),
         stale=lambda *_: (FIGURE, PAGE),
         options=("npz",),
-        notebook_figures=("calibration_figure.comparison_figure",),
+        notebook_figures=("plots.calibration_figure.comparison_figure",),
     ),
     "CylinderFriction": ResultFiles(
         summary="friction.txt",
@@ -351,14 +343,14 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
     "Design": ResultFiles(
         summary="design.md",
         tables={"solutions.csv": "to_csv"},
-        figures={"design.png": "study_figures.design_figure"},
+        figures={"design.png": "plots.study_figures.design_figure"},
         more=_write_design,
         more_files=("before.png", "after.png", _MACHINE),
         stale=lambda *_: (UNFINISHED,),
     ),
     "Excitation": ResultFiles(
         tables={"reference.csv": "to_csv", "coefficients.yaml": "to_yaml"},
-        figures={"reference.png": "identification_figures.excitation_figure"},
+        figures={"reference.png": "plots.identification_figures.excitation_figure"},
     ),
     "Identification": ResultFiles(
         tables={"parameters.csv": "to_csv"},
@@ -366,12 +358,12 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         more_files=(REPORT, _MACHINE),
         options=("recordings", "validation"),
         stale=lambda result, folder: _machine_files(result.described_machine, folder),
-        notebook_figures=("identification_figures.force_figures",),
+        notebook_figures=("plots.identification_figures.force_figures",),
     ),
     "LinearModel": ResultFiles(
         summary="modes.md",
         tables={"model.mat": "save", "model.npz": "save"},
-        figures={"modes.png": "modes_figure.modes_figure"},
+        figures={"modes.png": "plots.modes_figure.modes_figure"},
         more=_write_modes,
         more_files=("over.png", PAGE),
         options=("models",),
@@ -388,14 +380,14 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         summary="power.md",
         tables={"power.csv": "to_csv"},
         figures={
-            "sankey.png": "sankey_diagram.sankey_figure",
-            "power.png": "power_figure.power_figure",
+            "sankey.png": "plots.sankey_diagram.sankey_figure",
+            "power.png": "plots.power_figure.power_figure",
         },
         text=_power_text,
     ),
     "PowerComparison": ResultFiles(
         summary="comparison.md",
-        figures={"comparison.png": "power_figure.power_comparison_figure"},
+        figures={"comparison.png": "plots.power_figure.power_comparison_figure"},
         text=_power_comparison_text,
     ),
     "Recording": ResultFiles(
@@ -405,27 +397,27 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         more_files=(RECORDING, RECORDING_NPZ, FIGURE, PAGE),
         stale=lambda *_: ("comparison.md", "comparison.png"),
         options=("npz", "views"),
-        motion=_recorded_motion,
-        notebook_figures=("recording_figure.recording_figure",),
+        motion=lambda run: (load_from_expression(run.machine), run),
+        notebook_figures=("plots.recording_figure.recording_figure",),
     ),
     "Sensitivities": ResultFiles(
         summary="sensitivities.md",
         tables={"sensitivities.csv": "to_csv"},
-        figures={"sensitivities.png": "modes_figure.sensitivities_figure"},
+        figures={"sensitivities.png": "plots.modes_figure.sensitivities_figure"},
     ),
     "SignalExcitation": ResultFiles(
         tables={"signals.csv": "to_csv"},
-        figures={"signals.png": "identification_figures.signals_figure"},
+        figures={"signals.png": "plots.identification_figures.signals_figure"},
     ),
     "Study": ResultFiles(
         tables={"study.csv": "to_csv"},
-        figures={"study.png": "study_figures.study_figure"},
+        figures={"study.png": "plots.study_figures.study_figure"},
         stale=lambda *_: (UNFINISHED,),
     ),
     "ToolForce": ResultFiles(
         summary="tool_force.md",
         tables={"tool_force.csv": "to_csv"},
-        figures={"tool_force.png": "rating_figures.tool_force_figure"},
+        figures={"tool_force.png": "plots.rating_figures.tool_force_figure"},
     ),
     "ValveCurve": ResultFiles(
         summary="valve.txt",
@@ -437,11 +429,11 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
     "WorkingRange": ResultFiles(
         summary="working_range.md",
         tables={"working_range.csv": "to_csv"},
-        figures={"working_range.png": "workspace_figures.working_range_figure"},
+        figures={"working_range.png": "plots.workspace_figures.working_range_figure"},
     ),
     "Workspace": ResultFiles(
         summary="workspace.md",
         tables={"workspace.csv": "to_csv", "curves.csv": "curves_to_csv"},
-        figures={"workspace.png": "workspace_figures.workspace_figure"},
+        figures={"workspace.png": "plots.workspace_figures.workspace_figure"},
     ),
 }

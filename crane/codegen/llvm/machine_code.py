@@ -89,7 +89,11 @@ class MachineCode:
     @classmethod
     def compile_functions(cls, functions: Iterable[Formula | Routine]) -> "MachineCode":
         """Compile functions, or read their machine code from the cache."""
-        text = emit_module(functions)
+        return cls.compile_text(emit_module(functions))
+
+    @classmethod
+    def compile_text(cls, text: str) -> "MachineCode":
+        """Compile LLVM IR, or read its machine code from the cache."""
         depends = f"{compiler_settings()} {text}"
         return cls(
             entry_name(depends),
@@ -126,12 +130,14 @@ def compiler_settings() -> str:
 
     version = llvmlite.__version__, llvm.llvm_version_info
     return (
-        f"{version} {llvm.get_default_triple()} {_host_cpu()} {_OPTIMIZATION_LEVEL} "
+        f"{version} {llvm.get_default_triple()} {host_cpu()} {_OPTIMIZATION_LEVEL} "
         f"{_TUNING_OPTIONS}"
     )
 
 
-def _host_cpu() -> tuple[str, str]:
+@functools.cache
+def host_cpu() -> tuple[str, str]:
+    """Name and features of the processor."""
     import llvmlite.binding as llvm
 
     return llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
@@ -143,7 +149,7 @@ def _target_machine() -> Any:
 
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    name, features = _host_cpu()
+    name, features = host_cpu()
     return llvm.Target.from_default_triple().create_target_machine(
         cpu=name, features=features, opt=_OPTIMIZATION_LEVEL
     )

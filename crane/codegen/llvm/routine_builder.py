@@ -111,11 +111,9 @@ class ArrayPointer:
         """An element, or the first one of a part."""
         return RoutineValue("real", "element", (self, self._element_index(index)))
 
-    def element_pointer(
-        self, index: "int | RoutineValue | str", layout: Layout | None = None
-    ) -> "ArrayPointer":
+    def element_pointer(self, index: "int | RoutineValue | str") -> "ArrayPointer":
         """Pointer to an element or a part."""
-        return ArrayPointer(self.name, self.offset + self._element_index(index), layout)
+        return ArrayPointer(self.name, self.offset + self._element_index(index))
 
     def row_pointer(self, index: "int | RoutineValue", width: int) -> "ArrayPointer":
         """Pointer to a row."""

@@ -1,6 +1,5 @@
 """Add a hydraulic cylinder, or the loops that a description leaves open, to a machine file."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,20 +7,25 @@ from pathlib import Path
 import numpy as np
 
 from crane.common.atomic_output import check_file_is_writable, fill_folder, portable_file_name
-from crane.common.errors import CraneError, CraneWarning, InputError, MechanismError, OutputError
+from crane.common.errors import (
+    CraneError,
+    InputError,
+    MechanismError,
+    ignore_warnings,
+    warn,
+)
 from crane.common.package_search import use_load_options
 from crane.formats.additions.distance_curve import (
     DistanceCurve,
     distance_curve,
-    fit_to_joint_range,
     warn_about_masses,
     warn_about_strokes,
 )
 from crane.formats.additions.open_loop_search import LoopProposal, propose_loops
 from crane.formats.additions.steel_cylinder import (
+    AttachmentPair,
     SteelCylinder,
     add_barrel_and_rod,
-    joints_between,
     parse_attachment_point,
 )
 from crane.formats.machine_file.machine_reader import read_machine_spec
@@ -133,29 +137,26 @@ def add_cylinder(
         raise InputError(f"the cylinder's name is {name!r}, give a word")
     loaded = load(machine)
     file = machine_file_path(out, f"{portable_file_name(f'{loaded.name}_{name}')}.yaml")
-    points = [parse_attachment_point(loaded, text) for text in between]
+    barrel, rod_eye = (parse_attachment_point(loaded, text) for text in between)
+    points = AttachmentPair(loaded, (barrel, rod_eye))
     draft = MachineDraft(loaded, file.stem)
     _check_names_are_free(loaded, name)
-    distances = distance_curve(loaded, points)
-    start_index, reached_distances = fit_to_joint_range(distances, cylinder, points, loaded)
-    joint_path = [
-        joint.name
-        for joint in joints_between(loaded.tree.parent_joints, points[0].link, points[1].link)
+    distances = distance_curve(points)
+    start_index, reached_distances = distances.fit_cylinder(cylinder)
+    shares_load = loaded.unit(distances.joint) == "m" and distances.joint not in [
+        joint.name for joint in points.joints
     ]
-    shares_load = loaded.unit(distances.joint) == "m" and distances.joint not in joint_path
-    notes = _choice_notes(distances, start_index, shares_load) + add_barrel_and_rod(
-        draft, loaded, name, points, cylinder, distances.configurations[start_index]
-    )
+    notes = _choice_notes(distances, start_index, shares_load)
+    notes += add_barrel_and_rod(draft, name, points, cylinder, distances.samples[start_index][1])
     _replace_drive(draft, loaded, name, None if shares_load else distances.joint)
     check_files_are_new(draft, file, force)
     with fill_folder(file.parent) as output_folder:
         draft.write(output_folder, file.name)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", CraneWarning)
+        with ignore_warnings():
             closed = load(output_folder / file.name)  # a file that does not load is not kept
         warn_about_strokes(closed, name)
     warn_about_masses(loaded, cylinder, distances.joint)
-    lever_arms = np.abs(reached_distances.lever_arms)
+    lever_arms = [abs(points.lever_arm(q, distances.joint)) for _, q in reached_distances.samples]
     strokes = np.clip(
         reached_distances.length[[0, -1]] - cylinder.retracted_length, 0, cylinder.stroke
     )
@@ -169,7 +170,7 @@ def add_cylinder(
         driven_range=(float(reached_distances.values[0]), float(reached_distances.values[-1])),
         length_range=(float(distances.length.min()), float(distances.length.max())),
         stroke_range=(float(strokes[0]), float(strokes[1])),
-        lever_arm_range=(float(lever_arms.min()), float(lever_arms.max())),
+        lever_arm_range=(min(lever_arms), max(lever_arms)),
         masses=(cylinder.barrel_inertial.mass, cylinder.rod_inertial.mass),
         notes=tuple(notes),
     )
@@ -215,18 +216,16 @@ def _replace_drive(draft: MachineDraft, machine: Machine, name: str, joint: str 
         if not cylinders:
             del draft.data["hydraulics"]
     if removed:
-        warnings.warn(
+        warn(
             f"{machine.name}: {', '.join(removed)} belonged to the active joints as they were, "
             "left out: write those of the new ones",
-            CraneWarning,
             stacklevel=4,
         )
 
 
 def _check_names_are_free(machine: Machine, name: str) -> None:
-    used_names = {*machine.tree.links, *machine.tree.joints}
+    used_names = {*machine.tree.links, *machine.tree.joints, *machine.closure.equations.names}
     used_names |= {chain.name for chain in machine.chains}
-    used_names |= set(machine.closure.equations.names)
     for suffix in _NAME_SUFFIXES:
         if name + suffix in used_names:
             raise InputError(
@@ -256,9 +255,7 @@ def check_files_are_new(draft: MachineDraft, file: Path, force: bool) -> None:
         OutputError: A file exists already.
     """
     for relative_path in draft.file_paths(file.name):
-        target = file.parent / relative_path
-        if target.exists() and not force:
-            raise OutputError(f"{target}: exists already, choose another name or add --force")
+        check_file_is_writable(file.parent / relative_path, force)
 
 
 @dataclass(frozen=True)
@@ -280,8 +277,8 @@ class AddedLoops:
     def __str__(self) -> str:
         """Return a few lines about the loops."""
         lines = [str(proposal) for proposal in self.loops]
-        driven_text = ", ".join(self.active)
-        lines.append(f"{self.mobility} degrees of freedom, driven by {driven_text or 'nothing'}")
+        driven_text = ", ".join(self.active) or "nothing"
+        lines.append(f"{self.mobility} degrees of freedom, driven by {driven_text}")
         return "\n".join([*lines, f"written to {self.path}"])
 
 
@@ -314,8 +311,7 @@ def add_loops(
         MechanismError: The machine does not close with them.
         OutputError: The files cannot be written, or exist already.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
+    with ignore_warnings():
         loaded = load(machine, packages=packages, arguments=arguments)
         with use_load_options(loaded.packages, loaded.arguments, trust_xacro=loaded.trusts_xacro):
             spec = read_machine_spec(machine)

@@ -16,7 +16,7 @@ import pinocchio as pin
 from crane.closure.coordinates import Coordinates
 from crane.closure.loop_equations import frame_id
 from crane.common.samples import Array
-from crane.description.kinematic_tree import Joint, Vector, to_vector
+from crane.description.kinematic_tree import Z_AXIS, Joint, Vector, to_vector
 from crane.description.specification import LoopSpec, MachineSpec
 from crane.formats.additions.steel_cylinder import joints_between
 from crane.formats.machine_file.structure_sections import loop_end_pairs
@@ -30,7 +30,6 @@ _PARALLEL_TOLERANCE = 1e-6  # sine of an angle
 _MIN_LOOP_JOINTS = 3  # with fewer joints of the tree a loop would lock them
 _BARREL_PATTERN = re.compile(r"barrel|tube|housing|cylinder|cyl", re.IGNORECASE)
 _ROD_PATTERN = re.compile(r"piston_?rod|rod|piston|ram|plunger", re.IGNORECASE)
-_Z = (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -40,12 +39,10 @@ class LoopProposal:
     Attributes:
         loop: The proposed loop.
         gap: Distance of its frames at home, less the travel of slides at its ends [m].
-        is_named: Whether names indicate it, and not positions.
     """
 
     loop: LoopSpec
     gap: float
-    is_named: bool
 
     def __str__(self) -> str:
         """Return an entry of `loops` in a machine file, with the gap as a comment."""
@@ -127,11 +124,10 @@ class _OpenLoopSearch:
                 continue
             kind, axis = self._loop_type_and_axis(first, second)
             if re.match(r"closed?_?loop", name, re.IGNORECASE):  # example-parallel-robots
-                kind, axis = "spherical" if "3d" in name.lower() else "fixed", _Z
+                kind, axis = "spherical" if "3d" in name.lower() else "fixed", Z_AXIS
             yield LoopProposal(
                 LoopSpec(name, kind, first, second, axis, ""),
                 self._gap(first, second),
-                is_named=True,
             )
 
     def _slide_proposals(self) -> Iterator[LoopProposal]:
@@ -167,7 +163,6 @@ class _OpenLoopSearch:
                 yield LoopProposal(
                     LoopSpec(barrel, "prismatic", barrel, rod, _round_direction(axes[0]), ""),
                     0.0,
-                    True,
                 )
 
     def _meeting_proposals(self) -> Iterator[LoopProposal]:
@@ -188,9 +183,7 @@ class _OpenLoopSearch:
                 and self._is_away_from_origin(second)
             )
             if kind != "spherical" or are_separate_frames:
-                yield LoopProposal(
-                    LoopSpec(second, kind, first, second, axis, ""), gap, is_named=False
-                )
+                yield LoopProposal(LoopSpec(second, kind, first, second, axis, ""), gap)
 
     def _nearby_pairs(self) -> Iterator[tuple[str, str]]:
         """Yield pairs of frames that are close or can be moved together by slides."""
@@ -266,7 +259,7 @@ class _OpenLoopSearch:
             for kind in ("revolute", "prismatic")
         )
         if not revolute_axes:
-            return "spherical", _Z
+            return "spherical", Z_AXIS
         normal = revolute_axes[0]
         deviation = np.linalg.norm(np.cross(revolute_axes, normal), axis=1).max()
         deviation = max(
@@ -277,7 +270,7 @@ class _OpenLoopSearch:
             deviation < _PARALLEL_TOLERANCE
             and np.linalg.norm(axes[0] - axes[1]) < _PARALLEL_TOLERANCE
         )
-        return ("revolute", _round_direction(axes[0])) if is_planar else ("spherical", _Z)
+        return ("revolute", _round_direction(axes[0])) if is_planar else ("spherical", Z_AXIS)
 
 
 def _round_direction(axis: Array) -> Vector:

@@ -1,19 +1,28 @@
 """Hydraulic cylinders of steel between attachment points: masses, shapes, links and loop."""
 
 import math
-import warnings
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 from lxml import etree
 
-from crane.common.errors import CraneWarning, InputError, suggest_names
+from crane.common.errors import InputError, check_name, warn
 from crane.common.plausible_ranges import LONGEST, implausible_value_text, suggested_units_text
 from crane.common.samples import Array, as_number
 from crane.common.unit_conversions import UnitError, parse_number
-from crane.description.kinematic_tree import Inertial, Joint, Limits, Link, Vector, to_vector
+from crane.description.kinematic_tree import (
+    X_AXIS,
+    Y_AXIS,
+    Z_AXIS,
+    Inertial,
+    Joint,
+    Limits,
+    Link,
+    Vector,
+    path_to_root,
+    to_vector,
+)
 from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
 from crane.description.specification import LoopSpec
 from crane.formats.machine_file.machine_writer import MachineDraft, loop_data
@@ -23,8 +32,6 @@ from crane.machine.machine import Machine
 STEEL_DENSITY = 7850.0  # [kg/m3]
 RELIEF_PRESSURE = 35e6  # [Pa] usual in mobile machines; determines the effort of the joint
 _WALL_SHARE = 0.1  # of the bore: at 35 MPa the stress in the tube is 35 / 0.2 MPa
-
-
 _DIFFERENCE_STEP = 1e-5  # of the fastest coordinate, for central differences
 
 
@@ -45,12 +52,10 @@ class AttachmentPoint:
         point = ",".join(f"{value:.6g}" for value in self.point)
         return f"{self.link}:{point}" if any(self.point) else self.link
 
-    def placement(self, machine: Machine, q: Array) -> pin.SE3:
-        """Return the pose of the link's frame, moved to the point, in the world."""
-        data = machine.model.createData()
-        pin.forwardKinematics(machine.model, data, machine.coordinates.configuration(q))
-        link_placement = pin.updateFramePlacement(machine.model, data, machine.frame(self.link))
-        return link_placement * pin.SE3(np.eye(3), np.array(self.point))
+    @property
+    def placement(self) -> pin.SE3:
+        """Its pose in the link's frame."""
+        return pin.SE3(np.eye(3), np.array(self.point))
 
 
 def parse_attachment_point(machine: Machine, text: str) -> AttachmentPoint:
@@ -71,63 +76,63 @@ def parse_attachment_point(machine: Machine, text: str) -> AttachmentPoint:
         raise InputError(
             f"'{text}' is no point, write LINK or LINK:x,y,z with metres in the link's frame"
         )
-    if link not in machine.tree.links:
-        raise InputError(
-            f"'{link}' is no link of '{machine.name}', {suggest_names(machine.tree.links, link)}"
-        )
+    check_name(link, machine.tree.links, f"'{link}' is no link of '{machine.name}'")
     return AttachmentPoint(link, to_vector(point))
 
 
 def joints_between(
-    parent_joints: Mapping[str, Joint], first_link: str, second_link: str
+    parent_joints: dict[str, Joint], first_link: str, second_link: str
 ) -> list[Joint]:
     """Return the movable joints of a tree between two links, see `Tree.parent_joints`."""
-    paths_to_root = []
-    for link in (first_link, second_link):
-        path = []
-        while link in parent_joints:
-            path.append(parent_joints[link])
-            link = parent_joints[link].parent
-        paths_to_root.append(path)
-    first, second = ({joint.name for joint in path} for path in paths_to_root)
-    return [
-        joint
-        for path in paths_to_root
-        for joint in path
-        if joint.is_movable and joint.name in first ^ second
-    ]
+    first, second = (path_to_root(parent_joints, link) for link in (first_link, second_link))
+    shared = {joint.name for joint in first} & {joint.name for joint in second}
+    return [x for x in (*first, *second) if x.is_movable and x.name not in shared]
 
 
-def vector_between(machine: Machine, points: Sequence[AttachmentPoint], q: Array) -> Array:
-    """Return the vector (3,) or (N, 3) from the first point to the second in the world [m].
+@dataclass(frozen=True)
+class AttachmentPair:
+    """Two attachment points of a machine.
 
-    Args:
+    Attributes:
         machine: The machine.
-        points: Two attachment points.
-        q: (nq,) or (N, nq) configurations.
+        points: The points.
     """
-    if q.ndim == 2:
-        return np.array([vector_between(machine, points, one) for one in q])
-    first, second = (point.placement(machine, q).translation for point in points)
-    return np.asarray(second - first)
 
+    machine: Machine
+    points: tuple[AttachmentPoint, AttachmentPoint]
 
-def lever_arm(machine: Machine, points: Sequence[AttachmentPoint], q: Array, joint: str) -> float:
-    """Return the derivative of the distance of two points by an active joint: the lever arm [m].
+    @property
+    def joints(self) -> list[Joint]:
+        """The movable joints of the tree between the two bodies."""
+        return joints_between(self.machine.tree.parent_joints, *(x.link for x in self.points))
 
-    For a prismatic joint it is a ratio. It is computed along gamma at a closed configuration
-    (nq,), by central differences.
+    def placements(self, q: Array) -> list[pin.SE3]:
+        """Return the poses of the links' frames, moved to the points, in the world."""
+        model, data = self.machine.model, self.machine.model.createData()
+        pin.forwardKinematics(model, data, self.machine.coordinates.configuration(q))
+        return [
+            pin.updateFramePlacement(model, data, self.machine.frame(x.link)) * x.placement
+            for x in self.points
+        ]
 
-    Raises:
-        ClosureError: The configuration is singular.
-    """
-    gamma_column = machine.closure.gamma(q)[:, machine.active.index(joint)]
-    step = _DIFFERENCE_STEP / float(np.abs(gamma_column).max())
-    ahead, back = (
-        np.linalg.norm(vector_between(machine, points, q + x * gamma_column))
-        for x in (step, -step)
-    )
-    return float(ahead - back) / (2 * step)
+    def vector(self, q: Array) -> Array:
+        """Return the vector (3,) from the first point to the second in the world [m]."""
+        first, second = (placement.translation for placement in self.placements(q))
+        return np.asarray(second - first)
+
+    def lever_arm(self, q: Array, joint: str) -> float:
+        """Return the derivative of the distance by an active joint: the lever arm [m].
+
+        For a prismatic joint it is a ratio. It is computed along gamma at a closed configuration
+        (nq,), by central differences.
+
+        Raises:
+            ClosureError: The configuration is singular.
+        """
+        gamma_column = self.machine.closure.gamma(q)[:, self.machine.active.index(joint)]
+        step = _DIFFERENCE_STEP / float(np.abs(gamma_column).max())
+        ahead, back = (np.linalg.norm(self.vector(q + x * gamma_column)) for x in (step, -step))
+        return float(ahead - back) / (2 * step)
 
 
 @dataclass(frozen=True)
@@ -184,7 +189,7 @@ class SteelCylinder:
                 )
                 raise InputError(f"the {label} is {value:g} m{unit_hint}")
             if warning := implausible_value_text(range_name, value):
-                warnings.warn(f"the {label} {warning}", CraneWarning, stacklevel=4)
+                warn(f"the {label} {warning}", stacklevel=4)
         bore, rod, stroke = float(bore), float(rod), float(stroke)
         return cls(bore, rod, stroke, stroke + 4 * bore if dead_length is None else dead_length)
 
@@ -248,25 +253,19 @@ def _add_cylinder_visual(link: etree._Element, start: float, end: float, diamete
 
 _OFFSET_TOLERANCE = 1e-6  # relative to the cylinder's length
 _PARALLEL_TOLERANCE = 1e-9  # sine of an angle; a larger deviation gets a universal joint
-_X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 
 def add_barrel_and_rod(
-    draft: MachineDraft,
-    machine: Machine,
-    name: str,
-    points: Sequence[AttachmentPoint],
-    cylinder: SteelCylinder,
-    q: Array,
+    draft: MachineDraft, name: str, pair: AttachmentPair, cylinder: SteelCylinder, q: Array
 ) -> list[str]:
     """Add barrel and rod as a chain with its loop and the home configuration q (nq,).
 
     Returns:
         Notes on changes of the attachment points.
     """
-    notes = []
-    axis_vector = vector_between(machine, points, q)
-    normal = _plane_normal(machine, points, q, axis_vector)
+    notes, points = [], pair.points
+    axis_vector = pair.vector(q)
+    normal = _plane_normal(pair, q, axis_vector)
     is_planar = normal is not None and bool(abs(axis_vector @ normal) <= cylinder.bore)
     if normal is not None and is_planar:
         offset = float(axis_vector @ normal)
@@ -283,13 +282,11 @@ def add_barrel_and_rod(
     rotation = np.column_stack(
         [axis_direction, pin_direction, np.cross(axis_direction, pin_direction)]
     )
-    barrel_placement, rod_placement = (point.placement(machine, q) for point in points)
+    barrel_placement, rod_placement = pair.placements(q)
     barrel_frame = pin.SE3(rotation, barrel_placement.translation)
     rod_frame = pin.SE3(rotation, barrel_placement.translation + axis_vector)
-    base_in_link = pin.SE3(np.eye(3), np.array(points[0].point)) * barrel_placement.actInv(
-        barrel_frame
-    )
-    eye_in_link = pin.SE3(np.eye(3), np.array(points[1].point)) * rod_placement.actInv(rod_frame)
+    base_in_link = points[0].placement * barrel_placement.actInv(barrel_frame)
+    eye_in_link = points[1].placement * rod_placement.actInv(rod_frame)
     rod_robot, eye = draft.urdf_of_link(points[1].link), f"{name}_eye"
     add_link(rod_robot, Link(eye, ""))
     add_joint(
@@ -300,10 +297,12 @@ def add_barrel_and_rod(
     )
     draft.data["loops"].append(
         loop_data(
-            LoopSpec(name, "revolute" if is_planar else "spherical", f"{name}_rod", eye, _Y, "")
+            LoopSpec(
+                name, "revolute" if is_planar else "spherical", f"{name}_rod", eye, Y_AXIS, ""
+            )
         )
     )
-    home = dict(zip(machine.joints, q.tolist(), strict=True))
+    home = dict(zip(pair.machine.joints, q.tolist(), strict=True))
     draft.data["home"] = (
         home
         | dict.fromkeys([f"{name}_pin"] if is_planar else [f"{name}_pin_y", f"{name}_pin_z"], 0.0)
@@ -312,18 +311,15 @@ def add_barrel_and_rod(
     return notes
 
 
-def _plane_normal(
-    machine: Machine, points: Sequence[AttachmentPoint], q: Array, axis_vector: Array
-) -> Array | None:
+def _plane_normal(pair: AttachmentPair, q: Array, axis_vector: Array) -> Array | None:
     """Return the normal (3,) of the plane of relative motion of two bodies, None if spatial."""
-    data = machine.model.createData()
+    machine = pair.machine
     jacobian = pin.computeJointJacobians(
-        machine.model, data, machine.coordinates.configuration(q)
+        machine.model, machine.model.createData(), machine.coordinates.configuration(q)
     ).reshape(6, -1)
-    joints = joints_between(machine.tree.parent_joints, points[0].link, points[1].link)
-    columns = {joint.name: jacobian[:, machine.column(joint.name)] for joint in joints}
-    revolute_axes = [columns[joint.name][3:] for joint in joints if joint.kind == "revolute"]
-    prismatic_axes = [columns[joint.name][:3] for joint in joints if joint.kind == "prismatic"]
+    columns = [(joint.kind, jacobian[:, machine.column(joint.name)]) for joint in pair.joints]
+    revolute_axes = [column[3:] for kind, column in columns if kind == "revolute"]
+    prismatic_axes = [column[:3] for kind, column in columns if kind == "prismatic"]
     if revolute_axes:
         normal = revolute_axes[0]
     else:
@@ -346,12 +342,12 @@ def _cylinder_urdf(
     xyz, rpy = xyz_rpy_from_se3(base_placement)
     links = [Link(f"{name}_base", "")]
     if is_planar:
-        pins = [Joint(f"{name}_pin", "revolute", links[0].name, barrel, "", xyz, rpy, _Y)]
+        pins = [Joint(f"{name}_pin", "revolute", links[0].name, barrel, "", xyz, rpy, Y_AXIS)]
     else:
         links.append(Link(cross, "", composite_joint=f"{name}_pin"))
         pins = [
-            Joint(f"{name}_pin_y", "revolute", links[0].name, cross, "", xyz, rpy, _Y),
-            Joint(f"{name}_pin_z", "revolute", cross, barrel, "", axis=_Z),
+            Joint(f"{name}_pin_y", "revolute", links[0].name, cross, "", xyz, rpy, Y_AXIS),
+            Joint(f"{name}_pin_z", "revolute", cross, barrel, "", axis=Z_AXIS),
         ]
     links += [Link(barrel, "", cylinder.barrel_inertial), Link(rod, "", cylinder.rod_inertial)]
     slide = Joint(
@@ -361,15 +357,14 @@ def _cylinder_urdf(
         rod,
         "",
         to_vector(np.array([cylinder.retracted_length, 0, 0])),
-        axis=_X,
+        axis=X_AXIS,
         limits=Limits(0.0, cylinder.stroke, cylinder.max_force),
     )
     for link in links:
         add_link(robot, link)
     barrel_element, rod_element = robot.findall("link")[-2:]
     length, part = cylinder.retracted_length, cylinder.part_length
-    outer_diameter = (1 + 2 * _WALL_SHARE) * cylinder.bore
-    _add_cylinder_visual(barrel_element, 0, length - part, outer_diameter)
+    _add_cylinder_visual(barrel_element, 0, length - part, ((1 + 2 * _WALL_SHARE) * cylinder.bore))
     _add_cylinder_visual(rod_element, 2 * part - length, 0, cylinder.rod)
     for joint in (*pins, slide):
         add_joint(robot, joint)

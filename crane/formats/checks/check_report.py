@@ -182,8 +182,10 @@ def _check_machine(
     path = find_machine_file(name)
     spec: MachineSpec | None = None
     closure: Closure | None = None
-    with warnings.catch_warnings(record=True) as caught, collect_findings() as collected:
-        warnings.simplefilter("always", CraneWarning)
+    with (
+        warnings.catch_warnings(record=True, action="always", category=CraneWarning) as caught,
+        collect_findings() as collected,
+    ):
         with error_recovery():
             spec = read_machine_spec(path)
             spec = add_floating_base(spec) if floating else spec
@@ -202,11 +204,12 @@ def _check_machine(
         for one in caught
         if issubclass(one.category, CraneWarning)
     ]
-    ordered = sorted(set(findings), key=lambda x: (x.file, x.line, not x.is_error, x.message))
+    ordered = sorted(set(findings), key=lambda x: (not x.is_error, x.file, x.line, x.message))
     is_truncated = collected.is_truncated or len(ordered) > _MAX_FINDINGS
+    listed = sorted(ordered[:_MAX_FINDINGS], key=lambda x: (x.file, x.line))
     command_arguments = command_line_arguments(name, active, free)
     report = CheckReport(
-        tuple(ordered[:_MAX_FINDINGS]),
+        tuple(listed),
         None,
         is_truncated,
         f"crane check {command_arguments} again, once the errors are mended",

@@ -1,6 +1,5 @@
 """Check that the loops of a machine close, at home, in its tasks and over its strokes."""
 
-import warnings
 from collections.abc import Iterator, Mapping
 
 import numpy as np
@@ -11,9 +10,11 @@ from crane.closure.constraint_structure import OpenLoopError
 from crane.closure.constraint_tolerances import least_squares_step
 from crane.closure.home_search import within_limits
 from crane.closure.loop_equations import LoopEquations
-from crane.common.errors import ClosureError, CraneWarning, MechanismError
+from crane.closure.multi_start_search import low_discrepancy_steps
+from crane.common.errors import ClosureError, MechanismError, warn
 from crane.common.samples import Array
 from crane.description.findings import Findings, report_error
+from crane.description.kinematic_tree import path_to_root
 from crane.description.specification import TIP_COORDINATES, MachineSpec, Task
 from crane.formats.assembly_warnings import add_remedy, check_home, warn_about_assembly_modes
 from crane.machine.machine_assembly import assemble_tree, build_closure, home_initial_guess
@@ -79,14 +80,10 @@ def _report_with_gaps(
             text = text.replace(f"it {residual_text}", f"its smallest gap is {own_gap}")
     report_error(MechanismError(text, error.subject))
     for subject, gap in gaps.items():
-        problem = (
-            f"loop '{subject.removeprefix('loop ')}' stays open, too: its smallest gap is {gap}"
-        )
-        report_error(
-            MechanismError(
-                f"{spec.source_locations.get(subject, spec.path.name)}: {problem}", subject
-            )
-        )
+        location = spec.source_locations.get(subject, spec.path.name)
+        name = subject.removeprefix("loop ")
+        problem = f"loop '{name}' stays open, too: its smallest gap is {gap}"
+        report_error(MechanismError(f"{location}: {problem}", subject))
 
 
 def _loop_gaps(spec: MachineSpec, model: pin.Model, initial_guess: Array) -> dict[str, str]:
@@ -109,12 +106,11 @@ def _loop_gaps(spec: MachineSpec, model: pin.Model, initial_guess: Array) -> dic
         length = float(np.linalg.norm(phi[rows & equations.is_translation]))
         # rows of rotations are cosines of angles that are right ones when closed
         sine = min(1.0, float(np.linalg.norm(phi[rows & ~equations.is_translation])))
-        if max(length, sine) > _OPEN_TOLERANCE:
-            metres = length * equations.characteristic_length
-            length_text = f"{metres:.3g} m" if metres >= 1 else f"{1e3 * metres:.3g} mm"
-            angle_text = f"{np.degrees(np.arcsin(sine)):.3g} deg"
-            parts = ((length, length_text), (sine, angle_text))
-            open_parts = [text for gap, text in parts if gap > _OPEN_TOLERANCE]
+        metres = length * equations.characteristic_length
+        length_text = f"{metres:.3g} m" if metres >= 1 else f"{1e3 * metres:.3g} mm"
+        angle_text = f"{np.degrees(np.arcsin(sine)):.3g} deg"
+        parts = ((length, length_text), (sine, angle_text))
+        if open_parts := [text for gap, text in parts if gap > _OPEN_TOLERANCE]:
             gap_texts[f"loop {loop.name}"] = " and ".join(open_parts)
     return gap_texts
 
@@ -122,18 +118,14 @@ def _loop_gaps(spec: MachineSpec, model: pin.Model, initial_guess: Array) -> dic
 def _warn_about_limits(spec: MachineSpec, closure: Closure) -> None:
     coordinates = closure.equations.coordinates
     is_within_limits = within_limits(closure.equations, closure.home)
-    for column in closure.passive:
+    for column in closure.passive[~is_within_limits[closure.passive]]:
         name = coordinates.names[int(column)]
         lower, upper = coordinates.lower[column], coordinates.upper[column]
-        q = closure.home[column]
-        if not is_within_limits[column]:
-            location = spec.tree.joints[name].source_location
-            warnings.warn(
-                f"{location}: passive joint '{name}' is at {q:.4g} with the loops closed at home, "
-                f"outside of its limits {lower:g} to {upper:g}, widen them or correct the home",
-                CraneWarning,
-                stacklevel=2,
-            )
+        warn(
+            f"{spec.tree.joints[name].source_location}: passive joint '{name}' is at "
+            f"{closure.home[column]:.4g} with the loops closed at home, outside of its limits "
+            f"{lower:g} to {upper:g}, widen them or correct the home"
+        )
 
 
 _MAX_SAMPLES, _MAX_SAMPLED_JOINTS = 150, 6000  # of the strokes; samples times joints
@@ -158,7 +150,7 @@ def check_tasks(spec: MachineSpec, closure: Closure) -> None:
         for via in task.via if task.space == "tip" else ():
             distance = float(np.linalg.norm([via.point.get(x, 0.0) for x in TIP_COORDINATES]))
             if distance > reach:
-                _warn(
+                warn(
                     f"{location}: task '{name}' has its tip {distance:.4g} m from the root at t = "
                     f"{via.time:g} s, and all links in line are {reach:.4g} m long, choose a "
                     "point within reach"
@@ -166,7 +158,7 @@ def check_tasks(spec: MachineSpec, closure: Closure) -> None:
                 break
         for instant, positions in _task_positions(task):
             if problem := _position_problem(closure, instant, positions):
-                _warn(f"{location}: task '{name}' {problem}")
+                warn(f"{location}: task '{name}' {problem}")
 
 
 def _position_problem(closure: Closure, instant: str, positions: Mapping[str, float]) -> str:
@@ -211,22 +203,20 @@ def check_strokes(spec: MachineSpec, closure: Closure) -> None:
     failures: list[tuple[float, str]] = []
     sample_count = max(1, min(_MAX_SAMPLES, _MAX_SAMPLED_JOINTS // len(closure.home)))
     span, home = (upper - lower)[is_moved], closure.home[active]
-    tried_count = 0
-    for share in _unit_box_points(int(is_moved.sum()), sample_count):
+    steps, tried_count = low_discrepancy_steps(len(span)), 0
+    while tried_count < sample_count and len(failures) < _MAX_FAILURES:
         tried_count += 1
         q_a = home.copy()
-        q_a[is_moved] = lower[is_moved] + share * span
+        q_a[is_moved] = lower[is_moved] + np.remainder(0.5 + tried_count * steps, 1.0) * span
         try:
             closure.solve(q_a)
         except ClosureError as error:
             distances = np.abs((q_a - home)[is_moved] / np.where(span > 0, span, 1.0))
             failures.append((float(distances.max()), str(error)))
-        if len(failures) == _MAX_FAILURES:
-            break
     failed_share = len(failures) / tried_count
     if failed_share >= _MIN_FAILED_SHARE:
         names = ", ".join(np.array(closure.active_names)[is_moved])
-        _warn(
+        warn(
             f"{spec.source_locations.get('active', spec.path.name)}: {100 * failed_share:.0f} % "
             f"of the strokes within the limits of {names} lie beyond dead centres, the nearest "
             f"of those tried: {min(failures)[1]}; narrow the limits, or see that the lengths are "
@@ -236,14 +226,11 @@ def check_strokes(spec: MachineSpec, closure: Closure) -> None:
 
 def _reach(spec: MachineSpec) -> float:
     """Return the length [m] of all links from the root to the tip in line, slides extended."""
-    parent_joints = {joint.child: joint for joint in spec.tree.joints.values()}
-    link, length = spec.tip, 0.0
-    while link in parent_joints:
-        joint = parent_joints[link]
+    length = 0.0
+    for joint in path_to_root(spec.tree.parent_joints, spec.tip or ""):
         length += float(np.linalg.norm(joint.xyz))
         if joint.kind == "prismatic":
             length += max(abs(joint.limits.lower), abs(joint.limits.upper))
-        link = joint.parent
     return length
 
 
@@ -259,20 +246,3 @@ def _task_positions(task: Task) -> Iterator[tuple[str, Mapping[str, float]]]:
     for phase in task.phases:
         positions |= phase.until
         yield f"at the end of phase '{phase.name}'", dict(positions)
-
-
-def _unit_box_points(count: int, samples: int) -> Array:
-    """Return (samples, count) points of the unit box, a low-discrepancy sequence.
-
-    They are multiples of powers of 1 / phi with phi^(k + 1) = phi + 1 for k coordinates (Roberts
-    2018).
-    """
-    phi = 2.0
-    for _ in range(40):
-        phi = (1 + phi) ** (1 / (count + 1))
-    steps = phi ** -np.arange(1.0, count + 1)
-    return np.remainder(0.5 + np.outer(np.arange(1, samples + 1), steps), 1.0)
-
-
-def _warn(text: str) -> None:
-    warnings.warn(text, CraneWarning, stacklevel=3)

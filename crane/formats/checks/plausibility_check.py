@@ -5,20 +5,18 @@ to sevenfold, perhaps because only a part of the body is drawn, so the bounds ar
 """
 
 import math
-import warnings
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 from lxml import etree
 
-from crane.common.errors import CraneWarning
-from crane.common.number_text import parse_float
+from crane.common.errors import warn
 from crane.common.plausible_ranges import LONGEST
 from crane.common.samples import Array
-from crane.description.kinematic_tree import inertia_problem
+from crane.description.kinematic_tree import TENSOR_ATTRIBUTES, Inertial, inertia_problem
 from crane.description.specification import MachineSpec
-from crane.formats.visuals.urdf_shapes import MeshShape, UrdfShapes, Visual, read_shapes
-from crane.formats.xml_file import XmlFile
+from crane.formats.visuals.urdf_shapes import MeshShape, UrdfShapes, Visual
+from crane.formats.xml_file import XmlFile, parse_attribute
 from crane.hydraulics.circuit_elements import MAIN_PUMP, TANK_NODE
 from crane.hydraulics.components import Valve
 from crane.hydraulics.hydraulic_circuit import (
@@ -46,11 +44,7 @@ _MISSING_INPUT_TEXTS = {  # by type of control that needs valves, or their open 
 
 def read_numbers(element: etree._Element | None, key: str, count: int) -> Array | None:
     """Return the finite numbers of an attribute, None if it has others."""
-    text = None if element is None else element.get(key)
-    try:
-        found = np.array([parse_float(word) for word in (text or "").split()])
-    except ValueError:
-        return None
+    found = np.array([] if element is None else parse_attribute(element, key))
     return found if found.shape == (count,) and np.isfinite(found).all() else None
 
 
@@ -61,13 +55,14 @@ _MAX_GYRATION_SHARE, _MIN_GYRATION_SHARE = 4.0, 0.01
 _MAX_GYRATION_BY_JOINTS, _MIN_GYRATION_BY_JOINTS = 20.0, 0.003
 _MAX_COM_DISTANCE = 3.0  # of the centre of mass, relative to the size of the shapes
 _MAX_DENSITY = 1e5  # [kg/m3] in the bounding box of a link; osmium has 2.3e4
+_ZERO = (0.0, 0.0, 0.0)
 _DUMMY_LIMITS = 1e-2, 1e-4  # [m], [kg] below which a link only represents a sensor or frame
 
 
 def warn_about_implausible_values(files: Sequence[XmlFile], spec: MachineSpec | None) -> None:
     """Warn of implausible values in parsed files and in the home configuration."""
     for xml in {xml.file: xml for xml in files}.values():
-        shapes = read_shapes(xml, ("visual", "collision"))
+        shapes = UrdfShapes(xml, ("visual", "collision"))
         _warn_about_shapes(shapes)
         if _warn_about_units(xml):  # inertias cannot be compared with sizes in other units
             continue
@@ -92,20 +87,13 @@ def _bounds_by_link(visuals: Sequence[Visual]) -> dict[str, Bounds]:
     return {link: (found.min(axis=0), found.max(axis=0)) for link, found in points.items()}
 
 
-def _warn(text: str) -> None:
-    warnings.warn(text, CraneWarning, stacklevel=2)
-
-
 def _warn_about_units(xml: XmlFile) -> bool:
     """Warn of lengths and angles in other units, and return whether lengths seem to be."""
     length_hint, rotation_hint = (
         f"write {unit} if these are {other}"
         for unit, other in (("metres", "millimetres"), ("radians", "degrees"))
     )
-    limit_hint = f"{rotation_hint}, or make it continuous"
-    problems: dict[str, list[tuple[etree._Element, str]]] = {
-        rotation_hint: [], limit_hint: [], length_hint: [],
-    }  # fmt: skip
+    long_elements: list[tuple[etree._Element, str]] = []
     attributes = (
         ("origin", "rpy", 3), ("origin", "xyz", 3), ("box", "size", 3), ("cylinder", "length", 1),
         ("cylinder", "radius", 1), ("sphere", "radius", 1),
@@ -119,26 +107,24 @@ def _warn_about_units(xml: XmlFile) -> bool:
         largest = 0.0 if values is None else values[np.abs(values).argmax()]
         if key == "rpy" and abs(largest) > _REVOLUTION * 1.01:
             problem = f'rpy="{element.get("rpy")}" turns more than once'
-            problems[rotation_hint].append((element, problem))
+            xml.warn(element, f"{problem}, {rotation_hint}")
         if key != "rpy" and abs(largest) > LONGEST:
             problem = f"{largest:g} m in <{element.tag}> is a long way for a machine"
-            problems[length_hint].append((element, problem))
+            long_elements.append((element, problem))
     for joint in xml.root.iterfind("joint"):
         limit, label = joint.find("limit"), f"of joint '{joint.get('name')}'"
         limits = (read_numbers(limit, key, 1) for key in ("lower", "upper"))
         largest = max((float(end[0]) for end in limits if end is not None), key=abs, default=0.0)
         if joint.get("type") == "prismatic" and LONGEST < abs(largest) <= _NO_LIMIT:
-            problem = f"the limit {largest:g} m {label} is a long way"
-            problems[length_hint].append((limit, problem))
+            long_elements.append((limit, f"the limit {largest:g} m {label} is a long way"))
         if joint.get("type") == "revolute" and 2 * _REVOLUTION < abs(largest) <= _NO_LIMIT:
-            problem = f"the limit {largest:g} rad {label} is many turns"
-            problems[limit_hint].append((limit, problem))
-    for hint, found in problems.items():
-        found.sort(key=lambda item: item[0].sourceline or 0)
-        count_text = f" ({len(found)} such in this file)" if len(found) > 1 else ""
-        for element, problem in found[:1]:
-            _warn(f"{xml.source_location(element)}: {problem}{count_text}, {hint}")
-    return bool(problems[length_hint])
+            warn(
+                f"{xml.source_location(limit)}: the limit {largest:g} rad {label} is many turns, "
+                f"{rotation_hint}, or make it continuous"
+            )
+    for element, problem in long_elements:
+        xml.warn(element, f"{problem}, {length_hint}")
+    return bool(long_elements)
 
 
 def _warn_about_home(spec: MachineSpec) -> None:
@@ -146,7 +132,7 @@ def _warn_about_home(spec: MachineSpec) -> None:
     for name, value in spec.home.items():
         if name in revolute_joints and abs(value) > 2 * _REVOLUTION:
             location = spec.source_locations.get(f"home {name}", spec.path.name)
-            _warn(
+            warn(
                 f"{location}: home of '{name}' is {value:g} rad, many turns, write radians if "
                 "these are degrees"
             )
@@ -154,12 +140,12 @@ def _warn_about_home(spec: MachineSpec) -> None:
 
 def _warn_about_shapes(shapes: UrdfShapes) -> None:
     for name, where in shapes.missing_meshes.items():
-        _warn(
+        warn(
             f"{where}: mesh file '{name}' is not there, correct its path or "
             "install the package that has it; a box is drawn instead"
         )
     for problem in shapes.problems:
-        _warn(problem)
+        warn(problem)
     sizes: dict[str, Array] = {}
     for visual in (*shapes.shapes["visual"], *shapes.shapes["collision"]):
         if isinstance(visual.shape, MeshShape):
@@ -167,7 +153,7 @@ def _warn_about_shapes(shapes: UrdfShapes) -> None:
             sizes[visual.mesh_label] = np.maximum(size, sizes.get(visual.mesh_label, 0.0))
     for mesh, size in sizes.items():
         if size.max() > LONGEST:
-            _warn(
+            warn(
                 f"{mesh} is {size.max():.3g} m large, give it "
                 'scale="0.001 0.001 0.001" if it is in millimetres'
             )
@@ -181,24 +167,21 @@ def _warn_about_body(
         return
     mass_tag, tensor_tag, origin = (inertial.find(x) for x in ("mass", "inertia", "origin"))
     mass = read_numbers(mass_tag, "value", 1)
-    parts = [
-        read_numbers(tensor_tag, key, 1) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    ]
+    parts = [read_numbers(tensor_tag, key, 1) for key in TENSOR_ATTRIBUTES]
     if mass is None or not mass[0] > _DUMMY_LIMITS[1] or any(part is None for part in parts):
         return
-    xx, xy, xz, yy, yz, zz = (float(part[0]) for part in parts if part is not None)
-    tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    values = tuple(float(part[0]) for part in parts if part is not None)
+    tensor = Inertial(float(mass[0]), _ZERO, _ZERO, values).inertia_matrix
     if inertia_problem(float(mass[0]), tensor):
         return  # has an error or warning already
     com = read_numbers(origin, "xyz", 3)
     gyration_radius = math.sqrt(float(np.linalg.eigvalsh(tensor).max()) / float(mass[0]))
     joint_distance = max(joint_distance, 0.0 if com is None else float(np.linalg.norm(com)))
-    name = link.get("name")
-    for where, problem in _size_problems(
+    for tag, problem in _size_problems(
         bounds, joint_distance, gyration_radius, com, float(mass[0])
     ):
-        element = {"mass": mass_tag, "origin": origin, "inertia": tensor_tag}[where]
-        _warn(f"{xml.source_location(element)}: link '{name}' {problem}")
+        location = xml.source_location(inertial.find(tag))
+        warn(f"{location}: link '{link.get('name')}' {problem}")
 
 
 def _size_problems(
@@ -268,7 +251,7 @@ def warn_about_circuit(spec: MachineSpec) -> None:
         location = spec.source_locations.get(
             key, spec.source_locations.get("hydraulics", spec.path.name)
         )
-        warnings.warn(f"{location}: {text}", CraneWarning, stacklevel=2)
+        warn(f"{location}: {text}")
 
 
 def flow_shortages(spec: MachineSpec) -> list[str]:
@@ -299,8 +282,8 @@ def _node_problems(hydraulics: Hydraulics) -> Iterator[tuple[str, str]]:
     return_nodes = {node for x in valves for node in (x.return_a, x.return_b)} & {
         *hydraulics.lines
     }
-    kinds = {name: "line" for name in hydraulics.lines}
-    kinds |= {name: "accumulator" for name in hydraulics.accumulators}
+    kinds = dict.fromkeys(hydraulics.lines, "line")
+    kinds |= dict.fromkeys(hydraulics.accumulators, "accumulator")
     for name, kind in kinds.items():
         if name not in connected or (name in return_nodes and name not in drained_nodes):
             continue  # has an error already

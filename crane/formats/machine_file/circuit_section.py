@@ -3,12 +3,11 @@
 import itertools
 import math
 import string
-import warnings
 from collections.abc import Callable, Container
 from functools import partial
 from typing import Any
 
-from crane.common.errors import CraneWarning, DescriptionError, suggest_names
+from crane.common.errors import DescriptionError, check_name, warn
 from crane.common.plausible_ranges import implausible_value_text
 from crane.description.circuit_schema import AREA_KEYS, BORE_KEYS, ORIFICE_KEYS, PUMP
 from crane.description.findings import (
@@ -155,10 +154,7 @@ def check_active_joint(active: tuple[str, ...], joint: str, location: str) -> No
     Raises:
         DescriptionError: With file and line, and the joints that are.
     """
-    if joint not in active:
-        raise DescriptionError(
-            f"{location}: '{joint}' is not an active joint, {suggest_names(active, joint)}"
-        )
+    check_name(joint, active, f"{location}: '{joint}' is not an active joint", DescriptionError)
 
 
 def read_component(
@@ -191,11 +187,7 @@ def _warn_about_unit(
 ) -> None:
     text = implausible_value_text(key, value, is_rotary, section.schema.component)
     if text and math.isfinite(value):
-        warnings.warn(
-            f"{section.source_location(key)}: '{key}' of {section.title} {text}",
-            CraneWarning,
-            stacklevel=2,
-        )
+        warn(f"{section.source_location(key)}: '{key}' of {section.title} {text}")
 
 
 def _check_relief(supply: Supply | None, cylinder: Cylinder) -> None:
@@ -207,14 +199,10 @@ def _warn_about_relief(section: YamlSection, supply: Supply | None, cylinder: Cy
     if supply is None or implausible_value_text("relief", cylinder.relief):
         return
     if 0 < cylinder.relief <= supply.pressure:
-        warnings.warn(
-            (
-                f"{section.source_location('relief')}: 'relief' of {section.title} is "
-                f"{cylinder.relief:g} Pa, not above the supply's {supply.pressure:g} Pa: what the "
-                "pump gives flows off there before it can press, give a higher one"
-            ),
-            CraneWarning,
-            stacklevel=2,
+        warn(
+            f"{section.source_location('relief')}: 'relief' of {section.title} is "
+            f"{cylinder.relief:g} Pa, not above the supply's {supply.pressure:g} Pa: what the "
+            "pump gives flows off there before it can press, give a higher one"
         )
 
 
@@ -315,8 +303,9 @@ def _read_network(section: YamlSection) -> dict[str, Any]:
 
     def read_named(name: str, item: YamlSection) -> Any:
         if not name or not set(name) <= _NAME_CHARACTERS:
-            kind = item.schema.title
-            raise item.error_at(None, f"a {kind} is called '{name}', use letters, digits, _")
+            raise item.error_at(
+                None, f"a {item.schema.title} is called '{name}', use letters, digits, _"
+            )
         values = _pump_values(section, item) if item.schema is PUMP else item.values()
         return read_component(item, values)
 
@@ -365,5 +354,4 @@ def _read_valve(joint: str, item: YamlSection) -> Valve:
         constants["spool_b"] = read_component(
             second_section, second_section.values(), joint=joint, **shared
         )
-    valve: Valve = read_component(item, values, **constants)
-    return valve
+    return read_component(item, values, **constants)

@@ -1,7 +1,6 @@
 """Curves of the edges of a valve: coefficients, flows or areas over the stroke of the spool."""
 
 import csv
-import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -67,7 +66,7 @@ def _read_pairs(item: YamlSection, key: str) -> Sequence[tuple[float, float]]:
 def _read_csv_table(path: Path) -> tuple[str, Sequence[tuple[float, float]]]:
     try:
         text = read_plain_file(path, MAX_FILE_SIZE).decode("utf-8-sig")
-        heads, *rows = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
+        heads, *rows = csv.reader(text.splitlines(), skipinitialspace=True)
     except (OSError, UnicodeDecodeError, csv.Error, ValueError) as error:
         raise InputError(f"{path.name} cannot be read ({error}), give a CSV file") from None
     columns = {head.partition("[")[0].strip(): i for i, head in enumerate(heads)}
@@ -88,8 +87,7 @@ def _read_csv_table(path: Path) -> tuple[str, Sequence[tuple[float, float]]]:
         except IndexError:
             raise InputError(f"{path.name}:{number} has no two numbers, correct it") from None
         except UnitError as error:
-            cells = ", ".join(row)
-            raise InputError(f"{path.name}:{number} has '{cells}', {error}") from None
+            raise InputError(f"{path.name}:{number} has '{', '.join(row)}', {error}") from None
         points.append((u, value))
     return names[0], points
 

@@ -1,10 +1,9 @@
 """The sections of a machine file on forces: of joints, between frames, and external ones."""
 
 import dataclasses
-import warnings
 from typing import Any
 
-from crane.common.errors import CraneWarning, InputError
+from crane.common.errors import InputError, warn
 from crane.description.external_force_schema import CONTACT, CONTACT_LAW_KEYS, CUTTER, GROUND, LOAD
 from crane.description.external_forces import ExternalForce, PhasedWrench, Wrench
 from crane.description.findings import FollowUpError, error_recovery
@@ -32,11 +31,10 @@ def read_friction(top: YamlSection, tree: TreeBuilder) -> dict[str, Friction]:
         for kind in () if is_drive_intended else ("coulomb", "viscous"):
             mean, offset = getattr(law, kind), getattr(law, f"{kind}_offset")
             if abs(offset) > mean:
-                warnings.warn(
+                warn(
                     f"{item.source_location()}: friction of '{joint}' drives the joint in one "
                     f"direction (|{kind}_offset| {abs(offset):g} > {kind} {mean:g}), a constant "
                     "force may hide in it; write drives: true if it is meant",
-                    CraneWarning,
                     stacklevel=3,
                 )
         return law
@@ -104,8 +102,13 @@ def read_external_forces(
         with error_recovery():
             values = section.values()
             contact_law |= {key: values.pop(key) for key in CONTACT_LAW_KEYS if key in values}
-            rows = section.rows("profile") if "profile" in section else ()
-            ground = section.create(Ground, profile=tuple(map(tuple, rows)), **values)
+            ground = section.create(
+                Ground,
+                profile=tuple(
+                    map(tuple, (section.rows("profile") if "profile" in section else ()))
+                ),
+                **values,
+            )
 
     def read_contact(item: YamlSection) -> Contact:
         frame = _read_moving_frame(item, tree)

@@ -21,6 +21,7 @@ from crane.description.key_types import (
     SectionSchema,
     VariantKey,
 )
+from crane.description.kinematic_tree import unique_name
 from crane.description.machine_schema import EXTENDS_KEY, MACHINE
 
 SCHEMA_PATH = Path(__file__).with_name("machine_file.schema.json")  # shipped with the package
@@ -64,8 +65,7 @@ class _SchemaDefinitions:
         place = (id(section), is_partial)
         if place not in self._names:
             name += "_variant" * (is_partial and name != "variant")
-            while name in self.schemas:
-                name += "_"
+            name = unique_name(name, self.schemas)
             self._names[place], self.schemas[name] = name, {}
             self.schemas[name] = self._section(section, is_partial)
         return {"$ref": f"#/$defs/{self._names[place]}"}
@@ -118,15 +118,17 @@ class _SchemaDefinitions:
         bounds: dict[str, Any] = {} if key.minimum is None else {"minimum": key.minimum}
         if key.is_positive or (key.zero_error and key.minimum == 0):
             bounds = {"exclusiveMinimum": 0}
-        columns = getattr(key, "column_units", ())
-        units = tuple(dict.fromkeys(columns or key.si_units(None, (0,))))
+        units = tuple(dict.fromkeys(getattr(key, "column_units", ()) or key.si_units(None, (0,))))
         name = "_or_".join(unit or "ratio" for unit in units)
         name = "number_" + re.sub(r"\W", "_", name.replace("/", "_per_"))
         if name not in self.schemas:
             pattern = rf"^\s*{NUMBER_PATTERN}\s*(?:{'|'.join(map(_unit_pattern, units))})?\s*$"
             others = [x for unit in units if unit != QUANTITY_UNIT for x in accepted_units(unit)]
-            examples = [f"1 {unit}" for unit in others if unit]
-            number = {"type": ["number", "string"], "pattern": pattern, "examples": examples}
+            number = {
+                "type": ["number", "string"],
+                "pattern": pattern,
+                "examples": [f"1 {unit}" for unit in others if unit],
+            }
             self.schemas[name] = number
             self.schemas[f"{name}_or_none"] = number | {"type": _NUMBER_OR_NONE}
         return {"$ref": f"#/$defs/{name}", **bounds}

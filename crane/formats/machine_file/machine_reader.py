@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from collections.abc import Callable, Container, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,13 +21,12 @@ from crane.description.sensors import (
     TIME,
     VALVE_SIGNAL_PREFIX,
     Sensor,
-    quantity_names,
     quantity_unit,
+    quantity_units,
     signal_delay_error,
 )
 from crane.description.specification import (
     ATTITUDE_COORDINATES,
-    STANDARD_GRAVITY,
     TIP_COORDINATES,
     Chain,
     EstimationSettings,
@@ -95,36 +93,17 @@ def _read_by_format(path: Path) -> MachineSpec:
 
 
 def _read_robot(path: Path) -> MachineSpec:
-    urdf = read_urdf(path)
-    chain = Chain(path.stem, path, None, path.name, urdf.moving_joints)
-    tree = TreeBuilder()
-    tree.add_chain(chain, urdf)
+    spec = read_urdf(path)
+    tree = TreeBuilder(spec.tree, spec.is_complete)
     if not tree.joints and not load_options().floating_root:
         report_error(DescriptionError(f"{path.name}: no joint moves in this file, add one"))
-    for loop in urdf.loops:
+    for loop in spec.loops:
         with error_recovery():
             tree.check_loop(loop)
-    locations = source_locations(urdf.loops, urdf.couplings)
-    locations |= {f"home {joint}": place for joint, place in urdf.home_locations.items()}
-    active = urdf.independent_joints
-    if urdf.loops and not active:
-        active, locations["active"] = (), urdf.loops[0].source_location
-    return MachineSpec(
-        name=urdf.name,
-        source=path.name,
-        path=path,
-        chains=(chain,),
-        tree=tree.tree,
-        loops=urdf.loops,
-        active=active,
-        home=urdf.home,
-        friction=urdf.friction,
-        forces=urdf.springs,
-        tip=tree.single_leaf_link() if urdf.tip is None else urdf.tip,
-        couplings=urdf.couplings,
-        source_locations=locations,
-        gravity=urdf.gravity or STANDARD_GRAVITY,
-    )
+    if spec.loops and not spec.active:
+        locations = {**spec.source_locations, "active": spec.loops[0].source_location}
+        spec = dataclasses.replace(spec, active=(), source_locations=locations)
+    return dataclasses.replace(spec, tip=tree.single_leaf_link()) if spec.tip is None else spec
 
 
 def read_plain_data(path: Path) -> dict[str, Any]:
@@ -162,8 +141,6 @@ def _read_machine(path: Path) -> MachineSpec:
     )
     friction |= _read_or_default(read_friction, {}, top, tree)
     forces = springs + _read_or_default(read_forces, (), top, tree)
-    gas_springs = _read_or_default(read_gas_springs, (), top, tree)
-    end_stops = _read_or_default(read_end_stops, (), top, tree)
     tip = _read_tip(top, tree)
     payload = _read_or_default(_read_payload, None, top, tree, tip)
     # a machine whose active joints are not named is not driven either: `load` proposes some
@@ -180,37 +157,37 @@ def _read_machine(path: Path) -> MachineSpec:
         tasks = _read_or_default(read_tasks, tasks, top, tree, active, tip, valves, home)
         control = _read_or_default(_read_control, control, top, active)
     external_forces = _read_or_default(read_external_forces, (), top, tree)
-    spec = MachineSpec(
-        name,
-        source,
-        path,
-        chains,
-        with_rotor_inertias(tree.tree, rotor_inertias),
-        loops,
-        active,
-        home,
-        friction,
-        forces,
-        gas_springs,
-        end_stops,
-        tip,
-        tasks,
-        control,
-        hydraulics,
-        couplings,
-        locations,
-        payload,
-        free,
-        _read_or_default(read_drives, (), top, tree),
-        _read_or_default(read_ropes, (), top, tree),
-        _read_or_default(read_sensors, {}, top, tree),
-        _read_or_default(read_estimation, EstimationSettings(), top),
-        external_forces,
-        _read_or_default(_read_supports, (), top, tree, external_forces),
-        _read_or_default(_read_pins, {}, top, tree, loops),
-        gravity,
+    return MachineSpec(
+        name=name,
+        source=source,
+        path=path,
+        chains=chains,
+        tree=with_rotor_inertias(tree.tree, rotor_inertias),
+        loops=loops,
+        active=active,
+        home=home,
+        friction=friction,
+        forces=forces,
+        gas_springs=_read_or_default(read_gas_springs, (), top, tree),
+        end_stops=_read_or_default(read_end_stops, (), top, tree),
+        tip=tip,
+        tasks=tasks,
+        control=control,
+        hydraulics=hydraulics,
+        couplings=couplings,
+        source_locations=locations,
+        payload=payload,
+        free=free,
+        drives=_read_or_default(read_drives, (), top, tree),
+        ropes=_read_or_default(read_ropes, (), top, tree),
+        sensors=_read_or_default(read_sensors, {}, top, tree),
+        estimation=_read_or_default(read_estimation, EstimationSettings(), top),
+        external_forces=external_forces,
+        supports=_read_or_default(_read_supports, (), top, tree, external_forces),
+        pin_capacities=_read_or_default(_read_pins, {}, top, tree, loops),
+        gravity=gravity,
+        written_numbers=top.written_numbers(),
     )
-    return dataclasses.replace(spec, written_numbers=top.written_numbers())
 
 
 def _read_supports(
@@ -237,15 +214,13 @@ def _read_supports(
 def _read_pins(top: YamlSection, tree: TreeBuilder, loops: Sequence[LoopSpec]) -> dict[str, float]:
     """The largest force that pins bear, by joint or loop [N]."""
     names = [*tree.joints, *(loop.name for loop in loops)]
-
-    def check_name(name: str, location: str) -> None:
-        if name not in names:
-            known = suggest_names(names, name)
-            raise tree.unknown_name_error(
-                f"{location}: '{name}' under 'pins' is no joint or loop, {known}"
-            )
-
-    return top.value_map("pins", YamlSection.number, check_name)
+    return top.value_map(
+        "pins",
+        YamlSection.number,
+        lambda name, location: tree.check_name(
+            name, names, f"{location}: '{name}' under 'pins' is no joint or loop"
+        ),
+    )
 
 
 def _read_free_joints(
@@ -302,10 +277,10 @@ def _read_payload(top: YamlSection, tree: TreeBuilder, tip: str | None) -> Paylo
         )
     if not urdf.tree.total_mass:
         raise section.error_at(
-            "urdf", f"no link of {urdf.file.name} has a mass, give one an <inertial>"
+            "urdf", f"no link of {urdf.path.name} has a mass, give one an <inertial>"
         )
-    chain = Chain("payload", urdf.file, tip, section.source_location("urdf"), ())
-    attachment = chain.attachment_joint(urdf.root_link)
+    chain = Chain("payload", urdf.path, tip, section.source_location("urdf"), ())
+    attachment = chain.attachment_joint(urdf.tree.root_link)
     for _ in tree.filter_new_names([attachment, *urdf.tree]):
         pass  # notes names that are taken
     return PayloadSpec(chain, urdf.tree.with_parts(attachment))
@@ -313,7 +288,9 @@ def _read_payload(top: YamlSection, tree: TreeBuilder, tip: str | None) -> Paylo
 
 def _read_control(top: YamlSection, active: tuple[str, ...]) -> dict[str, PIGains]:
     gains = top.read_map(
-        "control", lambda _, item: PIGains(**item.values()), partial(check_active_joint, active)
+        "control",
+        lambda _, item: PIGains(**item.values()),
+        lambda joint, location: check_active_joint(active, joint, location),
     )
     named_joints = top.item_names("control")
     missing = [joint for joint in active if named_joints and joint not in named_joints]
@@ -376,7 +353,7 @@ def read_sensors(top: YamlSection, tree: TreeBuilder) -> dict[str, Sensor]:
     def read_sensor(name: str, item: YamlSection) -> Sensor:
         unit = quantity_unit(tree.tree, name)
         if unit is None:
-            known = suggest_names(quantity_names(tree.tree), name)
+            known = suggest_names(quantity_units(tree.tree), name)
             raise tree.unknown_name_error(
                 str(item.error_at(None, f"'{name}' is no quantity of this machine, {known}"))
             )

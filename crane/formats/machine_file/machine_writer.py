@@ -1,6 +1,5 @@
 """A machine file with a URDF per sub-chain."""
 
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -8,10 +7,16 @@ from typing import Any
 from lxml import etree
 
 from crane.common.atomic_output import portable_file_name, replace_folder
-from crane.common.errors import CraneError, CraneWarning, InputError, OutputError, format_one_line
+from crane.common.errors import (
+    CraneError,
+    InputError,
+    OutputError,
+    format_one_line,
+    ignore_warnings,
+)
 from crane.common.unit_conversions import KeyPath
 from crane.description.force_elements import Friction
-from crane.description.kinematic_tree import Tree
+from crane.description.kinematic_tree import path_to_root
 from crane.description.machine_parameters import FieldPath, parameter_paths, value_at
 from crane.description.machine_schema import (
     COUPLING,
@@ -105,7 +110,12 @@ class MachineDraft:
         tree = with_floating_joints(machine)
         chains = [chain for chain in machine.chains if chain.name != "payload"]
         chain_of_attachment = {chain.attachment_name: chain.name for chain in chains[1:]}
-        self._chain_of_link = _chains_by_link(tree, chains[0].name, chain_of_attachment)
+        parent_joints = tree.parent_joints
+        self._chain_of_link: dict[str, str] = {}
+        for name in tree.links:
+            joints = [joint.name for joint in path_to_root(parent_joints, name)]
+            begun = (chain_of_attachment[x] for x in joints if x in chain_of_attachment)
+            self._chain_of_link[name] = next(begun, chains[0].name)
         robots = {chain.name: etree.Element("robot", name=chain.name) for chain in chains}
         for link in tree.links.values():
             add_link(robots[self._chain_of_link[link.name]], link)
@@ -231,20 +241,6 @@ class MachineDraft:
         return f"{self._folder}/{file}" if self._folder else file
 
 
-def _chains_by_link(
-    tree: Tree, first: str, chain_of_attachment: Mapping[str, str]
-) -> dict[str, str]:
-    """The name of the chain of each link, by the attachments at which chains begin."""
-    chains, joints_by_parent = {tree.root_link: first}, tree.joints_by_parent()
-    pending = [tree.root_link]
-    while pending:
-        link = pending.pop()
-        for joint in joints_by_parent.get(link, ()):
-            chains[joint.child] = chain_of_attachment.get(joint.name, chains[link])
-            pending.append(joint.child)
-    return chains
-
-
 def _machine_data(machine: Machine) -> dict[str, Any]:
     """The machine file, with empty chains and without payload."""
     equations = machine.closure.equations
@@ -319,8 +315,7 @@ def _payload_urdf(machine: Machine) -> Path | None:
     ):
         return None
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", CraneWarning)
+        with ignore_warnings():
             load = read_machine_spec(machine.path).payload
     except CraneError:  # its files are gone
         return None

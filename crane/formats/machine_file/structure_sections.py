@@ -5,17 +5,16 @@ The tree grows chain by chain, and knows whether names that others use are in it
 
 import math
 import re
-import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 
-from crane.common.errors import CraneError, CraneWarning, DescriptionError, suggest_names
+from crane.common.errors import CraneError, DescriptionError, suggest_names, warn
 from crane.description.findings import FollowUpError, error_recovery, report_error
 from crane.description.force_elements import ForceElement, Friction
-from crane.description.kinematic_tree import Joint, Link, Tree, body_of
+from crane.description.kinematic_tree import Joint, Link, Tree, body_of, path_to_root
 from crane.description.pinocchio_conversion import se3_from_xyz_rpy
 from crane.description.rotation_vectors import add_base_joints, check_freedoms
 from crane.description.specification import (
@@ -30,7 +29,7 @@ from crane.description.specification import (
     unit_vector,
 )
 from crane.formats.machine_file.yaml_section import YamlSection
-from crane.formats.urdf.urdf_reader import UrdfModel, read_urdf
+from crane.formats.urdf.urdf_reader import read_urdf
 
 _LOOP_END_PATTERN = re.compile(
     r"((?:closing_|closed?_?loop|loop_?clos).*?)_?([12AB])", re.IGNORECASE
@@ -42,65 +41,56 @@ _MAX_SHOWN = 4  # pairs in a line
 class TreeBuilder:
     """The chains hung onto each other.
 
+    Args:
+        tree: What is there already.
+        is_complete: See below.
+
     Attributes:
-        links: By name.
+        tree: All links and joints.
         joints: Those that move, by name.
         is_complete: Whether every name is here; where findings are collected, a chain or a name
             may have been refused.
     """
 
-    def __init__(self) -> None:
-        self.links: dict[str, Link] = {}
-        self.joints: dict[str, Joint] = {}
-        self.is_complete = True
-        self._all_joints: dict[str, Joint] = {}
-        self._parent_joints: dict[str, Joint] = {}
-        self._root = ""
+    def __init__(self, tree: Tree, is_complete: bool = True):
+        self.is_complete = is_complete
+        self._set_tree(tree)
 
-    @property
-    def tree(self) -> Tree:
-        """All that has been added."""
-        return Tree(dict(self.links), dict(self._all_joints))
+    def _set_tree(self, tree: Tree) -> None:
+        self.tree, self.links, self._parent_joints = tree, tree.links, tree.parent_joints
+        self.joints = {joint.name: joint for joint in tree.moving_joints}
 
-    def add_chain(self, chain: Chain, urdf: UrdfModel) -> None:
+    def add_chain(self, chain: Chain, urdf: MachineSpec) -> None:
         """Hang a chain from its parent frame, the first from the world.
 
         Raises:
             DescriptionError: The frame is unknown, or a name is taken by an earlier chain.
         """
-        self._root = self._root or urdf.root_link
         with error_recovery():
-            if chain.parent is not None and chain.parent not in self.links:
-                raise self.unknown_name_error(
-                    f"{chain.source_location}: chain '{chain.name}' hangs from '{chain.parent}', "
-                    f"no frame of an earlier chain, {suggest_names(self.links, chain.parent)}",
-                    chain.parent,
-                )
-            attachments = [chain.attachment_joint(urdf.root_link)] * (chain.parent is not None)
-            for joint in self.filter_new_names(attachments):
-                self._add_part(joint)
+            label = f"{chain.source_location}: chain '{chain.name}' hangs from '{chain.parent}'"
+            if chain.parent is not None:
+                problem = f"{label}, no frame of an earlier chain"
+                self.check_name(chain.parent, self.links, problem)
+            attachments = [chain.attachment_joint(urdf.tree.root_link)] * (
+                chain.parent is not None
+            )
+            self._set_tree(self.tree.with_parts(*self.filter_new_names(attachments)))
         parts = list(urdf.tree)
         free = list(self.filter_new_names(parts))
         # what is not there goes by another name
         self.is_complete &= urdf.is_complete and len(free) == len(parts)
-        for part in free:
-            self._add_part(part)
+        self._set_tree(self.tree.with_parts(*free))
 
     def add_floating_base(self, freedoms: Sequence[str]) -> None:
         """Let the root of the first chain float instead of standing on the world."""
-        if not freedoms or not self.links:
-            return
-        floating_tree = add_base_joints(self.tree, freedoms)
-        self.links, self._all_joints, self.joints = {}, {}, {}
-        self._root = floating_tree.root_link
-        for part in floating_tree:
-            self._add_part(part)
+        if freedoms and self.links:
+            self._set_tree(add_base_joints(self.tree, freedoms))
 
     def filter_new_names(self, parts: Iterable[Link | Joint]) -> Iterator[Link | Joint]:
         """Those whose names are not taken; the others are noted."""
         for part in parts:
             is_link = isinstance(part, Link)
-            earlier = (self.links if is_link else self._all_joints).get(part.name)
+            earlier = (self.links if is_link else self.tree.joints).get(part.name)
             if earlier is None:
                 yield part
                 continue
@@ -113,41 +103,27 @@ class TreeBuilder:
             if earlier.source_location == part.source_location:
                 return  # one file twice: the rest of it is there, too
 
-    def _add_part(self, part: Link | Joint) -> None:
-        if isinstance(part, Link):
-            self.links[part.name] = part
-            return
-        self._all_joints[part.name] = self._parent_joints[part.child] = part
-        if part.is_movable:
-            self.joints[part.name] = part
-
     def unknown_name_error(self, message: str, name: str = "?") -> CraneError:
         """The error about a name, unless a chain is not there or the name has been refused."""
-        is_follow_up = not self.is_complete or not name
-        return FollowUpError(message) if is_follow_up else DescriptionError(message)
+        return DescriptionError(message) if self.is_complete and name else FollowUpError(message)
+
+    def check_name(self, name: str, names: Collection[str], problem: str) -> None:
+        """Raise for a name that is not among some."""
+        if name not in names:
+            raise self.unknown_name_error(f"{problem}, {suggest_names(names, name)}", name)
 
     def check_joint(self, joint: str, source_location: str) -> None:
         """Raise for a joint that does not exist or does not move."""
         if joint in self.joints:
             return
-        if joint in self._all_joints:
+        if joint in self.tree.joints:
             problem = f"{source_location}: joint '{joint}' is fixed, name a moving one"
             raise DescriptionError(problem) if self.joints else FollowUpError(problem)
-        raise self.unknown_name_error(
-            f"{source_location}: joint '{joint}' is unknown, {suggest_names(self.joints, joint)}",
-            joint,
-        )
+        self.check_name(joint, self.joints, f"{source_location}: joint '{joint}' is unknown")
 
     def check_link(self, link: str, source_location: str, label: str) -> None:
         """Raise for a link that does not exist, called `label`."""
-        if link not in self.links:
-            raise self.unknown_name_error(
-                (
-                    f"{source_location}: {label} '{link}' is unknown, "
-                    f"{suggest_names(self.links, link)}"
-                ),
-                link,
-            )
+        self.check_name(link, self.links, f"{source_location}: {label} '{link}' is unknown")
 
     def read_frame_pair(self, section: YamlSection) -> tuple[str, str]:
         """The two frames that a section is between, on two bodies.
@@ -181,7 +157,9 @@ class TreeBuilder:
 
     def is_movable(self, link: str) -> bool:
         """Whether a link is not fixed to the world."""
-        return not self.is_complete or body_of(self._parent_joints, link) != self._root
+        is_forest = any(joint.is_cut for joint in self.tree.joints.values())
+        is_known = self.is_complete and not is_forest
+        return not is_known or body_of(self._parent_joints, link) != self.tree.root_link
 
     def missing_limit_text(self, joint: str) -> str:
         """How a joint lacks a finite range, in words; empty if it has one, or is unknown."""
@@ -195,7 +173,7 @@ class TreeBuilder:
 
     def single_leaf_link(self) -> str | None:
         """The last link of an unbranched chain."""
-        parents = {joint.parent for joint in self._all_joints.values()}
+        parents = {joint.parent for joint in self.tree.joints.values()}
         leaves = [name for name in self.links if name not in parents]
         return leaves[0] if len(leaves) == 1 else None
 
@@ -208,7 +186,7 @@ def read_chains(
 ]:  # fmt: skip
     """The sub-chains, their tree, the friction, couplings and springs of their URDFs, gravity."""
     chains: list[Chain] = []
-    tree = TreeBuilder()
+    tree = TreeBuilder(Tree({}, {}))
     friction: dict[str, Friction] = {}
     couplings: tuple[Coupling, ...] = ()
     springs: tuple[ForceElement, ...] = ()
@@ -224,8 +202,8 @@ def read_chains(
             chains.append(chain)
             friction |= urdf.friction
             couplings += urdf.couplings
-            springs += urdf.springs
-            if urdf.gravity is not None:
+            springs += urdf.forces
+            if "gravity" in urdf.source_locations:
                 gravities.setdefault(urdf.gravity, chain.name)
     tree.is_complete &= top.is_complete
     if not chains and tree.is_complete:
@@ -235,8 +213,7 @@ def read_chains(
         tree.add_floating_base(check_freedoms(top.names("floating")))
     if not tree.joints and tree.is_complete:
         report_error(top.error_at("chains", "no joint of these chains moves, add one"))
-    gravity = _read_gravity(top, gravities)
-    return tuple(chains), tree, friction, couplings, springs, gravity
+    return tuple(chains), tree, friction, couplings, springs, _read_gravity(top, gravities)
 
 
 def _read_gravity(
@@ -257,7 +234,7 @@ def _read_gravity(
 
 def _read_chain(
     item: YamlSection, earlier_chains: list[Chain], are_all_read: bool, path: Path
-) -> tuple[Chain, UrdfModel]:
+) -> tuple[Chain, MachineSpec]:
     """A chain and its file.
 
     Args:
@@ -285,7 +262,8 @@ def _read_chain(
     for loop in urdf.loops[:1]:
         problem = f"a sub-chain has no <loop>, write it under 'loops' of {path.name}"
         report_error(DescriptionError(f"{loop.source_location}: {problem}"))
-    return Chain(name, file, parent, item.source_location("parent"), urdf.moving_joints), urdf
+    location, joints = item.source_location("parent"), urdf.chains[0].joints
+    return Chain(name, file, parent, location, joints), urdf
 
 
 def read_loops(top: YamlSection, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
@@ -298,11 +276,10 @@ def read_loops(top: YamlSection, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
         frames = []
         for end in ("predecessor", "successor"):
             frame = section.text(end)
-            if frame and frame not in tree.links and tree.is_complete:
-                known = suggest_names(tree.links, frame)
-                report_error(
-                    section.error_at(end, f"{label} has the unknown {end} '{frame}', {known}")
-                )
+            location = section.source_location(end)
+            with error_recovery():
+                problem = f"{location}: {label} has the unknown {end} '{frame}'"
+                tree.check_name(frame, tree.links, problem)
             frames.append(frame)
         axis = None
         with error_recovery():
@@ -329,13 +306,13 @@ def read_couplings(top: YamlSection, tree: TreeBuilder) -> tuple[Coupling, ...]:
     names: list[str] = []
 
     def read_coupling(item: YamlSection) -> Coupling:
-        name, joints = item.text("name"), item.section("joints")
+        name = item.text("name")
         if name in names:
             raise item.error_at("name", f"two couplings are named '{name}', rename one")
         factors = item.value_map("joints", YamlSection.number, tree.check_joint)
         powers = item.value_map("powers", _read_powers, tree.check_joint)
         coupling = Coupling(name, factors, item.number("offset"), item.source_location(), powers)
-        if joints is None or len(coupling.joints) < 2:
+        if len(coupling.joints) < 2:
             raise item.error_at(
                 "joints", f"coupling '{name}' joins less than two joints, add some"
             )
@@ -358,12 +335,10 @@ def read_drives(top: YamlSection, tree: TreeBuilder) -> tuple[Drive, ...]:
 
     def read_drive(section: YamlSection, name: str) -> Drive:
         title = f"drive '{name}'"
-        joints = section.section(name, title)
-        if joints is None or not list(joints):
+        factors = section.value_map(name, YamlSection.number, tree.check_joint, title)
+        if not factors:
             raise section.error_at(name, f"{title} moves no joint, name some")
-        for joint in joints:
-            tree.check_joint(joint, joints.source_location(joint))
-        return Drive(name, section.value_map(name, YamlSection.number, title=title))
+        return Drive(name, factors)
 
     return tuple(top.value_map("drives", read_drive).values())
 
@@ -401,22 +376,23 @@ def warn_about_open_loops(spec: MachineSpec) -> None:
     ]
     remainder_text = [f"{len(pairs) - _MAX_SHOWN} more"] if len(pairs) > _MAX_SHOWN else []
     location = spec.tree.links[pairs[0][0]].source_location
-    warnings.warn(
+    warn(
         f"{location}: no joint closes what looks like {len(pairs)} loop{'s' * (len(pairs) > 1)}, "
         f"{', '.join(pair_texts + remainder_text)}: close them by crane add loops, paste what "
-        "crane check proposes into a machine file, or rename the frames",
-        CraneWarning,
-        stacklevel=2,
+        "crane check proposes into a machine file, or rename the frames"
     )
+
+
+def links_by_name(tree: Tree) -> dict[str, str]:
+    """Return links by their names, and child links by the names of joints."""
+    children = {name: x.child for name, x in tree.joints.items() if name not in tree.links}
+    return {name: name for name in tree.links} | children
 
 
 def loop_end_pairs(tree: Tree) -> list[tuple[str, str, str]]:
     """A name for each loop, and its two links, which have the names themselves or their joints."""
-    link_of_name = {name: name for name in tree.links}
-    for name, joint in tree.joints.items():
-        link_of_name.setdefault(name, joint.child)
     ends: dict[str, dict[str, str]] = {}
-    for name, link in link_of_name.items():
+    for name, link in links_by_name(tree).items():
         if match := _LOOP_END_PATTERN.fullmatch(name):
             ends.setdefault(match[1], {})[match[2].upper()] = link
     return [
@@ -435,10 +411,8 @@ def _gap_text(parent_joints: Mapping[str, Joint], first: str, second: str) -> st
     placements = []
     for link in (first, second):
         placement = pin.SE3.Identity()
-        while link in parent_joints:
-            joint = parent_joints[link]
+        for joint in path_to_root(parent_joints, link):
             placement = se3_from_xyz_rpy(joint.xyz, joint.rpy) * placement
-            link = joint.parent
         placements.append(placement)
     relative_placement = placements[0].actInv(placements[1])
     if not np.isfinite(relative_placement.homogeneous).all():  # an origin is refused

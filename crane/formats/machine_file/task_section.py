@@ -1,8 +1,6 @@
 """The section `tasks` of a machine file."""
 
 import dataclasses
-import itertools
-from collections.abc import Sequence
 
 from crane.description.findings import error_recovery
 from crane.description.machine_schema import MOTIONS
@@ -95,7 +93,7 @@ def _read_start(name: str, item: YamlSection, active: tuple[str, ...]) -> dict[s
 
 def _read_via_task(name: str, item: YamlSection, active: tuple[str, ...], tip: str | None) -> Task:
     """A task through points, in the space of the coordinates that these name."""
-    tip_coordinates = itertools.chain(TIP_COORDINATES, *ATTITUDE_COORDINATES)
+    tip_coordinates = sum(ATTITUDE_COORDINATES, TIP_COORDINATES)
     known_keys = active + ("time", "rates", *(x for x in tip_coordinates if x not in active))
     title = f"via point of task '{name}'"
     points = list(item.list_items("via", title))
@@ -164,7 +162,7 @@ def _read_via_point(point: YamlSection, title: str) -> ViaPoint:
 def _attitude_coordinates(
     name: str,
     point_of_coordinate: dict[str, YamlSection],
-    points: Sequence[tuple[YamlSection, ViaPoint]],
+    points: list[tuple[YamlSection, ViaPoint]],
 ) -> tuple[str, ...]:
     groups = [
         group for group in ATTITUDE_COORDINATES if any(x in point_of_coordinate for x in group)

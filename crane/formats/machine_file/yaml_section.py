@@ -78,9 +78,8 @@ class YamlSection(YamlValues):
             )
         spec = self._key(key)
         spec = next((x for x in getattr(spec, "types", ()) if isinstance(x, SectionKey)), spec)
-        schema = SectionSchema(title, {}, others=getattr(spec, "item", Key()))
-        if isinstance(spec, SectionKey):
-            schema = spec.section
+        names = SectionSchema(title, {}, others=getattr(spec, "item", Key()))
+        schema = spec.section if isinstance(spec, SectionKey) else names
         section = YamlSection(value, schema, title, self._data.locations[key], key, self.turns)
         if schema.others is None:
             section.check_keys(schema.keys)

@@ -4,6 +4,8 @@ import errno
 import re
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +17,6 @@ from crane.common.unit_conversions import NUMBER_PATTERN, KeyPath, WrittenNumber
 from crane.description.findings import report_error
 
 MAX_FILE_SIZE = 2_000_000  # bytes of a file; parsing ten million takes a minute
-
-
-class _BlockMapping(dict[str, Any]):
-    """A mapping of which each number has a line of its own."""
-
-
-class _MachineFileDumper(yaml.SafeDumper):
-    """Innermost mappings and lists in a line, but for `_BlockMapping`."""
-
-
-def _represent_block_mapping(dumper: _MachineFileDumper, data: _BlockMapping) -> yaml.Node:
-    return dumper.represent_mapping("tag:yaml.org,2002:map", data.items(), flow_style=False)
-
-
-_MachineFileDumper.add_representer(_BlockMapping, _represent_block_mapping)
 
 
 def format_yaml(
@@ -47,46 +34,31 @@ def format_yaml(
         written_numbers: Numbers whose units are kept, see `written_numbers_by_path`.
     """
     in_units = with_written_units(dict(data), written_numbers)
-    block_data = _with_block_mappings(in_units, (), {way[:-1] for way in notes})
-    text = str(
-        yaml.dump(
-            block_data, Dumper=_MachineFileDumper, sort_keys=False, allow_unicode=True, width=100,
-            default_flow_style=None,
-        )
-    )  # fmt: skip
+    plain: Any = data
+    layout: Any = {"allow_unicode": True, "width": 100}
+    text = str(yaml.safe_dump(in_units, sort_keys=False, default_flow_style=None, **layout))
     if not notes:
         return text
+    top = yaml.compose(text, yaml.SafeLoader)
+    for key_path in notes:
+        _node_at(top, key_path[:-1]).flow_style = False
+    text = str(yaml.serialize(top, **layout))
     lines, top = text.split("\n"), yaml.compose(text, yaml.SafeLoader)
-    assert top is not None, "it was just written"
     for key_path, note in notes.items():
-        node: Any = top
-        value: Any = data
-        for key in key_path:
-            value = value[key]
-            node = (
-                node.value[key]
-                if isinstance(key, int)
-                else next(value for name, value in node.value if name.value == key)
-            )
+        node, value = _node_at(top, key_path), reduce(getitem, key_path, plain)
         in_si = f"{value:.6g} in SI units, " if is_quantity(node.value) else ""
         lines[node.end_mark.line] += f"  # {in_si}{format_one_line(note)}"
     return "\n".join(lines)
 
 
-def _with_block_mappings(item: Any, key_path: KeyPath, block_paths: set[KeyPath]) -> Any:
-    """The same with `_BlockMapping` where numbers with notes are."""
-    if isinstance(item, dict):
-        found = {
-            key: _with_block_mappings(value, (*key_path, key), block_paths)
-            for key, value in item.items()
-        }
-        return _BlockMapping(found) if key_path in block_paths else found
-    if isinstance(item, list):
-        return [
-            _with_block_mappings(value, (*key_path, i), block_paths)
-            for i, value in enumerate(item)
-        ]
-    return item
+def _node_at(node: Any, key_path: KeyPath) -> Any:
+    for key in key_path:
+        node = (
+            node.value[key]
+            if isinstance(key, int)
+            else next(value for name, value in node.value if name.value == key)
+        )
+    return node
 
 
 class LocatedMapping(dict[str, Any]):
@@ -122,13 +94,12 @@ def written_numbers_by_path(
     """The numbers that were read of a machine file, as written, by the ways to them."""
     found = {(*path, *place): quantity for place, quantity in data.written_numbers.items()}
     for key, value in data.items():
-        items: dict[str | int, Any] = {key: value}
-        if isinstance(value, list):
-            items = dict(zip(_item_labels(value), value, strict=True))
-        for label, item in items.items():
+        if isinstance(value, LocatedMapping):
+            found |= written_numbers_by_path(value, (*path, key))
+        items = value if isinstance(value, list) else []
+        for label, item in zip(_item_labels(items), items, strict=True):
             if isinstance(item, LocatedMapping):
-                way = (*path, key) if item is value else (*path, key, label)
-                found |= written_numbers_by_path(item, way)
+                found |= written_numbers_by_path(item, (*path, key, label))
     return found
 
 
@@ -219,21 +190,16 @@ def _construct_mapping(loader: Any, node: yaml.MappingNode) -> LocatedMapping:
             report_error(DescriptionError(f"{where}: {problem}"))
             continue
         if key in data:
-            first_line = data.locations[key][1]
-            problem = f"key '{key}' is there twice (first in line {first_line}), keep one"
-            report_error(DescriptionError(f"{where}: {problem}"))
+            problem = f"is there twice (first in line {data.locations[key][1]}), keep one"
+            report_error(DescriptionError(f"{where}: key '{key}' {problem}"))
             continue
         data[key] = loader.construct_object(value_node, deep=True)
         data.locations[key] = file, line
     return data
 
 
-def _construct_integer(loader: Any, node: yaml.ScalarNode) -> int:
-    return int(loader.construct_scalar(node))
-
-
 _StrictConstructor.add_constructor("tag:yaml.org,2002:map", _construct_mapping)
-_StrictConstructor.add_constructor("tag:yaml.org,2002:int", _construct_integer)
+_StrictConstructor.add_constructor("tag:yaml.org,2002:int", lambda _, node: int(node.value))
 _FLOAT_PATTERN = rf"{NUMBER_PATTERN}|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"
 for _loader in _LOADERS:
     _loader.yaml_implicit_resolvers = {

@@ -1,12 +1,13 @@
 """Values of a machine file, read as their schema says, every error with its file and line."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import os
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from crane.common.errors import DescriptionError, suggest_names
+from crane.common.errors import DescriptionError, check_name, suggest_names
 from crane.common.number_text import parse_float
 from crane.common.unit_conversions import (
     KeyPath,
@@ -126,6 +127,10 @@ class YamlValues:
         """An error that points at a key."""
         return DescriptionError(f"{self.source_location(key)}: {problem}")
 
+    def check_name(self, key: str, name: str, names: Collection[str], problem: str) -> None:
+        """Raise for a name in the value of a key that is not among some."""
+        check_name(name, names, f"{self.source_location(key)}: {problem}", DescriptionError)
+
     def _value_error(self, key: str, value_text: str, hint: str) -> DescriptionError:
         return self.error_at(key, f"'{key}' of {self.title} is {value_text}, {hint}")
 
@@ -199,10 +204,8 @@ class YamlValues:
         return ""
 
     def _check_choice(self, key: str, value: str) -> None:
-        choices = self._key(key).choices
-        if choices and value not in choices:
-            known = suggest_names(choices, value)
-            raise self.error_at(key, f"'{key}' of {self.title}: '{value}' is unknown, {known}")
+        choices = self._key(key).choices or (value,)
+        self.check_name(key, value, choices, f"'{key}' of {self.title}: '{value}' is unknown")
 
     def number(self, key: str) -> float:
         """A finite number within its bounds; NaN where its error is reported."""
@@ -230,8 +233,7 @@ class YamlValues:
             key: The key.
             position: Where it is in the list or the rows of the key.
         """
-        lists = (NumberListKey, RowListKey)
-        spec = self._number_key(key, *(lists if position else (NumberKey,)))
+        spec = self._number_key(key, *((NumberListKey, RowListKey) if position else (NumberKey,)))
         if not isinstance(spec, NumberKey):
             return ("",)
         coordinate = key if key not in self.schema.keys else ""
@@ -325,13 +327,9 @@ class YamlValues:
         """A file, named by its path from the folder of the file that names it."""
         text = self.text(key)
         path = self._data.locations.get(key, self._location)[0].parent / text
-        try:
-            if path.is_dir():
-                raise self.error_at(key, f"'{text}' of {self.title} is a folder, give a file")
-            is_file = path.is_file()
-        except OSError:  # a name longer than any file's
-            is_file = False
-        if not is_file:
+        if os.path.isdir(path):
+            raise self.error_at(key, f"'{text}' of {self.title} is a folder, give a file")
+        if not os.path.isfile(path):  # also for invalid names
             raise self.error_at(
                 key, f"{self.title}: there is no file '{text}', give its path from this folder"
             )

@@ -8,14 +8,20 @@ over the same two sites share it. An actuator by a slider and a crank has a pris
 the z axis of the slider's site, and a strut of constant length from there to the crank's site.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
 
-from crane.description.kinematic_tree import Joint, Limits, Link, joint_series
+from crane.description.kinematic_tree import (
+    X_AXIS,
+    Y_AXIS,
+    Z_AXIS,
+    Joint,
+    Limits,
+    Link,
+    joint_series,
+)
 from crane.description.pinocchio_conversion import xyz_rpy_from_se3
 from crane.description.specification import LoopSpec
 from crane.formats.mjcf.mujoco_file import MujocoFile
@@ -25,7 +31,6 @@ _MIN_SINE = 0.1  # of the angle between a strut and the axis of a hinge that its
 _DEAD_CENTRE_TOLERANCE = 1e-6  # of the lever arm over the length
 _RANGE_SAMPLES = 201  # over the range of a joint
 _MAX_STRUTS = 100  # each adds three joints
-_X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 _NAME_SUFFIXES = (
     "", "_1", "_2", "_pin_y", "_pin_z", "_end", "_eye", "_slider", "_rod", "_rod_1", "_rod_2",
     "_rod_pin_y", "_rod_pin_z", "_rod_end", "_rod_eye",
@@ -33,12 +38,17 @@ _NAME_SUFFIXES = (
 _ACTUATOR_TAGS = (
     "general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder", "muscle",
 )  # fmt: skip
-_PINS = [("pin_y", "revolute", _Y), ("pin_z", "revolute", _Z)]
+_PINS = [("pin_y", "revolute", Y_AXIS), ("pin_z", "revolute", Z_AXIS)]
 
 
-@dataclass
 class MjcfCylinders:
-    """Joints, links and loops of the cylinders of a file.
+    """Joints, links and loops of actuators by spatial tendons over sites, and by slider and crank.
+
+    Args:
+        mjcf: The file.
+        sites: Name of the link by site.
+        used_names: Names of its links and joints, which receives those of the cylinders.
+        home: (nq,) MuJoCo's coordinates of the home configuration.
 
     Attributes:
         parts: Links and joints.
@@ -50,56 +60,28 @@ class MjcfCylinders:
         resting: Prismatic joints that do not move at first order at home, at a dead centre.
     """
 
-    parts: list[Link | Joint] = field(default_factory=list)
-    loops: list[LoopSpec] = field(default_factory=list)
-    home: dict[str, float] = field(default_factory=dict)
-    tendon_factors: dict[int, dict[str, float]] = field(default_factory=dict)
-    tendon_offsets: dict[int, float] = field(default_factory=dict)
-    actuator_joints: dict[int, str] = field(default_factory=dict)
-    resting: set[str] = field(default_factory=set)
-
-
-def read_cylinders(
-    mjcf: MujocoFile, sites: Mapping[int, str], used_names: set[str], home: np.ndarray
-) -> MjcfCylinders:
-    """Read the actuators by spatial tendons over sites, and by slider and crank.
-
-    Args:
-        mjcf: The file.
-        sites: Name of the link by site.
-        used_names: Names of its links and joints, which receives those of the cylinders.
-        home: (nq,) MuJoCo's coordinates of the home configuration.
-    """
-    builder = _CylinderBuilder(mjcf, sites, used_names, home)
-    for actuator in range(mjcf.model.nu):
-        kind, target = mjcf.transmission(actuator)
-        if kind == "TENDON" and target not in builder.found.tendon_factors:
-            builder.add_tendon(target)
-        elif kind == "SLIDERCRANK":
-            builder.add_slider_crank(actuator)
-    return builder.found
-
-
-class _CylinderBuilder:
-    """Builds the cylinders of a file.
-
-    Args:
-        mjcf: The file.
-        sites: Name of the link by site.
-        used_names: Names of its links and joints.
-        home: (nq,) MuJoCo's coordinates of the home configuration.
-    """
-
     def __init__(
-        self, mjcf: MujocoFile, sites: Mapping[int, str], used_names: set[str], home: np.ndarray
+        self, mjcf: MujocoFile, sites: dict[int, str], used_names: set[str], home: np.ndarray
     ):
-        self.found = MjcfCylinders()
+        self.parts: list[Link | Joint] = []
+        self.loops: list[LoopSpec] = []
+        self.home: dict[str, float] = {}
+        self.tendon_factors: dict[int, dict[str, float]] = {}
+        self.tendon_offsets: dict[int, float] = {}
+        self.actuator_joints: dict[int, str] = {}
+        self.resting: set[str] = set()
         self._mjcf, self._model, self._used_names = mjcf, mjcf.model, used_names
         self._links = sites
         self._data = mjcf.kinematics(home)
         self._struts: dict[frozenset[int], str] = {}  # joints by their two sites
+        for actuator in range(mjcf.model.nu):
+            kind, target = mjcf.transmission(actuator)
+            if kind == "TENDON" and target not in self.tendon_factors:
+                self._add_tendon(target)
+            elif kind == "SLIDERCRANK":
+                self._add_slider_crank(actuator)
 
-    def add_tendon(self, tendon: int) -> None:
+    def _add_tendon(self, tendon: int) -> None:
         """Add the struts of a tendon, if it runs over sites and pulleys only."""
         weld = np.array(self._model.body_weldid)
         weld[self._model.body_mocapid[weld] >= 0] = 0  # what a program moves stands still
@@ -131,28 +113,26 @@ class _CylinderBuilder:
             self._add_strut(strut, (first, second), self._vector(first, second), location, limits)
             self._struts[pair] = strut
             if self._is_resting(first, second, self._data.site_xpos[first]):
-                self.found.resting.add(strut)
-        self.found.tendon_factors[tendon] = {self._struts[x]: y for x, y in shares.items()}
-        self.found.tendon_offsets[tendon] = offset
+                self.resting.add(strut)
+        self.tendon_factors[tendon] = {self._struts[x]: y for x, y in shares.items()}
+        self.tendon_offsets[tendon] = offset
 
     def _segments(self, tendon: int) -> list[tuple[int, int, float]]:
         """First and second site and divisor of each part; none if it runs over other things."""
-        model, divisor = self._model, 1.0
+        divisor = 1.0
         path: list[tuple[int, float]] = []  # site, -1 of a pulley, and the divisor there
-        start = model.tendon_adr[tendon]
-        for i in range(start, start + model.tendon_num[tendon]):
-            kind = self._mjcf.enumeration_name("Wrap", model.wrap_type[i])
+        for kind, item, parameter in self._mjcf.tendon_path(tendon):
             if kind not in ("SITE", "PULLEY"):
                 return []
-            divisor = float(model.wrap_prm[i]) if kind == "PULLEY" else divisor
-            path.append((int(model.wrap_objid[i]) if kind == "SITE" else -1, divisor))
+            divisor = parameter if kind == "PULLEY" else divisor
+            path.append((item if kind == "SITE" else -1, divisor))
         return [
             (first, second, divisor)
             for (first, _), (second, divisor) in pairwise(path)
             if min(first, second) >= 0
         ]
 
-    def add_slider_crank(self, actuator: int) -> None:
+    def _add_slider_crank(self, actuator: int) -> None:
         """Add the slider and the rod to the crank, if they meet at home."""
         crank, slider = (int(x) for x in self._model.actuator_trnid[actuator])
         rod_length = float(self._model.actuator_cranklength[actuator])
@@ -165,14 +145,14 @@ class _CylinderBuilder:
         name = self._unique_name(self._mjcf.name("ACTUATOR", actuator))
         location = self._mjcf.source_location(name, *_ACTUATOR_TAGS)
         slide = f"{name}_slider"
-        joint = Joint(name, "prismatic", self._links[slider], slide, location, axis=_Z)
-        self.found.parts += [Link(slide, location, composite_joint=name), joint]
-        self.found.actuator_joints[actuator] = name
-        self.found.home[name] = length
+        joint = Joint(name, "prismatic", self._links[slider], slide, location, axis=Z_AXIS)
+        self.parts += [Link(slide, location, composite_joint=name), joint]
+        self.actuator_joints[actuator] = name
+        self.home[name] = length
         rod = vector - length * rotation[:, 2]
         self._add_strut(f"{name}_rod", (slider, crank), rod, location, link=slide)
         if self._is_resting(slider, crank, self._data.site_xpos[crank] - rod):
-            self.found.resting.add(name)
+            self.resting.add(name)
 
     def _add_strut(
         self,
@@ -199,7 +179,7 @@ class _CylinderBuilder:
         rotation = np.column_stack([direction, normal, np.cross(direction, normal)])
         placement = xyz_rpy_from_se3(pin.SE3(self._rotation(sites[0]).T @ rotation, np.zeros(3)))
         rod_end = f"{name}_end"
-        series = joint_series(name, [*_PINS, ("slide", "prismatic", _X)], placement,
+        series = joint_series(name, [*_PINS, ("slide", "prismatic", X_AXIS)], placement,
                               (link or self._links[sites[0]], rod_end), location)  # fmt: skip
         *pins, slide = series
         assert isinstance(slide, Joint)
@@ -207,10 +187,10 @@ class _CylinderBuilder:
             slide = Joint(slide.name, "fixed", slide.parent, rod_end, location, (length, 0.0, 0.0))
         else:
             slide = Joint(name, "prismatic", slide.parent, rod_end, location, limits=limits)
-            self.found.home[name] = length
-        self.found.parts += [*pins, slide, Link(rod_end, location, composite_joint=name)]
-        self.found.loops.append(
-            LoopSpec(f"{name}_eye", "spherical", rod_end, self._links[sites[1]], _Z,
+            self.home[name] = length
+        self.parts += [*pins, slide, Link(rod_end, location, composite_joint=name)]
+        self.loops.append(
+            LoopSpec(f"{name}_eye", "spherical", rod_end, self._links[sites[1]], Z_AXIS,
                      location)
         )  # fmt: skip
 
@@ -231,8 +211,7 @@ class _CylinderBuilder:
 
         It is on the side of a dead centre on which home is; None with several joints or no limits.
         """
-        model, bodies = self._model, self._bodies_between(first, second)
-        joints = [i for i, body in enumerate(model.jnt_bodyid) if int(body) in bodies]
+        model, joints = self._model, self._joints_between(first, second)
         is_limited = (
             len(joints) == 1 and model.jnt_limited[joints[0]] and model.jnt_type[joints[0]] >= 2
         )
@@ -253,8 +232,8 @@ class _CylinderBuilder:
         end = turns[turns > home].min(initial=len(values) - 1)
         return np.array([lengths[start : end + 1].min(), lengths[start : end + 1].max()])
 
-    def _bodies_between(self, first: int, second: int) -> set[int]:
-        """Return the bodies on the path between two sites in the tree."""
+    def _joints_between(self, first: int, second: int) -> list[int]:
+        """Return the joints on the path between two sites in the tree."""
         bodies = set[int]()
         for site in (first, second):
             body, path = int(self._model.site_bodyid[site]), set[int]()
@@ -262,21 +241,19 @@ class _CylinderBuilder:
                 path.add(body)
                 body = int(self._model.body_parentid[body])
             bodies ^= path
-        return bodies
+        return [i for i, body in enumerate(self._model.jnt_bodyid) if int(body) in bodies]
 
     def _pin_direction(self, direction: np.ndarray, first: int, second: int) -> np.ndarray:
         """Return a unit vector (3,) across a direction, along a hinge between two sites if any.
 
         In a planar mechanism the second pin then stays at zero.
         """
-        bodies = self._bodies_between(first, second)
         hinges = [
             joint
-            for joint, body in enumerate(self._model.jnt_bodyid)
-            if int(body) in bodies and self._mjcf.joint_type(joint) == "HINGE"
+            for joint in self._joints_between(first, second)
+            if self._mjcf.joint_type(joint) == "HINGE"
         ]
-        candidates = [*self._data.xaxis[hinges], *np.eye(3)]
-        across = (x - (x @ direction) * direction for x in candidates)
+        across = (x - (x @ direction) * direction for x in [*self._data.xaxis[hinges], *np.eye(3)])
         found = next(x for x in across if np.linalg.norm(x) > _MIN_SINE)
         return found / np.linalg.norm(found)
 

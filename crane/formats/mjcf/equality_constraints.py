@@ -8,14 +8,13 @@ import numpy as np
 import pinocchio as pin
 
 from crane.common.errors import DescriptionError
-from crane.description.kinematic_tree import to_vector
+from crane.description.kinematic_tree import Z_AXIS, to_vector, unique_name
 from crane.description.specification import Coupling, LoopSpec
 from crane.formats.mjcf.model_features import fixed_tendon_factors
 from crane.formats.mjcf.mujoco_file import MujocoFile, pose
 
 _DISTANCE_TOLERANCE = 1e-9  # relative
 _TORQUE_SCALE_INDEX = 10  # of torquescale in the data of a weld
-_Z = (0.0, 0.0, 1.0)
 
 
 @dataclass
@@ -34,8 +33,7 @@ class MjcfFrames:
 
     def add(self, name: str, body: int, placement: pin.SE3, source_location: str) -> str:
         """Add a frame under a name that no link has, and return the name."""
-        while name in self.used_names:
-            name += "_"
+        name = unique_name(name, self.used_names)
         self.used_names.add(name)
         self.placements[name] = body, placement, source_location
         return name
@@ -88,8 +86,7 @@ def read_equality_constraints(
         if len({int(model.body_weldid[end.body]) for end in ends}) == 1:
             mjcf.note_unsupported("constraints within one body", name)
             continue
-        while name in names:
-            name += "_"
+        name = unique_name(name, names)
         names.add(name)
         if kind not in ("CONNECT", "WELD", "JOINT", "TENDON"):
             raise DescriptionError(
@@ -145,7 +142,7 @@ def _create_loop(
         end.link or frames.add(f"{name}_{side}", end.body, end.placement, source_location)
         for side, end in (("predecessor", first), ("successor", second))
     ]
-    return LoopSpec(name, kind, links[0], links[1], _Z, source_location)
+    return LoopSpec(name, kind, links[0], links[1], Z_AXIS, source_location)
 
 
 def _combine_connects(
@@ -196,21 +193,12 @@ def _combine_two_connects(
             axis = nearest
         links = [str(first.link) for first in first_ends]
         return LoopSpec(shared, "revolute", links[0], links[1], to_vector(axis), where)
+    rotations = [pin.Quaternion.FromTwoVectors(np.array(Z_AXIS), line).matrix() for line in lines]
     ends = [
-        _ConstraintEnd(
-            first.body, pin.SE3(_rotation_along(line), first.placement.translation), None
-        )
-        for first, line in zip(first_ends, lines, strict=True)
+        _ConstraintEnd(first.body, pin.SE3(rotation, first.placement.translation), None)
+        for first, rotation in zip(first_ends, rotations, strict=True)
     ]
     return _create_loop(shared, "revolute", ends[0], ends[1], frames, where)
-
-
-def _rotation_along(direction: np.ndarray) -> np.ndarray:
-    """Return a rotation (3, 3) whose third column has a direction."""
-    third = direction / np.linalg.norm(direction)
-    first = np.cross(np.eye(3)[np.argmin(np.abs(third))], third)
-    first /= np.linalg.norm(first)
-    return np.column_stack([first, np.cross(third, first), third])
 
 
 def _create_coupling(

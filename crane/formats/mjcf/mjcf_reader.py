@@ -17,21 +17,18 @@ from crane.description.kinematic_tree import (
     joint_series,
     parse_limit,
     to_vector,
+    unique_name,
     with_rotor_inertias,
 )
 from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
 from crane.description.rotation_vectors import with_rotation_vectors
 from crane.description.specification import Chain, MachineSpec, source_locations
 from crane.formats.machine_file.structure_sections import TreeBuilder
-from crane.formats.mjcf.actuator_cylinders import read_cylinders
+from crane.formats.mjcf.actuator_cylinders import MjcfCylinders
 from crane.formats.mjcf.equality_constraints import MjcfFrames, read_equality_constraints
-from crane.formats.mjcf.model_features import (
-    read_drives,
-    read_joint_effects,
-)
+from crane.formats.mjcf.model_features import ModelFeatures
 from crane.formats.mjcf.mujoco_file import MujocoFile, pose
 from crane.formats.mjcf.unsupported_features import note_unsupported_features
-from crane.formats.urdf.urdf_reader import UrdfModel
 
 
 def read_mjcf(path: Path) -> MachineSpec:
@@ -83,30 +80,19 @@ class _MjcfReader:
             self._add_fixed_joint(link, self.body_links[body], placement)
         used_names = {*self.links, *self.joints, *(loop.name for loop in loops)}
         qpos = self._home_coordinates()
-        cylinders = read_cylinders(mjcf, frames.link_of_site, used_names, qpos)
+        cylinders = MjcfCylinders(mjcf, frames.link_of_site, used_names, qpos)
         self.links |= {x.name: x for x in cylinders.parts if isinstance(x, Link)}
         self.joints |= {x.name: x for x in cylinders.parts if isinstance(x, Joint)}
         loops += tuple(cylinders.loops)
-        effects = read_joint_effects(mjcf, self.series_joints, frames.link_of_site, cylinders)
-        drives = read_drives(mjcf, self.series_joints, cylinders)
+        features = ModelFeatures(mjcf, self.series_joints, frames.link_of_site, cylinders)
         note_unsupported_features(mjcf, cylinders)
-        urdf = UrdfModel(
-            mjcf.file,
-            mjcf.file.stem,
-            with_rotor_inertias(Tree(self.links, self.joints), effects.rotor_inertias),
-            self.body_links[0],
-            loops,
-            None,
-            effects.friction,
-            couplings,
+        tree = TreeBuilder(
+            with_rotor_inertias(Tree(self.links, self.joints), features.rotor_inertias)
         )
-        chain = Chain(mjcf.file.stem, mjcf.file, None, mjcf.file.name, urdf.moving_joints)
-        tree = TreeBuilder()
-        tree.add_chain(chain, urdf)
         for loop in loops:
             tree.check_loop(loop)
         active = self._listed_joints("active")
-        for drive in drives if not active else ():
+        for drive in features.drives.values() if not active else ():
             # one joint of each drive: its other joints depend on that, or are other coordinates
             active += [x for x in drive.factors if x not in {*active, *cylinders.resting}][:1]
         free = tuple(self._listed_joints("free"))
@@ -117,19 +103,19 @@ class _MjcfReader:
             name=self.texts.get("name") or mjcf.file.stem,
             source=self.texts.get("source") or mjcf.file.name,
             path=mjcf.file,
-            chains=(chain,),
+            chains=(Chain(mjcf.file.stem, mjcf.file, None, mjcf.file.name, tuple(tree.joints)),),
             tree=tree.tree,
             loops=loops,
             active=tuple(active) if active or loops or couplings else None,
             home=home,
-            friction=effects.friction,
-            forces=tuple(effects.springs),
-            ropes=tuple(effects.ropes),
+            friction=features.friction,
+            forces=tuple(features.springs),
+            ropes=tuple(features.ropes),
             tip=tip,
             couplings=couplings,
             source_locations=source_locations(loops, couplings) | home_locations,
             free=free,
-            drives=drives,
+            drives=tuple(features.drives.values()),
             gravity=(0.0,) * 3
             if "GRAVITY" in mjcf.disabled_features
             else to_vector(self.model.opt.gravity),
@@ -138,16 +124,11 @@ class _MjcfReader:
 
     def _unique_link_name(self, name: str) -> str:
         """Return a name that no body and no other link has."""
-        used_names = {self.mjcf.name("BODY", i) for i in range(self.model.nbody)}
-        used_names |= self.links.keys()
-        while name in used_names:
-            name += "_"
-        return name
+        bodies = (self.mjcf.name("BODY", i) for i in range(self.model.nbody))
+        return unique_name(name, {*bodies, *self.links})
 
     def _add_fixed_joint(self, link: str, parent: str, placement: pin.SE3) -> None:
-        name = f"{link}_fixed"
-        while name in self.joints or name in self.names:
-            name += "_"
+        name = unique_name(f"{link}_fixed", {*self.joints, *self.names})
         self.joints[name] = Joint(
             name,
             "fixed",

@@ -9,14 +9,14 @@ from lxml import etree
 from crane.common.atomic_output import replace_file
 from crane.common.errors import InputError
 from crane.description.force_elements import ForceElement, Friction, Rope, element_name
-from crane.description.kinematic_tree import ROTATIONS
+from crane.description.kinematic_tree import ROTATIONS, unique_name
 from crane.description.rotation_vectors import ROTATION_COUNT
 from crane.description.specification import Coupling, Drive, LoopSpec
-from crane.formats.mjcf.massless_struts import find_massless_struts
 from crane.formats.mjcf.mjcf_elements import (
     add_fixed_tendon,
     add_inertial,
     add_tendon,
+    find_massless_struts,
     placement_attributes,
     solve_polynomial,
 )
@@ -55,11 +55,8 @@ def write_mjcf(machine: Machine, path: str | Path) -> None:
     writer = _MjcfWriter(machine)
     with replace_file(path) as temporary_file:
         temporary_file.write_bytes(writer.build_content())
-    unsupported = [
-        f"the constant force on {x.joint}" for x in machine.forces if x.force and x.joint
-    ]
-    unsupported += writer.unsupported
-    warn_about_unsupported(machine, "MJCF", unsupported)
+    constant = [f"the constant force on {x.joint}" for x in machine.forces if x.force and x.joint]
+    warn_about_unsupported(machine, "MJCF", [*constant, *writer.unsupported])
 
 
 class _MjcfWriter:
@@ -75,10 +72,12 @@ class _MjcfWriter:
     def __init__(self, machine: Machine):
         self.machine, self.model, self.tree = machine, machine.model, machine.tree
         self.joints = range(1, self.model.njoints)
-        last_columns = machine.coordinates.body_of_joint[1:]  # by index of the joint, from 1
         self.moved_links = [
             self.tree.root_link,
-            *(self.tree.joints[machine.joints[column - 1]].child for column in last_columns),
+            *(
+                self.tree.joints[machine.joints[column - 1]].child
+                for column in machine.coordinates.body_of_joint[1:]
+            ),
         ]
         self.frames = [  # of all other links
             frame
@@ -102,8 +101,13 @@ class _MjcfWriter:
         """Return the file's content."""
         add = etree.SubElement
         add(self.root, "compiler", angle="radian", autolimits="false", inertiafromgeom="false")
-        gravity = format_numbers(self.machine.gravity)
-        add(self.root, "option", timestep="0.001", gravity=gravity, integrator="implicitfast")
+        add(
+            self.root,
+            "option",
+            timestep="0.001",
+            gravity=format_numbers(self.machine.gravity),
+            integrator="implicitfast",
+        )
         self._add_texts()
         self.bodies[0] = add(self.root, "worldbody")
         pending = [(joint, self.bodies[0]) for joint in reversed(self._child_joints(0))]
@@ -295,8 +299,7 @@ class _MjcfWriter:
         MuJoCo has one value of each effect for all axes.
         """
         machine, data = self.machine, self.model.createData()
-        configuration = machine.coordinates.configuration(machine.home)
-        pin.forwardKinematics(self.model, data, configuration)
+        pin.forwardKinematics(self.model, data, machine.coordinates.configuration(machine.home))
         first = self.model.joints[joint].idx_v
         names = machine.joints[first : first + self.model.joints[joint].nv]
         is_ball = len(names) == ROTATION_COUNT
@@ -322,8 +325,7 @@ class _MjcfWriter:
 
     def _add_site(self, body: etree._Element, name: str, placement: pin.SE3) -> str:
         """Add a site under a unique name, and return the name."""
-        while name in self.site_names:
-            name += "_"
+        name = unique_name(name, self.site_names)
         self.site_names.add(name)
         site = etree.Element("site", {"name": name} | placement_attributes(placement))
         first = body.find("body")

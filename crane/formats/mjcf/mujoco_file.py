@@ -12,10 +12,9 @@ import pinocchio as pin
 from lxml import etree
 
 from crane.common.errors import DescriptionError
-from crane.common.number_text import parse_float
 from crane.common.optional_libraries import import_optional_library
 from crane.formats.conversion_notes import ConversionNotes
-from crane.formats.xml_file import XmlFile
+from crane.formats.xml_file import XmlFile, parse_attribute
 
 MAX_COPIES = 10_000  # copied elements; MuJoCo's time to copy grows with the square
 # attributes whose product is a number of cells or bytes, and its bound
@@ -63,12 +62,11 @@ def _count_elements(
         copied_count += models.get(element.get("model", ""), 0)
         total += copied_count
     for child in element:
-        if isinstance(child.tag, str):
-            child_count, copied = _count_elements(xml, child, included, models)
-            total, copied_count = total + child_count, copied_count + copied
+        child_count, copied = _count_elements(xml, child, included, models)
+        total, copied_count = total + child_count, copied_count + copied
     repeated_count = 0.0
     if element.tag in ("replicate", "composite"):  # MuJoCo reports invalid counts
-        repetitions = math.prod(max(1.0, x) for x in _read_numbers(element, "count"))
+        repetitions = math.prod(max(1.0, x) for x in parse_attribute(element, "count"))
         repeated_count = total * repetitions
         if repeated_count <= MAX_COPIES:
             copied_count += int(total * (repetitions - 1))
@@ -84,12 +82,12 @@ def _count_elements(
 
 def _check_sizes(xml: XmlFile, element: etree._Element) -> None:
     keys, maximum = _SIZE_ATTRIBUTES.get(element.tag, ((), math.inf))
-    product = math.prod(max(abs(x), 1.0) for key in keys for x in _read_numbers(element, key))
+    product = math.prod(max(abs(x), 1.0) for key in keys for x in parse_attribute(element, key))
     sizes: list[tuple[tuple[str, ...], float, float]] = [(keys, product, maximum)]
     if element.tag == "size" or (element.tag in _MAX_ATTRIBUTE_VALUES and element.get("builtin")):
         maximum = _MAX_ATTRIBUTE_VALUES[element.tag]
         sizes += [
-            ((key,), max(_read_numbers(element, key), default=0.0), maximum)
+            ((key,), max(parse_attribute(element, key), default=0.0), maximum)
             for key in (("params",) if element.tag == "mesh" else element.keys())
             if key not in _UNCHECKED_ATTRIBUTES
         ]
@@ -101,14 +99,6 @@ def _check_sizes(xml: XmlFile, element: etree._Element) -> None:
             raise xml.error_at(
                 element, f"{given} of <{element.tag}> is too large, make it at most {maximum}"
             )
-
-
-def _read_numbers(element: etree._Element, key: str) -> list[float]:
-    """Return the numbers of an attribute, none if it is malformed, which MuJoCo reports."""
-    try:
-        return [parse_float(word) for word in element.get(key, "").split()]
-    except ValueError:
-        return []
 
 
 def _remove_shapes(
@@ -333,6 +323,18 @@ class MujocoFile(ConversionNotes):
         if names := [self.name(object_type, index) for index in indices]:
             self.note_unsupported(feature, *names)
 
+    def tendon_path(self, tendon: int) -> list[tuple[str, int, float]]:
+        """Return the type, the index and the parameter of each object on the way of a tendon."""
+        model, start = self.model, self.model.tendon_adr[tendon]
+        return [
+            (
+                self.enumeration_name("Wrap", model.wrap_type[i]),
+                int(model.wrap_objid[i]),
+                float(model.wrap_prm[i]),
+            )
+            for i in range(start, start + model.tendon_num[tendon])
+        ]
+
     def transmission(self, actuator: int) -> tuple[str, int]:
         """Return the type of an actuator's transmission, such as JOINT, and its target's index."""
         kind = self.enumeration_name("Trn", self.model.actuator_trntype[actuator])
@@ -384,8 +386,4 @@ def pose(quaternion: np.ndarray, position: np.ndarray) -> pin.SE3:
 
     A quaternion of length zero is no rotation.
     """
-    length = float(np.linalg.norm(quaternion))
-    if length == 0:
-        return pin.SE3(np.eye(3), position.copy())
-    w, x, y, z = (float(value) / length for value in quaternion)
-    return pin.SE3(pin.Quaternion(w, x, y, z).toRotationMatrix(), position.copy())
+    return pin.SE3(pin.Quaternion(*quaternion).normalized().toRotationMatrix(), position.copy())

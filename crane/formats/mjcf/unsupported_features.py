@@ -85,8 +85,7 @@ def colliding_geoms(model: Any, disabled: set[str]) -> list[int]:
     )
     body, contype, conaffinity = unique_geoms.T
     rigid_bodies = body_weld_ids[body]
-    excluded = {divmod(int(x), 1 << 16) for x in model.exclude_signature}
-    excluded |= {(two, one) for one, two in excluded}
+    excluded = {frozenset(divmod(int(x), 1 << 16)) for x in model.exclude_signature}
     is_touching = np.zeros(len(unique_geoms), dtype=bool)
     for i in range(len(unique_geoms)):
         can_touch = ((contype[i] & conaffinity) | (contype & conaffinity[i])) != 0
@@ -97,7 +96,8 @@ def colliding_geoms(model: Any, disabled: set[str]) -> list[int]:
             )
             can_touch &= ~(are_parent_and_child & (rigid_bodies != 0) & (rigid_bodies[i] != 0))
         is_touching[i] = any(
-            (int(body[i]), int(body[j])) not in excluded for j in np.flatnonzero(can_touch)
+            frozenset((int(body[i]), int(body[j]))) not in excluded
+            for j in np.flatnonzero(can_touch)
         )
     found = is_touching[np.ravel(unique_index)]
     found[np.concatenate([model.pair_geom1, model.pair_geom2]).astype(int)] = True
@@ -112,8 +112,10 @@ def _note_joints(mjcf: MujocoFile, disabled: set[str]) -> None:
         ("jnt_springyield", "yielding of springs"),
         ("jnt_actfrclimited", "limits of the force on joints (actuatorfrcrange)"),
     ):
-        of_dofs = attribute.startswith("dof")
-        found = [int(model.dof_jntid[i]) if of_dofs else i for i in nonzero_rows(model, attribute)]
+        found = [
+            int(model.dof_jntid[i]) if attribute.startswith("dof") else i
+            for i in nonzero_rows(model, attribute)
+        ]
         mjcf.note_unsupported_elements(feature, "JOINT", found)
     for switch, fields in (
         ("SPRING", ("jnt_stiffness", "tendon_stiffness")),

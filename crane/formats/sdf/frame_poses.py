@@ -67,14 +67,10 @@ class SdfFramePoses:
         self, scope: ModelScope, inner: ModelScope, referrer: SdfElement
     ) -> pin.SE3:
         """Return the pose of a model that is nested in a scope at any depth."""
-        steps = []
-        while inner is not scope and inner.parent is not None:
-            steps.append((inner.parent, inner.name))
-            inner = inner.parent
-        placement = pin.SE3.Identity()
-        for parent, name in reversed(steps):
-            placement = placement * self.pose_in_scope(parent, name, referrer)
-        return placement
+        if inner is scope or inner.parent is None:
+            return pin.SE3.Identity()
+        parent_pose = self.nested_model_pose(scope, inner.parent, referrer)
+        return parent_pose * self.pose_in_scope(inner.parent, inner.name, referrer)
 
     def _model_pose(self, scope: ModelScope, model: ModelScope, base: str) -> pin.SE3:
         """Return the pose of a model's frame in the parent scope."""
@@ -96,6 +92,11 @@ class SdfFramePoses:
         if relative == _MODEL_FRAME:
             relative = item.base_frame
         return self.pose_in_scope(scope, relative or default, item) * placement
+
+    def pose_on_link(self, scope: ModelScope, link: SdfElement, item: SdfElement) -> pin.SE3:
+        """Return the pose of an element of a link relative to the link's frame."""
+        link_pose = self.element_pose(scope, link, link.base_frame)
+        return link_pose.actInv(self.element_pose(scope, item, link.name))
 
 
 def attached_to(frame: SdfElement) -> str:

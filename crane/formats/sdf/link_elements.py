@@ -2,21 +2,19 @@
 
 import dataclasses
 import math
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 from lxml import etree
 
-from crane.common.errors import CraneWarning
-from crane.common.samples import Array
-from crane.description.kinematic_tree import Inertial
+from crane.common.errors import warn
+from crane.description.kinematic_tree import TENSOR_ATTRIBUTES, Inertial
 from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
 from crane.formats.sdf.frame_poses import SdfFramePoses
 from crane.formats.sdf.model_scope import ModelScope, NoteFunction, SdfElement
 from crane.formats.visuals.urdf_shapes import find_mesh_file, read_meshes
-from crane.formats.xml_file import TENSOR_ATTRIBUTES, add_inertial, add_origin
+from crane.formats.xml_file import add_inertial, add_origin
 
 _DEFAULT_DENSITY = 1000.0  # [kg/m3], default of SDF
 
@@ -38,11 +36,9 @@ def add_link_inertial(
     """
     inertial_element = link.single_child("inertial")
     if inertial_element is None and is_moving:
-        warnings.warn(
+        warn(
             f"{link.source_location}: {link.label} has no <inertial>, which SDF takes as 1 kg "
-            "and 1 kg m2: write what it has",
-            CraneWarning,
-            stacklevel=2,
+            "and 1 kg m2: write what it has"
         )
     inertial_element = inertial_element or link.wrap(etree.Element("inertial"), link.label)
     tensor_element = inertial_element.single_child("inertia") or link.wrap(
@@ -66,11 +62,10 @@ def _collision_inertial(
 ) -> Inertial:
     """Return the inertial of the collisions of a link, filled with their densities."""
     density = inertial_element.number("density", _DEFAULT_DENSITY)
-    link_pose = frames.element_pose(scope, link, link.base_frame)
     total_inertia = pin.Inertia.Zero()
     for child in link.element.iterfind("collision"):
         shape = link.wrap(child, f"a collision of {link.label}")
-        shape_pose = link_pose.actInv(frames.element_pose(scope, shape, link.name))
+        shape_pose = frames.pose_on_link(scope, link, shape)
         total_inertia += shape_pose.act(solid_inertia(shape, shape.number("density", density)))
     computed_inertial = inertial_from_inertia(total_inertia)
     if computed_inertial is None:
@@ -102,9 +97,8 @@ def solid_inertia(shape: SdfElement, density: float) -> pin.Inertia:
         x, y, z = _read_sizes(solid_element, "size", 3)
         return pin.Inertia.FromBox(density * x * y * z, x, y, z)
     if tag in ("ellipsoid", "sphere"):
-        radii = _read_sizes(solid_element, "radius", 1) * 3
-        if tag == "ellipsoid":
-            radii = _read_sizes(solid_element, "radii", 3)
+        key, count = ("radii", 3) if tag == "ellipsoid" else ("radius", 1)
+        radii = _read_sizes(solid_element, key, count) * (3 // count)
         mass = density * 4 / 3 * math.pi * float(np.prod(radii))
         return pin.Inertia.FromEllipsoid(mass, *radii)
     (radius,), (length,) = (_read_sizes(solid_element, key, 1) for key in ("radius", "length"))
@@ -133,6 +127,8 @@ def _read_sizes(element: SdfElement, tag: str, count: int) -> tuple[float, ...]:
 
 
 def _mesh_inertia(mesh_element: SdfElement, density: float) -> pin.Inertia:
+    import trimesh  # slow to import, and few files have inertias of meshes
+
     name, file = _find_mesh(mesh_element)
     if mesh_element.single_child("submesh") is not None:
         raise _unknown_volume_error(mesh_element, f"takes a part of the mesh '{name}'")
@@ -145,56 +141,24 @@ def _mesh_inertia(mesh_element: SdfElement, density: float) -> pin.Inertia:
         )
     scale = np.array(mesh_element.numbers("scale", 3, (1.0, 1.0, 1.0)))
     triangles = np.concatenate([part.vertices[part.faces] for part in parts]) * scale
-    if edges := _count_open_edges(triangles):
+    centroid = triangles.reshape(-1, 3).mean(axis=0)  # as origin it reduces rounding errors
+    corners = (triangles - centroid).reshape(-1, 3)
+    # equal vertices are merged: formats such as STL contain each several times
+    mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3))
+    if edges := len(trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)):
         raise _unknown_volume_error(
             mesh_element, f"has the mesh '{name}', which {edges} edges leave open"
         )
-    mass, com, tensor = inertia_of_triangles(triangles, density)
-    if not mass > 0:
+    if not mesh.is_winding_consistent:
+        raise _unknown_volume_error(
+            mesh_element, f"has the mesh '{name}', whose triangles do not all face outwards"
+        )
+    if mesh.volume < 0:  # its triangles face inwards
+        mesh.invert()
+    mesh.density = density
+    if not mesh.mass > 0:
         raise _unknown_volume_error(mesh_element, f"has the mesh '{name}', which is flat")
-    return pin.Inertia(mass, com, tensor)
-
-
-def _count_open_edges(triangles: Array) -> int:
-    """Count the edges that triangles do not traverse equally often in both directions.
-
-    Vertices that agree to nine digits of the mesh's size are the same: formats without shared
-    vertices, such as STL, contain each several times.
-    """
-    points = triangles.reshape(-1, 3)
-    grid = float(np.ptp(points, axis=0).max()) * 1e-9 or 1.0
-    _, index = np.unique(np.round(points / grid), axis=0, return_inverse=True)
-    directed_edges = index.reshape(-1, 3)[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    directed_edges = directed_edges[directed_edges[:, 0] != directed_edges[:, 1]]
-    sign = np.where(directed_edges[:, 0] < directed_edges[:, 1], 1, -1)
-    _, edge = np.unique(np.sort(directed_edges, axis=1), axis=0, return_inverse=True)
-    return int(np.count_nonzero(np.bincount(edge.ravel(), weights=sign)))
-
-
-def inertia_of_triangles(triangles: Array, density: float) -> tuple[float, Array, Array]:
-    """Return mass, centre of mass (3,) and central inertia (3, 3) of a closed mesh (F, 3, 3).
-
-    The tetrahedron from the origin to a triangle a, b, c has, with six times its signed volume
-    d = a . (b x c) and s = a + b + c,
-
-        V = d / 6,    int x dV = d s / 24,
-        int x x^T dV = d (s s^T + a a^T + b b^T + c c^T) / 120.
-
-    The sum over all triangles is the integral over the body, negative if they face inwards.
-    """
-    centroid = triangles.reshape(-1, 3).mean(axis=0)  # as origin it reduces rounding errors
-    corners = triangles - centroid
-    volumes = np.linalg.det(corners)
-    sums = corners.sum(axis=1)
-    volume = volumes.sum() / 6
-    first = volumes @ sums / 24
-    second = np.einsum("f,fi,fj->ij", volumes, sums, sums)
-    second = (second + np.einsum("f,fki,fkj->ij", volumes, corners, corners)) / 120
-    if volume == 0:
-        return 0.0, centroid, np.zeros((3, 3))
-    com = first / volume
-    second = math.copysign(density, volume) * (second - volume * np.outer(com, com))
-    return density * abs(float(volume)), centroid + com, np.trace(second) * np.eye(3) - second
+    return pin.Inertia(mesh.mass, centroid + mesh.center_mass, mesh.moment_inertia)
 
 
 _SIZE_ATTRIBUTES = {
@@ -212,7 +176,6 @@ def add_shapes(
     note: NoteFunction,
 ) -> None:
     """Add visuals and collisions of a link; `note` receives shapes that URDF does not have."""
-    link_pose = frames.element_pose(scope, link, link.base_frame)
     for child in link.element:
         if child.tag not in ("visual", "collision"):
             continue
@@ -220,8 +183,7 @@ def add_shapes(
         if (geometry := _shape_element(shape, note)) is None:
             continue
         added = etree.SubElement(element, child.tag)
-        shape_pose = frames.element_pose(scope, shape, link.name)
-        add_origin(added, *xyz_rpy_from_se3(link_pose.actInv(shape_pose)))
+        add_origin(added, *xyz_rpy_from_se3(frames.pose_on_link(scope, link, shape)))
         etree.SubElement(added, "geometry").append(geometry)
         material = shape.single_child("material") if child.tag == "visual" else None
         if material is not None and (text := material.text("diffuse") or material.text("ambient")):
@@ -232,7 +194,7 @@ def add_shapes(
 
 def _geometry_shape(item: SdfElement) -> SdfElement | None:
     geometry = item.single_child("geometry")
-    tags = [] if geometry is None else [x.tag for x in geometry.element if isinstance(x.tag, str)]
+    tags = [] if geometry is None else [x.tag for x in geometry.element]
     return geometry.single_child(tags[0]) if geometry is not None and tags else None
 
 

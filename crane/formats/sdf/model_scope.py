@@ -319,14 +319,12 @@ class ModelReader:
         scope.frames[name] = SdfElement(
             placed.xml, placed.element, placed.label, include.base_frame, inner
         )
-        merged_parts = [
-            *((scope.links, x) for x in inner.links.items()),
-            *((scope.joints, x) for x in inner.joints.items()),
-            *((scope.frames, x) for x in inner.frames.items()),
-        ]
-        for own_parts, (key, part) in merged_parts:
-            if own_parts.setdefault(key, part) is not part:
-                raise include.error(f"merging brings a second '{key}', rename one")
+        for own_parts, parts in (
+            (scope.links, inner.links), (scope.joints, inner.joints), (scope.frames, inner.frames),
+        ):  # fmt: skip
+            for key, part in parts.items():
+                if own_parts.setdefault(key, part) is not part:
+                    raise include.error(f"merging brings a second '{key}', rename one")
         scope.models |= inner.models
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
+from lxml import etree
 
 from crane.common.errors import suggest_names
 from crane.description.kinematic_tree import Limits, parse_limit
@@ -17,12 +18,14 @@ from crane.formats.sdf.frame_poses import SdfFramePoses, find_link
 from crane.formats.sdf.model_scope import ModelScope, SdfElement, sdf_version
 
 WORLD_NODE = "::world"  # not a possible name of a link
-_SINGLE_FREEDOM_TYPES = {
-    "revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic",
+_EDGE_KINDS = {  # of joints that are one edge
+    "revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": "fixed",
+    "ball": "spherical",
 }  # fmt: skip
 _TWO_FREEDOM_TYPES = ("universal", "revolute2")
 _AXISLESS_TYPES = ("fixed", "ball")
-JOINT_TYPES = (*_SINGLE_FREEDOM_TYPES, *_TWO_FREEDOM_TYPES, *_AXISLESS_TYPES, "screw", "gearbox")
+JOINT_TYPES = (*_EDGE_KINDS, *_TWO_FREEDOM_TYPES, "screw", "gearbox")
+_PARALLEL_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ class SdfJointEdge:
 
     Attributes:
         name: Name in the whole machine.
-        kind: "revolute", "prismatic", "fixed" or "ball".
+        kind: "revolute", "prismatic", "fixed" or "spherical".
         parent: Parent node: the name of a link, or `WORLD_NODE`.
         child: Child node.
         placement: The joint's frame at coordinate zero, in the frame of the top model.
@@ -78,29 +81,32 @@ class SdfJointEdge:
     composite_joint: str = ""
 
 
-@dataclass(frozen=True)
-class CoupledCoordinate:
-    """A coordinate that depends on another: q = multiplier q_leader + offset."""
+class DisjointSets:
+    """Disjoint sets of names (union-find)."""
 
-    name: str
-    leader: str
-    multiplier: float
-    offset: float
-    item: SdfElement
+    def __init__(self) -> None:
+        self._parents: dict[str, str] = {}
+
+    def representative(self, name: str) -> str:
+        """Return the representative of the set that a name belongs to."""
+        while (parent := self._parents.get(name, name)) != name:
+            self._parents[name] = name = self._parents.get(parent, parent)
+        return name
+
+    def join(self, first: str, second: str) -> bool:
+        """Join the sets of two names, and return whether they were different."""
+        root, other_root = self.representative(first), self.representative(second)
+        self._parents[other_root] = root
+        return root != other_root
 
 
-@dataclass(frozen=True)
-class Gearbox:
-    """A coupling q_2 = -ratio q_1 of the angles from a reference link to two links.
-
-    The directions (3,) of both angles are in the frame of the top model.
-    """
-
-    reference: str
-    links: tuple[str, str]
-    directions: tuple[np.ndarray, np.ndarray]
-    ratio: float
-    item: SdfElement
+def rigid_bodies(edges: list[SdfJointEdge]) -> DisjointSets:
+    """Return the sets of links that fixed joints join to one body."""
+    bodies = DisjointSets()
+    for edge in edges:
+        if edge.kind == "fixed":
+            bodies.join(edge.parent, edge.child)
+    return bodies
 
 
 class SdfJoints:
@@ -112,26 +118,25 @@ class SdfJoints:
 
     Attributes:
         edges: Joints in the order of the file.
-        coupled_coordinates: Coordinates that depend on others.
-        gearboxes: Gearboxes.
+        mimics: Coordinates that depend on others: name, `<mimic>` of URDF, and where it is from.
     """
 
     def __init__(self, top: ModelScope, frames: SdfFramePoses):
         self._top, self._frames = top, frames
         self.edges: list[SdfJointEdge] = []
-        self.coupled_coordinates: list[CoupledCoordinate] = []
-        self.gearboxes: list[Gearbox] = []
+        self.mimics: list[tuple[str, etree._Element, SdfElement]] = []
+        self._gearboxes: list[tuple[SdfElement, tuple[str, str], list[np.ndarray], str]] = []
         self._freedom_names: dict[str, list[str]] = {}  # joint -> its coordinates
         scopes = [scope for scope in top.nested_scopes() if not scope.is_static]
-        for scope in scopes:
-            for joint in scope.joints.values():
-                self._read_joint(scope, joint)
-        for scope in scopes:
-            for joint in scope.joints.values():
-                self._read_mimic(scope, joint)
-        leaders = {x for f in self.coupled_coordinates for x in (f.name, f.leader)}
+        joints = [(scope, joint) for scope in scopes for joint in scope.joints.values()]
+        for scope, joint in joints:
+            self._read_joint(scope, joint)
+        for scope, joint in joints:
+            self._read_mimic(scope, joint)
+        self._add_gear_couplings()
+        coupled = {x for name, mimic, _ in self.mimics for x in (name, mimic.get("joint"))}
         self.edges = [
-            dataclasses.replace(edge, is_coupled=True) if edge.name in leaders else edge
+            dataclasses.replace(edge, is_coupled=True) if edge.name in coupled else edge
             for edge in self.edges
         ]
 
@@ -159,12 +164,8 @@ class SdfJoints:
         self._freedom_names[name] = [name]
         if kind == "gearbox":
             reference = self._end_node(scope, joint, "gearbox_reference_body")
-            first, second = (np.asarray(placement.rotation @ axis.direction) for axis in axes)
-            self.gearboxes.append(
-                Gearbox(
-                    reference, ends, (first, second), joint.number("gearbox_ratio", 1.0), joint
-                )
-            )
+            directions = [np.asarray(placement.rotation @ axis.direction) for axis in axes]
+            self._gearboxes.append((joint, ends, directions, reference))
         if kind in _TWO_FREEDOM_TYPES:
             parts = [f"{name}_1", f"{name}_2"]
             self._freedom_names[name] = parts
@@ -177,12 +178,10 @@ class SdfJoints:
             if joint.single_child("screw_thread_pitch") is None:
                 pitch = joint.number("thread_pitch", 1.0)  # [rad/m], positive if left-handed
                 travel_per_radian = -1.0 / pitch if pitch else 0.0
-            self.coupled_coordinates.append(
-                CoupledCoordinate(parts[1], name, travel_per_radian, 0.0, joint)
-            )
-        if kind in (*_SINGLE_FREEDOM_TYPES, *_AXISLESS_TYPES):
-            edge_kind, axis = _SINGLE_FREEDOM_TYPES.get(kind, kind), axes[0] if axes else None
-            self.edges.append(SdfJointEdge(name, edge_kind, *ends, placement, joint, axis))
+            self._add_mimic(joint, parts[1], name, travel_per_radian)
+        if kind in _EDGE_KINDS:
+            axis = axes[0] if axes else None
+            self.edges.append(SdfJointEdge(name, _EDGE_KINDS[kind], *ends, placement, joint, axis))
 
     def _end_node(self, scope: ModelScope, joint: SdfElement, tag: str) -> str:
         name = joint.text(tag)
@@ -260,6 +259,45 @@ class SdfJoints:
         )  # fmt: skip
         self.edges += [dataclasses.replace(first, composite_joint=joint.name), second]
 
+    def _add_gear_couplings(self) -> None:
+        """Add s_2 q_2 = -ratio s_1 q_1 with the signs s of the angles to both links of each gear.
+
+        Raises:
+            DescriptionError: No joint turns a link against the reference about the gear's axis.
+        """
+        bodies = rigid_bodies(self.edges)
+        for item, links, directions, reference in self._gearboxes:
+            (first, first_sign), (second, second_sign) = (
+                self._gear_angle(item, bodies, reference, link, direction)
+                for link, direction in zip(links, directions, strict=True)
+            )
+            factor = -item.number("gearbox_ratio", 1.0) * first_sign / second_sign
+            self._add_mimic(item, second, first, factor)
+
+    def _gear_angle(
+        self,
+        item: SdfElement,
+        bodies: DisjointSets,
+        reference: str,
+        link: str,
+        direction: np.ndarray,
+    ) -> tuple[str, float]:
+        """Return the joint between the reference and a link, and the sign of its coordinate."""
+        required_bodies = bodies.representative(reference), bodies.representative(link)
+        for edge in self.edges:
+            ends = bodies.representative(edge.parent), bodies.representative(edge.child)
+            if edge.kind != "revolute" or edge.axis is None or {*ends} != {*required_bodies}:
+                continue
+            cosine = float(direction @ edge.placement.rotation @ edge.axis.direction)
+            if abs(abs(cosine) - 1) <= _PARALLEL_TOLERANCE:
+                sign = 1.0 if ends == required_bodies else -1.0
+                return edge.name, float(np.sign(cosine)) * sign
+        raise item.error(
+            f"{item.label}: no joint turns '{link.removeprefix('::')}' against "
+            f"'{reference.removeprefix('::')}' "
+            "about the gear's axis, name another gearbox_reference_body",
+        )
+
     def _read_mimic(self, scope: ModelScope, joint: SdfElement) -> None:
         """Read axes that mimic an axis of another joint."""
         for name, tag in zip(
@@ -286,6 +324,11 @@ class SdfJoints:
             leader_part = parts[-1 if mimic.element.get("axis") == "axis2" else 0]
             multiplier = mimic.number("multiplier", 1.0)
             offset = mimic.number("offset", 0.0) - multiplier * mimic.number("reference", 0.0)
-            self.coupled_coordinates.append(
-                CoupledCoordinate(name, leader_part, multiplier, offset, mimic)
-            )
+            self._add_mimic(mimic, name, leader_part, multiplier, offset)
+
+    def _add_mimic(
+        self, item: SdfElement, name: str, leader: str, multiplier: float, offset: float = 0.0
+    ) -> None:
+        """Add a coordinate q = multiplier q_leader + offset."""
+        values = {"multiplier": repr(multiplier), "offset": repr(offset)}
+        self.mimics.append((name, etree.Element("mimic", {"joint": leader, **values}), item))

@@ -7,17 +7,21 @@ coordinate is that of SDF.
 """
 
 import dataclasses
-import warnings
-from collections.abc import Mapping
 from difflib import get_close_matches
 
 import pinocchio as pin
 from lxml import etree
 
-from crane.common.errors import CraneWarning, DescriptionError, suggest_names
+from crane.common.errors import DescriptionError, suggest_names, warn
 from crane.common.package_search import load_options
 from crane.description.force_elements import ForceElement
-from crane.description.kinematic_tree import Joint, Limits, to_vector
+from crane.description.kinematic_tree import (
+    TENSOR_ATTRIBUTES,
+    Joint,
+    Limits,
+    to_vector,
+    unique_name,
+)
 from crane.description.pinocchio_conversion import xyz_rpy_from_se3
 from crane.formats.conversion_notes import ConversionNotes
 from crane.formats.sdf.frame_poses import SdfFramePoses, canonical_link
@@ -25,15 +29,14 @@ from crane.formats.sdf.link_elements import add_link_inertial, add_shapes
 from crane.formats.sdf.model_scope import ModelReader, ModelScope, SdfElement
 from crane.formats.sdf.sdf_joints import (
     WORLD_NODE,
-    CoupledCoordinate,
+    DisjointSets,
     SdfAxis,
     SdfJointEdge,
     SdfJoints,
+    rigid_bodies,
 )
 from crane.formats.sdf.spanning_tree import (
-    DisjointSets,
     breadth_first,
-    gear_couplings,
     ground_edges,
     spanning_tree,
 )
@@ -50,7 +53,7 @@ from crane.formats.xml_file import (
 _IDENTITY_TOLERANCE = 1e-15
 _MAX_SHOWN_NAMES = 4  # of unsupported elements in a warning
 # Children that are read, and those that simulators and viewers read.
-_KNOWN_CHILDREN: Mapping[str, set[str]] = {
+_KNOWN_CHILDREN: dict[str, set[str]] = {
     "joint": {
         "parent", "child", "axis", "axis2", "pose", "gearbox_ratio", "gearbox_reference_body",
         "thread_pitch", "screw_thread_pitch", "physics", "sensor", "frame", "plugin",
@@ -63,7 +66,7 @@ _KNOWN_CHILDREN: Mapping[str, set[str]] = {
     "inertial": {
         "pose", "mass", "inertia", "density", "fluid_added_mass", "frame", "auto_inertia_params",
     },
-    "inertia": {"ixx", "ixy", "ixz", "iyy", "iyz", "izz"},
+    "inertia": {*TENSOR_ATTRIBUTES},
     "mimic": {"multiplier", "offset", "reference"},
     "link": {
         "pose", "inertial", "visual", "collision", "sensor", "plugin", "gravity", "self_collide",
@@ -152,23 +155,15 @@ class _SdfTranslation:
             canonical_link(self._top, self._top.item)  # raises
         joints = SdfJoints(self._top, self._frames)
         edges = [_fix_locked_joint(edge, self._notes) for edge in joints.edges]
-        gears = gear_couplings(edges, joints.gearboxes, _rigid_bodies(joints.edges))
-        geared_names = {name for gear in gears for name in (gear.name, gear.leader)}
-        edges = [
-            dataclasses.replace(x, is_coupled=True) if x.name in geared_names else x for x in edges
-        ]
         edges += ground_edges(edges, self._top, self._links, self._link_poses, self._notes)
-        for edge in edges:
-            if edge.composite_joint:
-                self._link_poses[edge.child] = edge.placement
         tree = spanning_tree(edges, WORLD_NODE)
         self._add_links(edges)
-        driven_joints = _driven_joints(edges, joints.coupled_coordinates)
+        driven_joints = _driven_joints(edges, {name for name, _, _ in joints.mimics})
         placed = {WORLD_NODE}
         for edge in breadth_first(tree, DisjointSets(), WORLD_NODE):
             self._add_joint(edge, edge.parent in placed, driven_joints)
             placed |= {edge.parent, edge.child}
-        self._add_mimics([*joints.coupled_coordinates, *gears], {edge.name for edge in tree})
+        self._add_mimics(joints, {edge.name for edge in tree})
         tree_edge_ids = {id(edge) for edge in tree}
         self._add_loops([edge for edge in edges if id(edge) not in tree_edge_ids], tree)
         if self._initial_positions:
@@ -190,7 +185,7 @@ class _SdfTranslation:
         self._set_source_location(
             etree.SubElement(self._robot, "link", name=self._ground_link), self._top.item
         )
-        bodies = _rigid_bodies(edges)
+        bodies = rigid_bodies(edges)
         for name, link in self._links.items():
             scope = self._scopes[name]
             is_moving = bodies.representative(name) != bodies.representative(WORLD_NODE)
@@ -200,6 +195,7 @@ class _SdfTranslation:
             self._set_source_location(element, link)
         for edge in edges:
             if edge.composite_joint:
+                self._link_poses[edge.child] = edge.placement
                 link = etree.SubElement(
                     self._robot, "link", name=edge.child, between=edge.composite_joint
                 )
@@ -216,9 +212,7 @@ class _SdfTranslation:
         axis = edge.axis
         placement = xyz_rpy_from_se3(self._link_poses[parent].actInv(edge.placement))
         ends = self._link_name(parent), self._joint_child_link(edge, child)
-        joint = Joint(
-            edge.name, {"ball": "spherical"}.get(edge.kind, edge.kind), *ends, "", *placement
-        )
+        joint = Joint(edge.name, edge.kind, *ends, "", *placement)
         if axis is not None:
             direction = to_vector(axis.direction if is_forward else -axis.direction)
             joint = dataclasses.replace(joint, axis=direction, limits=axis.limits)
@@ -249,30 +243,25 @@ class _SdfTranslation:
         return name
 
     def _unique_link_name(self, name: str) -> str:
-        while name in self._link_poses:
-            name += "_"
+        name = unique_name(name, self._link_poses)
         self._link_poses[name] = pin.SE3.Identity()
         return name
 
-    def _add_mimics(self, followers: list[CoupledCoordinate], joints: set[str]) -> None:
+    def _add_mimics(self, joints: SdfJoints, names: set[str]) -> None:
         elements = {joint.get("name"): joint for joint in self._robot.iterfind("joint")}
-        for follower in followers:
-            if missing := [x for x in (follower.name, follower.leader) if x not in joints]:
-                raise follower.item.error(
-                    f"{follower.item.label}: joint '{missing[0]}' is coupled and closes a loop of "
+        for name, mimic, item in joints.mimics:
+            if missing := [x for x in (name, mimic.get("joint")) if x not in names]:
+                raise item.error(
+                    f"{item.label}: joint '{missing[0]}' is coupled and closes a loop of "
                     "coupled joints, leave one of them out",
                 )
-            joint = elements[follower.name]
-            if joint.find("mimic") is not None:
-                raise follower.item.error(f"joint '{follower.name}' follows two others, keep one")
-            mimic = etree.SubElement(
-                joint, "mimic", joint=follower.leader,
-                multiplier=repr(follower.multiplier), offset=repr(follower.offset),
-            )  # fmt: skip
-            self._set_source_location(mimic, follower.item)
+            if elements[name].find("mimic") is not None:
+                raise item.error(f"joint '{name}' follows two others, keep one")
+            elements[name].append(mimic)
+            self._set_source_location(mimic, item)
 
     def _add_loops(self, loop_edges: list[SdfJointEdge], tree: list[SdfJointEdge]) -> None:
-        bodies = _rigid_bodies(tree)
+        bodies = rigid_bodies(tree)
         for edge in loop_edges:
             is_one_body = bodies.representative(edge.parent) == bodies.representative(edge.child)
             if is_one_body and edge.kind == "fixed":
@@ -282,11 +271,13 @@ class _SdfTranslation:
                     f"{edge.item.label} joins '{edge.parent}' and '{edge.child}', which are one "
                     "body: leave it out",
                 )
-            kind, axis = {"ball": "spherical"}.get(edge.kind, edge.kind), edge.axis
-            loop = etree.SubElement(self._robot, "loop", name=edge.name, type=kind)
+            axis = edge.axis
+            loop = etree.SubElement(self._robot, "loop", name=edge.name, type=edge.kind)
             for tag, link in (("predecessor", edge.parent), ("successor", edge.child)):
-                end = etree.SubElement(loop, tag, link=self._link_name(link))
-                add_origin(end, *xyz_rpy_from_se3(self._link_poses[link].actInv(edge.placement)))
+                add_origin(
+                    etree.SubElement(loop, tag, link=self._link_name(link)),
+                    *xyz_rpy_from_se3(self._link_poses[link].actInv(edge.placement)),
+                )
             if axis is not None:
                 etree.SubElement(loop, "axis", xyz=format_numbers(axis.direction))
             if axis is not None and finite_limits(axis.limits) is not None:
@@ -298,15 +289,6 @@ class _SdfTranslation:
             self._set_source_location(loop, edge.item)
 
 
-def _rigid_bodies(edges: list[SdfJointEdge]) -> DisjointSets:
-    """Return the sets of links that fixed joints join to one body."""
-    bodies = DisjointSets()
-    for edge in edges:
-        if edge.kind == "fixed":
-            bodies.join(edge.parent, edge.child)
-    return bodies
-
-
 def _fix_locked_joint(edge: SdfJointEdge, notes: ConversionNotes) -> SdfJointEdge:
     """Return a joint limited to zero as a fixed joint, which SDF before 1.5 does not have."""
     limits = Limits() if edge.axis is None else edge.axis.limits
@@ -316,15 +298,12 @@ def _fix_locked_joint(edge: SdfJointEdge, notes: ConversionNotes) -> SdfJointEdg
     return dataclasses.replace(edge, kind="fixed", axis=None)
 
 
-def _driven_joints(
-    edges: list[SdfJointEdge], followers: list[CoupledCoordinate]
-) -> set[str] | None:
+def _driven_joints(edges: list[SdfJointEdge], coupled_names: set[str]) -> set[str] | None:
     """Return the joints with an effort, None if all or no joints have one.
 
     An effort of 0 means that no actuator drives the joint, unless all joints have it.
     """
     axis_of_joint = {edge.name: edge.axis for edge in edges if edge.axis is not None}
-    coupled_names = {follower.name for follower in followers}
     without_effort = {name for name, axis in axis_of_joint.items() if not axis.limits.effort}
     with_effort = axis_of_joint.keys() - without_effort - coupled_names
     return with_effort if with_effort and without_effort else None
@@ -353,7 +332,7 @@ def _warn_about_unknown_children(part: SdfElement, element: etree._Element) -> N
         return
     for child in element:
         name = child.tag
-        if not isinstance(name, str) or name in tags or name.startswith("{"):
+        if name in tags or name.startswith("{"):
             continue
         similar = get_close_matches(name.lower(), sorted(tags), 1, 0.75)
         other_parents = [x for x, inside in _KNOWN_CHILDREN.items() if name in inside]
@@ -363,9 +342,7 @@ def _warn_about_unknown_children(part: SdfElement, element: etree._Element) -> N
                 if similar
                 else (f"it belongs into <{other_parents[0]}>")
             )
-            warnings.warn(
+            warn(
                 f"{part.xml.source_location(child)}: unknown <{name}> in <{element.tag}> of "
-                f"{part.label}, it is left out, {hint}",
-                CraneWarning,
-                stacklevel=2,
+                f"{part.label}, it is left out, {hint}"
             )

@@ -1,43 +1,19 @@
-"""The graph of links and joints of an SDF model: spanning tree, gears, joints to the ground."""
+"""The graph of links and joints of an SDF model: spanning tree, joints to the ground."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pinocchio as pin
 
-from crane.common.errors import CraneWarning
+from crane.common.errors import warn
 from crane.common.package_search import load_options
+from crane.description.kinematic_tree import unique_name
 from crane.formats.conversion_notes import ConversionNotes
 from crane.formats.sdf.frame_poses import canonical_link
 from crane.formats.sdf.model_scope import ModelScope, SdfElement
-from crane.formats.sdf.sdf_joints import (
-    WORLD_NODE,
-    CoupledCoordinate,
-    Gearbox,
-    SdfJointEdge,
-)
+from crane.formats.sdf.sdf_joints import WORLD_NODE, DisjointSets, SdfJointEdge
 
 _PRIORITY_CLASSES = 5
-
-
-class DisjointSets:
-    """Disjoint sets of names (union-find)."""
-
-    def __init__(self) -> None:
-        self._parents: dict[str, str] = {}
-
-    def representative(self, name: str) -> str:
-        """Return the representative of the set that a name belongs to."""
-        while (parent := self._parents.get(name, name)) != name:
-            self._parents[name] = name = self._parents.get(parent, parent)
-        return name
-
-    def join(self, first: str, second: str) -> bool:
-        """Join the sets of two names, and return whether they were different."""
-        root, other_root = self.representative(first), self.representative(second)
-        self._parents[other_root] = root
-        return root != other_root
 
 
 def _priority_class(edge: SdfJointEdge) -> int:
@@ -62,8 +38,9 @@ def spanning_tree(edges: Sequence[SdfJointEdge], root: str) -> list[SdfJointEdge
     """
     bodies, found = DisjointSets(), []
     for rank in range(_PRIORITY_CLASSES):
-        some = [edge for edge in edges if _priority_class(edge) == rank]
-        found += breadth_first(some, bodies, root)
+        found += breadth_first(
+            [edge for edge in edges if _priority_class(edge) == rank], bodies, root
+        )
     return found
 
 
@@ -85,60 +62,6 @@ def breadth_first(
                     pending.append(other_end)
                     found.append(edge)
     return found
-
-
-_PARALLEL_TOLERANCE = 1e-6
-
-
-def gear_couplings(
-    edges: list[SdfJointEdge], gears: Sequence[Gearbox], bodies: DisjointSets
-) -> list[CoupledCoordinate]:
-    """Return the couplings of gears: s_2 q_2 = -ratio s_1 q_1 with the signs s of both angles.
-
-    Args:
-        edges: All joints.
-        gears: All gearboxes.
-        bodies: Sets of links that are one body.
-
-    Raises:
-        DescriptionError: No joint turns a link against the reference about the gear's axis.
-    """
-    found = []
-    for gear in gears:
-        (first, first_sign), (second, second_sign) = (
-            _gear_angle(edges, gear, bodies, link, direction)
-            for link, direction in zip(gear.links, gear.directions, strict=True)
-        )
-        found.append(
-            CoupledCoordinate(
-                second, first, -gear.ratio * first_sign / second_sign, 0.0, gear.item
-            )
-        )
-    return found
-
-
-def _gear_angle(
-    edges: Sequence[SdfJointEdge],
-    gear: Gearbox,
-    bodies: DisjointSets,
-    link: str,
-    direction: np.ndarray,
-) -> tuple[str, float]:
-    """Return the joint between the reference and a link, and the sign of its coordinate."""
-    required_bodies = bodies.representative(gear.reference), bodies.representative(link)
-    for edge in edges:
-        ends = bodies.representative(edge.parent), bodies.representative(edge.child)
-        if edge.kind != "revolute" or edge.axis is None or {*ends} != {*required_bodies}:
-            continue
-        cosine = float(direction @ edge.placement.rotation @ edge.axis.direction)
-        if abs(abs(cosine) - 1) > _PARALLEL_TOLERANCE:
-            continue
-        return edge.name, float(np.sign(cosine)) * (1.0 if ends == required_bodies else -1.0)
-    raise gear.item.error(
-        f"{gear.item.label}: no joint turns '{link.removeprefix('::')}' against "
-        f"'{gear.reference.removeprefix('::')}' "
-        "about the gear's axis, name another gearbox_reference_body",
-    )
 
 
 _MAX_LISTED = 4
@@ -179,11 +102,10 @@ def ground_edges(
     if unattached and not is_floating:
         if is_fixed:
             listed = ", ".join(f"'{link}'" for link in unattached[:_MAX_LISTED])
-            warnings.warn(
+            warn(
                 f"{links[unattached[0]].source_location}: nothing joins '{top.name}' to the "
                 f"world, it is taken as standing on the ground by link {listed}: --floating "
                 "(floating=True) lets it float",
-                CraneWarning,
                 stacklevel=3,
             )
         else:
@@ -192,8 +114,6 @@ def ground_edges(
     used_names = {edge.name for edge in edges}
     added = []
     for link in unattached:
-        name = f"{link}_{suffix}"
-        while name in used_names:
-            name += "_"
+        name = unique_name(f"{link}_{suffix}", used_names)
         added.append(SdfJointEdge(name, kind, WORLD_NODE, link, link_poses[link], links[link]))
     return added

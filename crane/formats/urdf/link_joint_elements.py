@@ -2,17 +2,17 @@
 
 import dataclasses
 import math
-import warnings
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 
 from lxml import etree
 
-from crane.common.errors import CraneWarning, suggest_names
+from crane.common.errors import suggest_names, warn
 from crane.description.findings import FollowUpError, error_recovery, is_strict, report_error
 from crane.description.force_elements import Friction
 from crane.description.kinematic_tree import (
     MULTI_FREEDOM_TYPES,
+    TENSOR_ATTRIBUTES,
     Inertial,
     Joint,
     Limits,
@@ -24,6 +24,8 @@ from crane.description.kinematic_tree import (
 )
 from crane.formats.urdf.loop_elements import read_end_link
 from crane.formats.xml_file import XmlFile
+
+_UNLIMITED_HINT = "taken as unlimited: give it lower and upper"
 
 
 def read_link(xml: XmlFile, name: str, element: etree._Element, is_moved: bool) -> Link:
@@ -61,8 +63,7 @@ def _read_inertial(xml: XmlFile, label: str, inertial: etree._Element, is_moved:
         raise FollowUpError(f"{label} has no inertia")
     mass = xml.number(mass_tag, "value", f"the mass of {label}")
     tensor = tuple(
-        xml.number(tensor_tag, key, f"the inertia of {label}")
-        for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        xml.number(tensor_tag, key, f"the inertia of {label}") for key in TENSOR_ATTRIBUTES
     )
     if mass < 0:
         raise xml.error_at(mass_tag, f"{label} has the mass {mass:g} kg, give a positive one")
@@ -79,7 +80,7 @@ def _read_inertial(xml: XmlFile, label: str, inertial: etree._Element, is_moved:
         report_error(error, harmless=True)
     elif is_strict() or not problem.is_formal:
         # a fixed link only adds to another body, whose total inertia is checked later
-        warnings.warn(str(error), CraneWarning, stacklevel=2)
+        warn(str(error))
     finding_location = xml.source_location(tensor_tag) if problem.is_formal else ""
     return dataclasses.replace(link_inertial, finding_location=finding_location)
 
@@ -118,9 +119,12 @@ def read_multi_freedom_joint(
         if (found := xml.single_child(element, tag, label)) is not None:
             xml.report(found, f"{label} is {kind}, for which <{tag}> has no meaning, remove it")
     axis = xml.direction(element, label, (1.0, 0.0, 0.0))
-    placement = xml.placement(element, label)
     return joint_series(
-        name, joint_freedoms(kind, axis), placement, end_links, xml.source_location(element)
+        name,
+        joint_freedoms(kind, axis),
+        xml.placement(element, label),
+        end_links,
+        xml.source_location(element),
     )
 
 
@@ -147,7 +151,7 @@ def read_limits(xml: XmlFile, name: str, joint: etree._Element) -> Limits:
     element = xml.single_child(joint, "limit", label)
     if element is None:
         if kind != "continuous":
-            _warn_about_missing_limits(xml, joint, f"{label} is {kind} and has no <limit>")
+            xml.warn(joint, f"{label} is {kind} and has no <limit>, {_UNLIMITED_HINT}")
         return Limits(source_location=xml.source_location(joint))
     found: dict[str, float] = {}
     for key in ("effort", "velocity"):
@@ -157,13 +161,13 @@ def read_limits(xml: XmlFile, name: str, joint: etree._Element) -> Limits:
     if kind == "continuous":
         return limits
     if element.get("lower") is None and element.get("upper") is None:
-        _warn_about_missing_limits(xml, element, f"the limit of {label} has no lower and no upper")
+        xml.warn(element, f"the limit of {label} has no lower and no upper, {_UNLIMITED_HINT}")
         return limits
     lower, upper = (
         xml.number(element, key, f"the limit of {label}", 0.0) for key in ("lower", "upper")
     )
     if lower == upper == 0 and not any(found.values()):
-        _warn_about_missing_limits(xml, element, f"all limits of {label} are 0")
+        xml.warn(element, f"all limits of {label} are 0, {_UNLIMITED_HINT}")
         return Limits(source_location=limits.source_location)
     if lower > upper:
         xml.report(
@@ -175,13 +179,6 @@ def read_limits(xml: XmlFile, name: str, joint: etree._Element) -> Limits:
             f"lower and upper limit of {label} are both {lower:g}, widen them or make it fixed",
         )
     return dataclasses.replace(limits, lower=parse_limit(lower), upper=parse_limit(upper))
-
-
-def _warn_about_missing_limits(xml: XmlFile, element: etree._Element, problem: str) -> None:
-    message = (
-        f"{xml.source_location(element)}: {problem}, taken as unlimited: give it lower and upper"
-    )
-    warnings.warn(message, CraneWarning, stacklevel=4)
 
 
 def read_friction(xml: XmlFile, name: str, joint: etree._Element) -> Friction | None:
@@ -207,7 +204,7 @@ _MAX_LISTED = 8  # joints of a cycle in an error
 
 def read_graph(
     xml: XmlFile, links: Mapping[str, etree._Element], joints: Mapping[str, etree._Element]
-) -> tuple[EndLinks, str, set[str]]:
+) -> tuple[EndLinks, set[str]]:
     """Read the graph of links and joints.
 
     Joints with both ends form a forest, whatever the file contains. A joint that joins a link to
@@ -220,7 +217,7 @@ def read_graph(
         joints: The `<joint>` elements by name.
 
     Returns:
-        Parent and child link by joint, the root link, and the joints that are cut.
+        Parent and child link by joint, and the joints that are cut.
 
     Raises:
         DescriptionError: An end is missing or unknown, or the joints do not form one tree.
@@ -238,12 +235,14 @@ def read_graph(
             cut_joints.add(name)
     roots = [name for name in links if name not in parents]
     joined_count = len(parents)
-    while (repeated_link := _link_in_cycle(parents, links)) is not None:
-        closing_joint = parents[repeated_link][1]
+    while ring := _find_ring(parents, links):
+        closing_joint = ring[-1]
+        repeated_link = end_links[closing_joint][1]
+        listed = ", ".join(ring[:_MAX_LISTED]) + (", ..." if len(ring) > _MAX_LISTED else "")
         xml.report(
             joints[closing_joint],
-            f"link '{repeated_link}' is its own ancestor: cut the ring of joints "
-            f"{_loop_text(parents, repeated_link)} at '{closing_joint}' and close it as a loop",
+            f"link '{repeated_link}' is its own ancestor: cut the ring of joints {listed} at "
+            f"'{closing_joint}' and close it as a loop",
         )
         cut_joints.add(closing_joint)
         del parents[repeated_link]
@@ -256,7 +255,7 @@ def read_graph(
         )
     for name in cut_joints:
         end_links[name] = _NO_ENDS
-    return end_links, roots[0] if roots else next(iter(links)), cut_joints
+    return end_links, cut_joints
 
 
 def _read_end_links(
@@ -283,26 +282,16 @@ def _read_end_links(
     return parent, child
 
 
-def _link_in_cycle(parents: Mapping[str, tuple[str, str]], links: Iterable[str]) -> str | None:
-    """Return the first link that occurs twice among the ancestors of a link, None without one."""
+def _find_ring(parents: Mapping[str, tuple[str, str]], links: Iterable[str]) -> list[str]:
+    """Return the joints of the first cycle of links, from parents to children; [] without one."""
     visited = {""}  # links whose ancestors have been followed
     for link in links:
-        seen: set[str] = set()
-        while link in parents and link not in visited and link not in seen:
-            seen.add(link)
+        joints: dict[str, str] = {}  # by link the joint above it, upwards
+        while link in parents and link not in visited and link not in joints:
+            joints[link] = parents[link][1]
             link = parents[link][0]
-        if link in seen:
-            return link
-        visited |= seen
-    return None
-
-
-def _loop_text(parents: Mapping[str, tuple[str, str]], link: str) -> str:
-    """List the joints of the cycle that a link is in, from the link on."""
-    found: list[str] = []
-    current = link
-    while current != link or not found:
-        current, joint = parents[current]
-        found.append(joint)
-    found.reverse()
-    return ", ".join(found[:_MAX_LISTED]) + (", ..." if len(found) > _MAX_LISTED else "")
+        if link in joints:
+            ring = [*joints.values()][[*joints].index(link) :]
+            return ring[::-1]
+        visited |= joints.keys()
+    return []

@@ -1,23 +1,34 @@
 """Strict reading of URDF files, with errors where other readers ignore mistakes."""
 
 import dataclasses
-import warnings
-from collections.abc import Callable, Collection, Container, Mapping, Sequence, Set
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Container, Mapping, Sequence
 from difflib import get_close_matches
+from functools import cache
 from pathlib import Path
 
 from lxml import etree
 
-from crane.common.errors import CraneWarning, suggest_names
+from crane.common.errors import suggest_names
 from crane.description.findings import (
     FollowUpError,
     error_recovery,
     record_parsed_file,
 )
-from crane.description.force_elements import ForceElement, Friction
-from crane.description.kinematic_tree import MULTI_FREEDOM_TYPES, Joint, Link, Tree
-from crane.description.specification import Coupling, LoopSpec
+from crane.description.force_elements import Friction
+from crane.description.kinematic_tree import (
+    MULTI_FREEDOM_TYPES,
+    TENSOR_ATTRIBUTES,
+    Joint,
+    Link,
+    Tree,
+)
+from crane.description.specification import (
+    STANDARD_GRAVITY,
+    Chain,
+    Coupling,
+    MachineSpec,
+    source_locations,
+)
 from crane.formats.robot_files import open_robot
 from crane.formats.urdf.link_joint_elements import (
     MOVABLE_TYPES,
@@ -69,7 +80,7 @@ _ATTRIBUTES = {
     "origin": {"xyz", "rpy"},
     "axis": {"xyz"},
     "mass": {"value"},
-    "inertia": {"ixx", "ixy", "ixz", "iyy", "iyz", "izz"},
+    "inertia": {*TENSOR_ATTRIBUTES},
     "limit": {"lower", "upper", "effort", "velocity"},
     "dynamics": {"damping", "friction"},
 }
@@ -94,61 +105,20 @@ _FOREIGN_ELEMENTS = {
     "collision": {"verbose", "contact_coefficients", "surface", "contact", "map"},
     "visual": {"map"},
 }  # fmt: skip
-_MAX_WARNINGS = 3  # for one file
 _MIN_SIMILARITY = 0.6  # of a suggested name
 # elements of drafts of URDF+
 _OBSOLETE_ELEMENTS = {"loop_constraint": "loop", "joint_constraint": "coupling"}
 
 
-@dataclass(frozen=True)
-class UrdfModel:
-    """A checked URDF.
-
-    Attributes:
-        file: The file.
-        name: Name of the robot.
-        tree: Links and joints.
-        root_link: Name of the root link.
-        loops: Loops of `<loop>` elements.
-        independent_joints: Joints marked `independent="true"`; None where no joint has the
-            attribute.
-        friction: Friction of `<dynamics>` elements by joint.
-        couplings: Couplings of `<mimic>` and `<coupling>` elements.
-        home: Coordinates of the group state "home" by joint.
-        home_locations: File and line of each coordinate of home.
-        tip: Link of the end effector "tip".
-        is_complete: Whether all elements have unique names, so that none is missing here.
-        springs: Springs, if the file is in a format that has some.
-        gravity: (3,) acceleration of gravity [m/s2], `<robot gravity="...">`; None without it.
-    """
-
-    file: Path
-    name: str
-    tree: Tree
-    root_link: str
-    loops: tuple[LoopSpec, ...]
-    independent_joints: tuple[str, ...] | None
-    friction: Mapping[str, Friction]
-    couplings: tuple[Coupling, ...]
-    home: Mapping[str, float] = field(default_factory=dict)
-    home_locations: Mapping[str, str] = field(default_factory=dict)
-    tip: str | None = None
-    is_complete: bool = True
-    springs: tuple[ForceElement, ...] = ()
-    gravity: tuple[float, ...] | None = None
-
-    @property
-    def moving_joints(self) -> tuple[str, ...]:
-        """Names of the moving joints."""
-        return tuple(joint.name for joint in self.tree.moving_joints)
-
-
-def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> UrdfModel:
+def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> MachineSpec:
     """Read and check a URDF, or a file that is converted to one by `crane.formats.robot_files`.
 
     Args:
         file: The file.
         edit: Function that changes the elements before they are read.
+
+    Returns:
+        The machine of one chain; `source_locations` has "gravity" if the file states it.
 
     Raises:
         DescriptionError: The file is wrong; the message has file and line.
@@ -160,7 +130,7 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
     _warn_about_unknown_elements(xml, joints)
     if not links:
         raise xml.error_at(xml.root, "no <link> in this file, add one")
-    end_links, root, cut = read_graph(xml, links, joints)
+    end_links, cut = read_graph(xml, links, joints)
     moved_links = {
         end_links[name][1] for name, joint in joints.items() if joint.get("type") != "fixed"
     }
@@ -193,24 +163,26 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
         with error_recovery():
             couplings += (read_coupling(xml, name, element, joints, end_links, links),)
     tree = Tree({}, {}).with_parts(*parts)
-    home, home_lines = _read_home(xml, {joint.name for joint in tree.moving_joints})
-    return UrdfModel(
-        file,
-        xml.root.get("name") or file.stem,
-        tree,
-        root,
-        loops,
-        independent_names,
-        {name: found for name, found in friction.items() if found is not None},
-        couplings,
-        home,
-        home_lines,
-        _read_tip(xml, links),
+    moving_joints = tuple(joint.name for joint in tree.moving_joints)
+    home, locations = _read_home(xml, moving_joints)
+    if "gravity" in xml.root.attrib:
+        locations["gravity"] = xml.source_location(xml.root)
+    return MachineSpec(
+        name=xml.root.get("name") or file.stem,
+        source=file.name,
+        path=file,
+        chains=(Chain(file.stem, file, None, file.name, moving_joints),),
+        tree=tree,
+        loops=loops,
+        active=independent_names,
+        home=home,
+        friction={name: found for name, found in friction.items() if found is not None},
+        forces=springs,
+        tip=_read_tip(xml, links),
+        couplings=couplings,
+        source_locations=source_locations(loops, couplings) | locations,
+        gravity=xml.vector(xml.root, "gravity", "the robot", 3, STANDARD_GRAVITY),
         is_complete=not xml.unnamed_kinds,
-        springs=springs,
-        gravity=xml.vector(xml.root, "gravity", "the robot", 3)
-        if "gravity" in xml.root.attrib
-        else None,
     )
 
 
@@ -277,13 +249,9 @@ def _read_mimic(
     other = mimic.get("joint", "")
     if other not in joints and "joint" in xml.unnamed_kinds:
         raise FollowUpError(f"joint '{other}' may be one without a name")
-    if other not in movable_joints:
-        problem = f"mimics the unknown joint '{other}'"
-        if other in joints:
-            problem = f"mimics '{other}', which does not move"
-        raise xml.error_at(
-            mimic, f"joint '{name}' {problem}, {suggest_names(movable_joints, other)}"
-        )
+    known = f"'{other}', which does not move"
+    mimicked = known if other in joints else f"the unknown joint '{other}'"
+    xml.check_name(mimic, other, movable_joints, f"joint '{name}' mimics {mimicked}")
     if other == name:
         raise xml.error_at(mimic, f"joint '{name}' mimics itself, name another")
     if name in independent_names:
@@ -319,10 +287,10 @@ def _read_home(xml: XmlFile, joints: Collection[str]) -> tuple[dict[str, float],
     """Read `<group_state name="home">`, an element of SRDF.
 
     Returns:
-        Coordinates, and their files and lines, by joint.
+        Coordinates by joint, and the file and line of each as "home JOINT".
     """
     home: dict[str, float] = {}
-    source_locations: dict[str, str] = {}
+    locations: dict[str, str] = {}
     joint_elements = [
         joint
         for state in xml.root.iterfind("group_state")
@@ -332,8 +300,8 @@ def _read_home(xml: XmlFile, joints: Collection[str]) -> tuple[dict[str, float],
     for joint in joint_elements:
         with error_recovery():
             name, value = _read_coordinate(xml, joint, joints, home)
-            home[name], source_locations[name] = value, xml.source_location(joint)
-    return home, source_locations
+            home[name], locations[f"home {name}"] = value, xml.source_location(joint)
+    return home, locations
 
 
 def _read_tip(xml: XmlFile, links: Mapping[str, etree._Element]) -> str | None:
@@ -342,11 +310,8 @@ def _read_tip(xml: XmlFile, links: Mapping[str, etree._Element]) -> str | None:
     if not tips:
         return None
     link = str(tips[0].get("parent_link", "")).strip()
-    if link not in links:
-        problem = (
-            f"is the unknown link '{link}'" if link else 'has no link, write parent_link="LINK"'
-        )
-        raise xml.error_at(tips[0], f"the tip {problem}, {suggest_names(links, link or None)}")
+    problem = f"is the unknown link '{link}'" if link else 'has no link, write parent_link="LINK"'
+    xml.check_name(tips[0], link, links, f"the tip {problem}")
     return link
 
 
@@ -354,12 +319,8 @@ def _read_coordinate(
     xml: XmlFile, joint: etree._Element, joints: Collection[str], earlier_names: Container[str]
 ) -> tuple[str, float]:
     name = joint.get("name", "").strip()
-    if name not in joints:
-        raise xml.error_at(
-            joint,
-            f"home names the joint '{name}', which is unknown or does not move, "
-            f"{suggest_names(joints, name)}",
-        )
+    problem = f"home names the joint '{name}', which is unknown or does not move"
+    xml.check_name(joint, name, joints, problem)
     value = xml.number(joint, "value", f"home of '{name}'")
     if name in earlier_names:
         raise xml.error_at(joint, f"home of '{name}' is there twice, keep one")
@@ -367,72 +328,37 @@ def _read_coordinate(
 
 
 def _warn_about_unknown_elements(xml: XmlFile, joints: Mapping[str, etree._Element]) -> None:
-    """Warn of unknown elements, which are left out, and of incomplete limits.
-
-    Equal elements have one warning, at the first of them, with their number.
-    """
-    found: dict[tuple[str, str], list[etree._Element]] = {}
+    """Warn of unknown elements, which are left out, and of incomplete limits."""
     known_tags = set().union(*_CHILDREN.values())  # a misplaced known element is an error
     read_elements = [xml.root]
     for element in read_elements:
-        tags = _CHILDREN[element.tag]
-        read_elements += [x for x in element if x.tag in tags and x.tag in _CHILDREN]
+        read_elements += [
+            x for x in element if x.tag in _CHILDREN[element.tag] and x.tag in _CHILDREN
+        ]
         known = known_tags | _FOREIGN_ELEMENTS.get(element.tag, set())
-        other = [x for x in element if isinstance(x.tag, str) and x.tag not in known]
-        for child in [x for x in other if not x.tag.startswith("{")]:
-            found.setdefault((element.tag, child.tag), []).append(child)
-    groups = [
-        (elements, parent, _suggest_element(tag, _CHILDREN[parent]))
-        for (parent, tag), elements in found.items()
-    ]
-    groups.sort(key=lambda item: item[2].startswith("known"))  # likely mistakes first
-    for elements, parent, hint in groups[:_MAX_WARNINGS]:
-        _warn_about_elements(
-            xml,
-            elements,
-            f"unknown <{elements[0].tag}> in <{parent}>",
-            f", it is left out, {hint}",
-        )
-    if remaining := [elements[0] for elements, _, _ in groups[_MAX_WARNINGS:]]:
-        listed = ", ".join(f"<{element.tag}>" for element in remaining[:_MAX_WARNINGS])
-        dots = ", ..." if len(remaining) > _MAX_WARNINGS else ""
-        problem = f"{len(remaining)} more unknown elements ({listed}{dots}) are left out"
-        _warn_about_elements(xml, remaining[:1], problem, "")
-    incomplete = []
+        for child in [x for x in element if x.tag not in known and not x.tag.startswith("{")]:
+            hint = _suggest_element(child.tag, element.tag)
+            xml.warn(child, f"unknown <{child.tag}> in <{element.tag}>, it is left out, {hint}")
     for name, joint in joints.items():
         limit = joint.find("limit")
         if limit is None or joint.get("type") == "fixed":
             continue
-        missing = [key for key in ("effort", "velocity") if limit.get(key) is None]
-        if missing:
-            incomplete.append(
-                (limit, f"the limit of joint '{name}' has no {' and no '.join(missing)}")
-            )
-    if incomplete:
-        hint = ", nothing is limited then: add it, 1e9 for no limit"
-        _warn_about_elements(xml, [limit for limit, _ in incomplete], incomplete[0][1], hint)
+        if missing := [key for key in ("effort", "velocity") if limit.get(key) is None]:
+            problem = f"the limit of joint '{name}' has no {' and no '.join(missing)}"
+            xml.warn(limit, f"{problem}, nothing is limited then: add it, 1e9 for no limit")
 
 
-def _suggest_element(tag: str, tags: Set[str]) -> str:
+@cache
+def _suggest_element(tag: str, parent: str) -> str:
     if tag == "constraint":
         return CONSTRAINT_HINT
+    tags = sorted(_CHILDREN[parent])
     element_of_attribute = {
-        name: other for other in sorted(tags) for name in sorted(_ATTRIBUTES.get(other, ()))
+        name: other for other in tags for name in sorted(_ATTRIBUTES.get(other, ()))
     }
-    similar = get_close_matches(
-        tag.lower(), [*sorted(tags), *element_of_attribute], 1, _MIN_SIMILARITY
-    )
+    similar = get_close_matches(tag.lower(), [*tags, *element_of_attribute], 1, _MIN_SIMILARITY)
     if not similar:
         return suggest_names(tags)
     if similar[0] in tags:
         return f"did you mean <{similar[0]}>?"
     return f'did you mean {similar[0]}="..." of <{element_of_attribute[similar[0]]}>?'
-
-
-def _warn_about_elements(
-    xml: XmlFile, elements: list[etree._Element], problem: str, hint: str
-) -> None:
-    count = f" ({len(elements)} such in this file)" if len(elements) > 1 else ""
-    warnings.warn(
-        f"{xml.source_location(elements[0])}: {problem}{count}{hint}", CraneWarning, stacklevel=4
-    )

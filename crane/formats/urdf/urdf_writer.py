@@ -7,14 +7,13 @@ document, and the warning about what is left out.
 import copy
 import dataclasses
 import re
-import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from lxml import etree
 
 from crane.common.atomic_output import replace_file
-from crane.common.errors import CraneWarning, InputError, format_one_line
+from crane.common.errors import InputError, format_one_line, warn
 from crane.description.kinematic_tree import Tree
 from crane.description.specification import STANDARD_GRAVITY, Coupling, LoopSpec
 from crane.formats.robot_files import open_robots
@@ -135,8 +134,11 @@ def _add_coupling(machine: Machine, robot: etree._Element, coupling: Coupling) -
     # the joint that a held joint mimics has no effect
     other = [*joints[1:], *(name for name in machine.joints if name != joints[0])][0]
     (follower,) = (j for j in robot.iterfind("joint") if j.get("name") == joints[0])
-    multiplier = format_numbers([derivatives[0] if derivatives else 0.0])
-    mimic = {"joint": other, "multiplier": multiplier, "offset": format_numbers([offset])}
+    mimic = {
+        "joint": other,
+        "multiplier": format_numbers([derivatives[0] if derivatives else 0.0]),
+        "offset": format_numbers([offset]),
+    }
     if follower.get("independent") == "true":
         raise InputError(
             f"'{joints[0]}' is active and follows '{other}' by the coupling '{coupling.name}', "
@@ -338,9 +340,8 @@ def warn_about_unsupported(machine: Machine, format_name: str, others: Sequence[
     }
     names += [name for name, section in sections.items() if section]
     if listed := ", ".join([*names, *others]):
-        warnings.warn(
+        warn(
             f"{machine.name}: {format_name} has no place for {listed}, left out (a machine "
             "file has)",
-            CraneWarning,
             stacklevel=3,
         )

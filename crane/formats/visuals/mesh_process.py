@@ -2,16 +2,18 @@
 
 `crane.formats.visuals.urdf_shapes` runs it and sends a JSON object {"files": paths, "triangles":
 largest number in all files}. For each file the process writes a line of JSON, {"parts":
-[{"vertices": V, "faces": F, "colour": [r, g, b, a] or null}, ...], "alone": whether no other file
-was opened for it} or {"wrong": "message"}, then the arrays of each part: V 3 float64, F 3 int64.
+[{"faces": F, "colour": [r, g, b, a] or null}, ...], "alone": whether no other file was opened for
+it} or {"wrong": "message"}, then vertices and faces of each part in the format of `numpy.save`.
 Time and memory are limited, because mesh readers trust the sizes that a damaged file declares.
 
 It imports nothing of the package, which would take longer than reading most meshes.
 """
 
 import contextlib
+import io
 import json
 import os
+import resource
 import sys
 import warnings
 from typing import Any
@@ -38,6 +40,8 @@ def main() -> None:
     # trimesh does not need these to read, and importing them takes longer than most meshes
     for name in ("networkx", "rtree", "scipy", "shapely"):
         sys.modules[name] = None  # type: ignore[assignment]
+    import numpy as np
+
     with contextlib.suppress(ImportError):  # `_read_mesh` raises it again
         import trimesh  # noqa: F401  before time is counted
     for file in files:
@@ -50,18 +54,16 @@ def main() -> None:
         except Exception as error:  # readers raise anything for malformed files
             message = " ".join(str(error).split()) or type(error).__name__
             header, arrays = {"wrong": message[:80]}, []
-        output.write(json.dumps(header).encode() + b"\n")
+        answer = io.BytesIO()  # numpy cannot write arrays into a pipe
+        answer.write(json.dumps(header).encode() + b"\n")
         for array in arrays:
-            output.write(array.tobytes())
+            np.save(answer, array)
+        output.write(answer.getbuffer())
         output.flush()
 
 
 def limit_resources() -> None:
-    """Limit time for one more file, and memory, if the system supports it."""
-    try:
-        import resource
-    except ImportError:
-        return
+    """Limit time for one more file, and memory."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     time_limit = int(used.ru_utime + used.ru_stime) + MAX_SECONDS
     for kind, limit in ((resource.RLIMIT_CPU, time_limit), (resource.RLIMIT_AS, MAX_MEMORY)):
@@ -119,7 +121,7 @@ def _read_mesh(file: str, max_triangles: int) -> tuple[dict[str, Any], list[Any]
     arrays: list[Any] = []
     for colour, colour_parts in by_colour.items():
         joined = trimesh.util.append_faces(*zip(*colour_parts, strict=True))
-        parts.append({"vertices": len(joined[0]), "faces": len(joined[1]), "colour": colour})
+        parts.append({"faces": len(joined[1]), "colour": colour})
         arrays += joined
     return {"parts": parts, "alone": not SiblingFileResolver.asked}, arrays
 

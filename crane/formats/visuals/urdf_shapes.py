@@ -3,6 +3,7 @@
 A shape that cannot be drawn is reported and left out; it is no reason to refuse a machine.
 """
 
+import io
 import json
 import os
 import signal
@@ -22,6 +23,7 @@ from crane.common.errors import DescriptionError
 from crane.common.package_search import find_file
 from crane.common.samples import Array
 from crane.description.findings import raise_errors
+from crane.description.pinocchio_conversion import se3_from_xyz_rpy
 from crane.formats.visuals import mesh_process
 from crane.formats.xml_file import XmlFile
 
@@ -34,6 +36,7 @@ _MAX_NAME_LENGTH = 100  # characters shown
 _MAX_FILE_SIZE = 200e6  # bytes
 _MAX_CACHED_SIZE = 4 << 20  # bytes of a cached file, and of its answer
 _MAX_ATTEMPTS = 3
+_DAMAGE_ERRORS = ValueError, KeyError, TypeError, EOFError  # of an answer that is not complete
 _TIMEOUT_PER_FILE = 10 * mesh_process.MAX_SECONDS  # [s], for systems without CPU limits
 
 
@@ -82,8 +85,8 @@ def read_meshes(files: Iterable[Path]) -> dict[Path, tuple[MeshPart, ...] | str]
         cached = None if name is None else file_cache.read_entry(name)
         entry_names[file] = name
         if cached is not None:
-            with suppress(ValueError, KeyError, TypeError):  # else it is read anew
-                found[file], _ = _parse_answer(cached)
+            with suppress(*_DAMAGE_ERRORS):  # else it is read anew
+                found[file], _ = _parse_answer(io.BytesIO(cached))
                 del entry_names[file]
     for _ in range(_MAX_ATTEMPTS):
         remaining_triangles = mesh_process.MAX_TRIANGLES - sum(
@@ -94,7 +97,7 @@ def read_meshes(files: Iterable[Path]) -> dict[Path, tuple[MeshPart, ...] | str]
         )
         answers = _run_mesh_process(list(entry_names), remaining_triangles) if entry_names else []
         for (file, name), answer in zip(list(entry_names.items()), answers, strict=False):
-            found[file], is_self_contained = _parse_answer(answer)
+            found[file], is_self_contained = _parse_answer(io.BytesIO(answer))
             del entry_names[file]
             is_small = len(answer) <= _MAX_CACHED_SIZE
             if name and is_small and is_self_contained and name == _cache_entry_name(file):
@@ -129,36 +132,30 @@ def _run_mesh_process(files: list[Path], max_triangles: int) -> list[bytes]:
         output, status = completed.stdout, completed.returncode
     except subprocess.TimeoutExpired as late:
         output, status = late.stdout or b"", -signal.SIGTERM
-    answers, position = [], 0
-    while (end := output.find(b"\n", position)) >= 0:  # complete answers
-        parts = json.loads(output[position:end]).get("parts", ())
-        end += 1 + sum(8 * 3 * (part["vertices"] + part["faces"]) for part in parts)
-        if end > len(output):
-            break
-        answers.append(output[position:end])
-        position = end
+    answers, stream = [], io.BytesIO(output)
+    with suppress(*_DAMAGE_ERRORS):  # after the complete answers
+        for _ in files:
+            start = stream.tell()
+            _parse_answer(stream)
+            answers.append(output[start : stream.tell()])
     if len(answers) < len(files):
         reason = "damaged"
-        if status in (-signal.SIGTERM, -getattr(signal, "SIGXCPU", 0)):
+        if status in (-signal.SIGTERM, -signal.SIGXCPU):
             reason = f"reading it takes more than {mesh_process.MAX_SECONDS} s"
         answers.append(json.dumps({"wrong": reason}).encode() + b"\n")
     return answers
 
 
-def _parse_answer(answer: bytes) -> tuple[tuple[MeshPart, ...] | str, bool]:
+def _parse_answer(answer: io.BytesIO) -> tuple[tuple[MeshPart, ...] | str, bool]:
     """Return the triangles of an answer, or its error text, and whether no other file was read."""
-    position = answer.index(b"\n") + 1
-    header = json.loads(answer[:position])
+    header = json.loads(answer.readline())
     if "wrong" in header:
         return str(header["wrong"]), False
-    parts = []
-    for part in header["parts"]:
-        v, f = 3 * part["vertices"], 3 * part["faces"]
-        vertices = np.frombuffer(answer, np.float64, v, position).reshape(-1, 3)
-        faces = np.frombuffer(answer, np.int64, f, position + 8 * v).reshape(-1, 3)
-        parts.append(MeshPart(vertices, faces, part["colour"] and tuple(part["colour"])))
-        position += 8 * (v + f)
-    return tuple(parts), bool(header.get("alone"))
+    parts = tuple(
+        MeshPart(np.load(answer), np.load(answer), part["colour"] and tuple(part["colour"]))
+        for part in header["parts"]
+    )
+    return parts, bool(header.get("alone"))
 
 
 @dataclass(frozen=True)
@@ -229,21 +226,6 @@ class Visual:
 
 
 @dataclass(frozen=True)
-class UrdfShapes:
-    """The shapes of a URDF.
-
-    Attributes:
-        shapes: Shapes by tag.
-        missing_meshes: File and line by name of each mesh whose file does not exist.
-        problems: Other problems, with file, line, consequence and advice.
-    """
-
-    shapes: Mapping[str, Sequence[Visual]]
-    missing_meshes: Mapping[str, str]
-    problems: Sequence[str]
-
-
-@dataclass(frozen=True)
 class _UnloadedMesh:
     """A mesh on a link that is not read yet: its name, scale (3,) and file."""
 
@@ -256,36 +238,27 @@ class _UnloadedMesh:
     source_location: str
 
 
-def read_shapes(
-    xml: XmlFile, tags: Sequence[str] = ("visual",), replacement: BoxShape | None = None
-) -> UrdfShapes:
-    """Read the shapes of a URDF that can be drawn.
+class UrdfShapes:
+    """The shapes of a URDF that can be drawn, and the problems with others.
 
     Args:
         xml: The file.
         tags: Tags of the elements of links to read: visual, collision.
         replacement: Shape in place of a mesh that cannot be read; None to leave it out.
+
+    Attributes:
+        shapes: Shapes by tag.
+        missing_meshes: File and line by name of each mesh whose file does not exist.
+        problems: Other problems, with file, line, consequence and advice.
     """
-    reader = _ShapeReader(xml)
-    shapes = {tag: reader.read_elements(tag) for tag in tags}
-    meshes = read_meshes(
-        shape.file
-        for found in shapes.values()
-        for shape in found
-        if isinstance(shape, _UnloadedMesh) and shape.file is not None
-    )
-    visuals = {
-        tag: [x for shape in found for x in reader.create_visuals(shape, meshes, replacement)]
-        for tag, found in shapes.items()
-    }
-    return UrdfShapes(visuals, reader.missing_meshes, tuple(dict.fromkeys(reader.problems)))
 
-
-class _ShapeReader:
-    """Reads the shapes of a file, and collects problems."""
-
-    def __init__(self, xml: XmlFile):
-        self.xml = xml
+    def __init__(
+        self,
+        xml: XmlFile,
+        tags: Sequence[str] = ("visual",),
+        replacement: BoxShape | None = None,
+    ):
+        self._xml, self._replacement = xml, replacement
         self.missing_meshes: dict[str, str] = {}
         self._damaged_meshes: dict[str, str] = {}
         self.problems: list[str] = []
@@ -297,11 +270,23 @@ class _ShapeReader:
                 if (colour := self._read_colour(material)) is not None
             }
         self.problems.clear()  # reported for the visuals that use them
+        found = {tag: self._read_elements(tag) for tag in tags}
+        meshes = read_meshes(
+            shape.file
+            for shapes in found.values()
+            for shape in shapes
+            if isinstance(shape, _UnloadedMesh) and shape.file is not None
+        )
+        self.shapes: Mapping[str, Sequence[Visual]] = {
+            tag: [x for shape in shapes for x in self._create_visuals(shape, meshes)]
+            for tag, shapes in found.items()
+        }
+        self.problems = list(dict.fromkeys(self.problems))
 
-    def read_elements(self, tag: str) -> list[Visual | _UnloadedMesh]:
+    def _read_elements(self, tag: str) -> list[Visual | _UnloadedMesh]:
         """Return the shapes of elements with a tag."""
         found: list[Visual | _UnloadedMesh] = []
-        for element in self.xml.root.iterfind(f"link/{tag}"):
+        for element in self._xml.root.iterfind(f"link/{tag}"):
             link = element.getparent().get("name", "").strip()
             try:
                 found += self._read_element(element, link, f"a {tag} of link '{link}'")
@@ -313,57 +298,60 @@ class _ShapeReader:
     def _read_element(
         self, element: etree._Element, link: str, label: str
     ) -> Sequence[Visual | _UnloadedMesh]:
-        xyz, rpy = self.xml.placement(element, label)
+        xyz, rpy = self._xml.placement(element, label)
         self._check_distance(element, label, xyz)
-        placement = _pose_matrix(xyz, rpy)
-        material = self.xml.single_child(element, "material", label)
+        placement = se3_from_xyz_rpy(xyz, rpy)
+        material = self._xml.single_child(element, "material", label)
         colour = None
         if material is not None:
             colour = self._read_colour(material) or self._colours.get(
                 material.get("name", "").strip()
             )
-        geometry = self.xml.single_child(element, "geometry", label)
-        shapes = [] if geometry is None else [x for x in geometry if isinstance(x.tag, str)]
+        geometry = self._xml.single_child(element, "geometry", label)
+        shapes = [] if geometry is None else list(geometry)
         if len(shapes) != 1 or shapes[0].tag not in _SHAPE_TAGS:
             shape_text = ", ".join(f"<{shape.tag}>" for shape in shapes[:4]) or "no shape"
             listed = ", ".join(f"<{shape}>" for shape in _SHAPE_TAGS)
-            raise self.xml.error_at(element, f"{label} has {shape_text}, give one of {listed}")
+            raise self._xml.error_at(element, f"{label} has {shape_text}, give one of {listed}")
         shape = shapes[0]
         if shape.tag == "mesh":
             if not (name := shape.get("filename", "")):
-                raise self.xml.error_at(shape, f'{label} names no mesh, add filename="..."')
-            scale = self.xml.vector(shape, "scale", label, 3, (1.0, 1.0, 1.0))
+                raise self._xml.error_at(shape, f'{label} names no mesh, add filename="..."')
+            scale = self._xml.vector(shape, "scale", label, 3, (1.0, 1.0, 1.0))
             file, place = (
-                find_mesh_file(name, self.xml.file.parent),
-                self.xml.source_location(shape),
+                find_mesh_file(name, self._xml.file.parent),
+                self._xml.source_location(shape),
             )
-            return [_UnloadedMesh(link, name, scale, file, placement, colour, place)]
+            return [_UnloadedMesh(link, name, scale, file, placement.homogeneous, colour, place)]
         return [
-            Visual(link, part, placement @ _pose_matrix((0.0, 0.0, z)), colour or DEFAULT_COLOUR)
-            for part, z in self._read_shape(shape, label)
+            Visual(link, part, (placement * offset).homogeneous, colour or DEFAULT_COLOUR)
+            for part, offset in self._read_shape(shape, label)
         ]
 
-    def _read_shape(self, shape: etree._Element, label: str) -> list[tuple[Shape, float]]:
-        """Return the parts of a shape, each with its coordinate z."""
+    def _read_shape(self, shape: etree._Element, label: str) -> list[tuple[Shape, pin.SE3]]:
+        """Return the parts of a shape, each with its pose."""
+        centre = pin.SE3.Identity()
         if shape.tag == "box":
             x, y, z = self._read_sizes(shape, "size", label, 3)
-            return [(BoxShape((x, y, z)), 0.0)]
+            return [(BoxShape((x, y, z)), centre)]
         (radius,) = self._read_sizes(shape, "radius", label, 1)
         sphere = SphereShape(radius)
         if shape.tag == "sphere":
-            return [(sphere, 0.0)]
+            return [(sphere, centre)]
         (length,) = self._read_sizes(shape, "length", label, 1)
         # the length of a capsule is between the centres of its spheres
-        ends = [(sphere, -length / 2), (sphere, length / 2)] if shape.tag == "capsule" else []
-        return [(CylinderShape(radius, length), 0.0), *ends]
+        heights = (-length / 2, length / 2) if shape.tag == "capsule" else ()
+        ends = [(sphere, pin.SE3(np.eye(3), np.array([0.0, 0.0, z]))) for z in heights]
+        return [(CylinderShape(radius, length), centre), *ends]
 
     def _read_sizes(
         self, shape: etree._Element, key: str, label: str, count: int
     ) -> tuple[float, ...]:
-        sizes = self.xml.vector(shape, key, label, count)
+        sizes = self._xml.vector(shape, key, label, count)
         if min(sizes) <= 0:
-            given = f'{key}="{shape.get(key)}"'
-            raise self.xml.error_at(shape, f"{given} of {label} is not positive, give metres")
+            raise self._xml.error_at(
+                shape, f'{key}="{shape.get(key)}" of {label} is not positive, give metres'
+            )
         self._check_distance(shape, label, sizes)
         return sizes
 
@@ -372,7 +360,9 @@ class _ShapeReader:
     ) -> None:
         largest = max(lengths, key=abs)
         if abs(largest) > _MAX_DISTANCE:
-            raise self.xml.error_at(element, f"{label} has a length of {largest:g} m, give metres")
+            raise self._xml.error_at(
+                element, f"{label} has a length of {largest:g} m, give metres"
+            )
 
     def _read_colour(self, material: etree._Element) -> Colour | None:
         """Return the colour of a material, None if it has no valid one."""
@@ -380,10 +370,10 @@ class _ShapeReader:
         if colour is None:
             return None
         try:
-            rgba = self.xml.vector(colour, "rgba", "a colour", 4)
+            rgba = self._xml.vector(colour, "rgba", "a colour", 4)
             if not 0 <= min(rgba) <= max(rgba) <= 1:
                 given = f'rgba="{colour.get("rgba")}"'
-                raise self.xml.error_at(
+                raise self._xml.error_at(
                     colour, f"{given} of a colour is not within 0 to 1, correct it"
                 )
         except DescriptionError as error:
@@ -392,11 +382,8 @@ class _ShapeReader:
         red, green, blue, opacity = rgba
         return red, green, blue, opacity
 
-    def create_visuals(
-        self,
-        mesh: Visual | _UnloadedMesh,
-        meshes: Mapping[Path, tuple[MeshPart, ...] | str],
-        replacement: BoxShape | None,
+    def _create_visuals(
+        self, mesh: Visual | _UnloadedMesh, meshes: Mapping[Path, tuple[MeshPart, ...] | str]
     ) -> list[Visual]:
         """Return a shape with the triangles of its mesh."""
         if isinstance(mesh, Visual):
@@ -405,9 +392,8 @@ class _ShapeReader:
         if len(name) >= _MAX_NAME_LENGTH:
             name = f"...{name[-_MAX_NAME_LENGTH:]}"
         mesh_label = f"{mesh.source_location}: mesh '{name}'"
-        box = (
-            [] if replacement is None else [Visual(mesh.link, replacement, mesh.placement, colour)]
-        )
+        shapes = [] if self._replacement is None else [self._replacement]
+        box = [Visual(mesh.link, shape, mesh.placement, colour) for shape in shapes]
         if mesh.file is None:
             self.missing_meshes.setdefault(name, mesh.source_location)
             return box
@@ -439,8 +425,3 @@ class _ShapeReader:
 def _largest_coordinate(part: MeshPart, scale: tuple[float, ...]) -> float:
     with np.errstate(over="ignore"):
         return float(np.abs(part.vertices * scale).max())
-
-
-def _pose_matrix(xyz: Sequence[float], rpy: Sequence[float] = (0.0, 0.0, 0.0)) -> Array:
-    """Return a pose (4, 4) from a position and angles about the fixed axes x, y, z."""
-    return np.asarray(pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(xyz)).homogeneous)

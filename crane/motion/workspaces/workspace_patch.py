@@ -155,7 +155,7 @@ def _close_row(
     start = patch.configurations[node]
     targets = np.array([patch.active_coordinates(x) for x in row])
     if machine.closure.is_compiled:
-        closed = _follow(machine, start, targets)
+        closed = follow_branch(machine, start, targets)
     else:
         last_configuration, is_closed = last_closed_configuration(machine, start, targets[0])
         closed = last_configuration[None][: int(is_closed)]
@@ -164,7 +164,7 @@ def _close_row(
         strokes = previous[machine.closure.active]
         shares = np.linspace(0, 1, _CONTINUATION_STEPS + 1)[1:, None]
         path = strokes + shares * (targets[len(closed)] - strokes)
-        steps = _follow(machine, previous, path)
+        steps = follow_branch(machine, previous, path)
         if len(steps) == _CONTINUATION_STEPS:
             closed = np.vstack([closed, steps[-1:]])
     for x, q in zip(row, closed, strict=False):
@@ -172,8 +172,11 @@ def _close_row(
     return row[: len(closed)]
 
 
-def _follow(machine: Machine, start: Array, targets: Array) -> Array:
-    """Configurations (k, nq) at the first k of targets (N, n); none if the start is singular."""
+def follow_branch(machine: Machine, start: Array, targets: Array) -> Array:
+    """Configurations (k, nq) at the first k of targets (N, n) to which the branch leads.
+
+    In machine code; none if the start is singular.
+    """
     compiled_closure, out = machine.closure.compiled_closure, np.empty((len(targets), len(start)))
     cursor = compiled_closure.new_cursor()
     is_started = compiled_closure.start_cursor_at(cursor, start)

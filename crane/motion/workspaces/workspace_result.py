@@ -200,18 +200,23 @@ class Workspace(Result):
             for joint in self.strokes
         )
 
+    def _position_units(self) -> dict[str, str]:
+        lengths = [
+            "tip_x",
+            "tip_y",
+            "tip_z",
+            *(f"section_{x}" for x in self.section.coordinate_names),
+        ]
+        units = {joint: self.machine.unit(joint) for joint in self.machine.active}
+        return units | dict.fromkeys(lengths, "m")
+
     def to_csv(self, path: str | Path) -> None:
         """Write all configurations: strokes, tip, section coordinates, conditions.
 
         Raises:
             OutputError: The file cannot be written.
         """
-        u, w = self.section.coordinate_names
-        units = {
-            **{joint: self.machine.unit(joint) for joint in self.machine.active},
-            **{f"tip_{axis}": "m" for axis in "xyz"},
-            f"section_{u}": "m", f"section_{w}": "m", "condition": "1", "least_singular": "m",
-        }  # fmt: skip
+        units = self._position_units() | {"condition": "1", "least_singular": "m"}
         columns = (
             self.q_a,
             self.tip_positions,
@@ -229,12 +234,7 @@ class Workspace(Result):
         Raises:
             OutputError: The file cannot be written.
         """
-        u, w = self.section.coordinate_names
-        units = {
-            "curve": "1", "kind": "1",
-            **{joint: self.machine.unit(joint) for joint in self.machine.active},
-            **{f"tip_{axis}": "m" for axis in "xyz"}, f"section_{u}": "m", f"section_{w}": "m",
-        }  # fmt: skip
+        units = {"curve": "1", "kind": "1"} | self._position_units()
         rows = [
             np.column_stack(
                 [

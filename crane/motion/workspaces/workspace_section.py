@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-import pinocchio as pin
 
 from crane.closure.active_joint_selection import condition_number
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
+from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.machine.machine import Machine
 from crane.motion.kinematics import Kinematics
 
@@ -32,6 +32,7 @@ class WorkspaceSection(OneLineRepr):
         origin: (3,) point with u = w = 0 [m].
         is_radial: Whether u is a distance from the line through the origin along w.
         slewing_joint: Index of the slewing joint among the active ones, None if there is none.
+        slewing_sign: 1 if it slews about the upward direction, -1 about the downward one.
     """
 
     coordinate_names: tuple[str, str]
@@ -40,6 +41,7 @@ class WorkspaceSection(OneLineRepr):
     origin: Array
     is_radial: bool
     slewing_joint: int | None
+    slewing_sign: float = 1.0
 
     def coordinates(self, points: Array) -> Array:
         """Coordinates (u, w) (N, 2) [m] of points (N, 3) in the world."""
@@ -64,32 +66,29 @@ class WorkspaceSection(OneLineRepr):
         return np.einsum("kia,ian->ikn", np.array([first_directions, second_directions]), jacobian)
 
 
-def find_slewing_joint(machine: Machine, frame: str) -> tuple[int, Array] | None:
-    """Slewing joint of a frame: its index and a point on its axis, or None.
+def find_slewing_joint(machine: Machine, frame: str) -> tuple[int, Array, float] | None:
+    """Slewing joint of a frame: its index, a point on its axis, its sign about up; or None.
 
     It is a driven joint on the ground with a vertical axis, and moves no passive joint.
     """
     model, up = machine.model, machine.up_direction
     gamma = machine.closure.gamma(machine.home)
-    supporting_joints = list(model.supports[model.frames[machine.frame(frame)].parentJoint])
-    data = model.createData()
-    jacobian = pin.computeJointJacobians(
-        model, data, machine.coordinates.configuration(machine.home)
-    ).reshape(6, -1)
+    frames = FrameJacobians(machine)
+    frames.set_configuration(machine.home)
+    upward_rates = up @ frames.jacobian(frame)[3:]
     for i, name in enumerate(machine.active):
         if not model.existJointName(name):  # a coordinate of a floating base
             continue
-        joint = model.getJointId(name)
-        axis = jacobian[3:, machine.column(name)]
+        upward_rate = upward_rates[machine.column(name)]  # 0 if it does not carry the frame
         if (
             machine.is_driven[i]
-            and model.parents[joint] == 0
-            and joint in supporting_joints
+            and model.parents[model.getJointId(name)] == 0
             and machine.unit(name) == "rad"
             and not np.abs(gamma[machine.closure.passive, i]).any()
-            and abs(axis @ up) > 1 - 1e-9
+            and abs(upward_rate) > 1 - 1e-9
         ):
-            return i, np.array(data.oMi[joint].translation)
+            axis_point = frames.frame_pose(machine.tree.joints[name].child).translation
+            return i, axis_point, float(np.sign(upward_rate))
     return None
 
 
@@ -119,7 +118,7 @@ def workspace_section(
         normal = normal / np.linalg.norm(normal)
     is_flat = len(tip_positions) < 3 or extents[2] <= flatness_threshold
     if slewing_joint is not None:
-        index, axis_point = slewing_joint
+        index, axis_point, sign = slewing_joint
         axis_point = axis_point - (axis_point @ up) * up  # heights are those of the world
         is_upright = abs(normal @ up) < _FLATNESS_TOLERANCE
         is_central = abs((home_position - axis_point) @ normal) <= 10 * flatness_threshold
@@ -127,7 +126,9 @@ def workspace_section(
         if not is_radial:
             forward = np.cross(normal, up)
             forward *= np.sign((home_position - axis_point) @ forward) or 1.0
-        return WorkspaceSection(("radius", "height"), forward, up, axis_point, is_radial, index)
+        return WorkspaceSection(
+            ("radius", "height"), forward, up, axis_point, is_radial, index, sign
+        )
     if not is_flat:
         zero = np.zeros(3)
         return WorkspaceSection(("radius", "height"), zero, up, zero, True, None)

@@ -32,6 +32,8 @@ from crane.simulation.integration.run_notes import RunNotes
 _NEARLY_SINGULAR_MARGIN = 1e5  # on the inertia that counts as none, of what explains a halt
 _LIMIT_RELAXATION = np.array([2.0, 0.1])  # factors of the limits where no chart is better
 _MAX_RECENT_STATES = 500
+_REPEATED_STEPS = 4 * (NODES_BEFORE + STEPS_BEFORE)  # at least, before a crossing
+_MAX_SHARE = 2  # of steps that locate a crossing in an interval of outputs
 _CONFIGURATION_TOLERANCE = 1e-6  # between predicted and closed configuration, coordinate units
 # least ratios of condition numbers: at a dead centre, and of a chart that is tried after a halt
 _DEAD_CENTRE_IMPROVEMENT, _HALT_IMPROVEMENT = 10.0, 1.5
@@ -102,7 +104,9 @@ class ChartSwitchingIntegrator:
                 continue
             if self._switch_chart(times[0] + i * step, state, halt):
                 continue
-            next_index = self._pass_branch_crossing(times, i, state, step, rows)
+            next_index = self._repeat_intervals(times, i, state, step, rows)
+            if next_index is None:
+                next_index = self._pass_branch_crossing(times, i, state, step, rows)
             if next_index is None and halt is not None:
                 raise self._explain_by_mass_matrix(times[0] + i * step, state) or halt
             if next_index is not None:
@@ -247,6 +251,52 @@ class ChartSwitchingIntegrator:
         state[:], integrator.offset = saved_state, offset
         return None
 
+    def _repeat_intervals(
+        self, times: Array, i: int, state: Array, step: float, rows: Array
+    ) -> int | None:
+        """Repeat the last intervals with instants close enough to locate a branch crossing.
+
+        They go on for an interval, so that none ends within a crossing.
+
+        Args:
+            times: See `run`.
+            i: Index of the first instant not before the state.
+            state: Replaced by the state at the returned instant.
+            step: [s].
+            rows: See `run`.
+
+        Returns:
+            Index of the next instant; None where instants are close already, or those before are
+            unknown.
+        """
+        share = int(np.ceil(step * self._speed(state) / MAX_MOTION_PER_STEP))
+        needed = int(np.ceil(_REPEATED_STEPS / max(share, 1)))
+        before = min(max(needed, 2), len(self._recent_states))
+        if share <= _MAX_SHARE or not before:
+            return None
+        state[:], self._integrator.offset = self._recent_states[-before], 0.0
+        end = min(i + 1, len(times))
+        fine_step, count = step / share, (end - i + before) * share
+        instants = times[0] + (i - before) * step + fine_step * np.arange(count)
+        fine_rows = np.empty((count, rows.shape[1]))
+        self._recent_states = self._recent_states[:0]
+        try:
+            self.run(instants, state, fine_step, fine_rows)
+        finally:
+            self.done = self._segment_start = i
+        rows[i:end] = fine_rows[before * share :: share]
+        self.done = end
+        # of the close instants only the last that is an output
+        known = len(self._recent_states) // share
+        self._recent_states = self._recent_states[-share:][: min(known, 1)]
+        return end
+
+    def _speed(self, state: Array) -> float:
+        """Speed of the fastest joint [rad/s], [characteristic lengths per s]."""
+        at = self._row_layout.view(np.resize(state, self._row_layout.size))
+        closure = self._chart.machine.closure
+        return float(np.abs(closure.gamma(at.q) @ at.v_a / closure.units).max())
+
     def _predict_crossing(
         self, now: float, state: Array, last_time: float
     ) -> tuple[float, float] | None:
@@ -271,8 +321,7 @@ class ChartSwitchingIntegrator:
         if not (now > last_time and 0.0 < determinant < last_determinant):
             return None
         time_to_crossing = determinant / (last_determinant - determinant) * (now - last_time)
-        v = closure.gamma(at.q) @ at.v_a
-        speed = float(np.abs(v / closure.units).max())
+        v, speed = closure.gamma(at.q) @ at.v_a, self._speed(state)
         home = self._known_integrators[0][0].machine
         is_singular = relative_rank(
             chart.machine, at.q + time_to_crossing * v
@@ -306,7 +355,7 @@ class ChartSwitchingIntegrator:
         self._to_user_coordinates(times[first:i], rows[first:i])
         self._recent_states = self._recent_states[:0]
         next_time = times[0] + i * step
-        state[:] = path.state_at(behind_time)
+        state[:] = path.state_at(min(behind_time, next_time))
         if next_time - behind_time > 1e-6 * fine_step:
             part = (next_time - behind_time) / np.ceil((next_time - behind_time) / fine_step)
             instants = np.arange(behind_time, next_time - 0.5 * part, part)

@@ -194,7 +194,7 @@ class VariantEvaluation:
 
     @cached_property
     def _configuration_search(self) -> ConfigurationSearch:
-        return ConfigurationSearch(self._statics)
+        return ConfigurationSearch(self.machine, self._options.frame)
 
     @cached_property
     def _task_values(self) -> dict[str, float]:

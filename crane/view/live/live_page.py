@@ -1,7 +1,6 @@
 """Page of a live view: sliders, buttons and readout beside the machine."""
 
 import time
-from collections.abc import Sequence
 from html import escape
 from queue import SimpleQueue
 from typing import Any
@@ -15,10 +14,16 @@ from crane.machine.machine import Machine
 from crane.recordings.recording import FORCE_UNITS
 from crane.recordings.recording_summary import DISPLAY_UNITS
 from crane.view.live.live_scene import LiveScene
-from crane.view.live.live_session import Playback, Readout, Session, round_up_to_nice
+from crane.view.live.live_session import Playback, Readout, Session
+from crane.view.page.html_document import html_table
+from crane.view.page.scene import round_up_to_nice
 
-_TABLE_TAG = '<table style="width:100%;font-size:0.8em;border-spacing:0 0.15em">'
-_HEADING_ROW_TAG = '<tr style="opacity:0.6">'
+_STYLE = """<style>
+.crane-readout { margin: 0 1em 0.6em; font-size: 0.8em; }
+.crane-readout table { width: 100%; border-spacing: 0 0.15em; }
+.crane-readout th { text-align: left; font-weight: normal; opacity: 0.6; }
+.crane-readout .n { text-align: right; }
+</style>"""
 _WARNING_BOX_TAG = (
     '<div style="margin:0.3em 1em;padding:0.5em 0.7em;border-left:4px solid #d0401c;'
     'background:#d0401c22;font-size:0.8em">'
@@ -44,48 +49,37 @@ def readout_html(
     rows = []
     for joint, *forces in zip(machine.active, *columns.values(), strict=True):
         unit, is_free = FORCE_UNITS[machine.unit(joint)], joint in machine.free
-        rows.append([joint, *("free" if is_free else format_quantity(x, unit) for x in forces)])
-    parts = [_html_table(["joint", *columns], rows)]
+        rows.append(
+            [escape(joint), *("free" if is_free else format_quantity(x, unit) for x in forces)]
+        )
+    parts = [html_table(["joint*", *columns], rows)]
     if readout.tip is not None:
         position = [f"{round(1e3 * value, 1) + 0.0:.1f}" for value in readout.tip]
-        parts.append(_html_table(["tip x [mm]", "y [mm]", "z [mm]"], [position]))
+        parts.append(html_table(["tip x [mm]*", "y [mm]", "z [mm]"], [position]))
     rows = []
     for joint in machine.joints:
         if joint not in machine.active:
             unit, scale = DISPLAY_UNITS[machine.unit(joint)]
             value = scale * readout.configuration[machine.column(joint)]
-            rows.append([joint, f"{round(value, 2) + 0.0:.2f} {unit}"])
+            rows.append([escape(joint), f"{round(value, 2) + 0.0:.2f} {unit}"])
     if rows:
-        parts.append(_html_table(["passive joint", "coordinate"], rows))
+        parts.append(html_table(["passive joint*", "coordinate"], rows))
     if readout.gain_joints:
         passive_joint, active_joint = readout.gain_joints
         unit = f"{machine.unit(passive_joint)}/{machine.unit(active_joint)}"
         gain, condition_number = f"{readout.largest_gain:.3g}", f"{readout.condition_number:.3g}"
         rows = [
-            ["largest gamma", f"{gain} {unit}", f"{passive_joint} per {active_joint}"],
-            ["condition number of J_P", condition_number, f"loop {readout.weakest_loop}"],
+            ["largest gamma", f"{gain} {unit}", escape(f"{passive_joint} per {active_joint}")],
+            ["condition number of J_P", condition_number, escape(f"loop {readout.weakest_loop}")],
             ["loops closed to", f"{readout.residual:.0e} m", ""],
         ]
-        parts.append(_html_table([], rows))
-    return "".join(f'<div style="margin:0 1em 0.6em">{part}</div>' for part in parts)
+        parts.append(html_table(["*", "", ""], rows))
+    return _STYLE + "".join(f'<div class="crane-readout">{part}</div>' for part in parts)
 
 
 def warning_html(text: str) -> str:
     """Return a message in a box as HTML; empty for an empty text."""
     return f"{_WARNING_BOX_TAG}{escape(text)}</div>" if text else ""
-
-
-def _html_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    def cells(words: Sequence[str], kind: str) -> str:
-        aligned = ["left"] + ["right"] * (len(words) - 1)
-        return "".join(
-            f'<{kind} style="text-align:{side};font-weight:normal">{escape(text)}</{kind}>'
-            for side, text in zip(aligned, words, strict=True)
-        )
-
-    lines = [f"{_HEADING_ROW_TAG}{cells(headings, 'th')}</tr>"] if headings else []
-    lines += [f"<tr>{cells(row, 'td')}</tr>" for row in rows]
-    return f"{_TABLE_TAG}{''.join(lines)}</table>"
 
 
 _LOAD_KEY, _TIME_KEY, _PLAY_KEY, _HOME_KEY = "load", "time", "play", "home"

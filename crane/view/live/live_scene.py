@@ -14,8 +14,14 @@ from crane.formats.visuals.urdf_shapes import (
     SphereShape,
     Visual,
 )
-from crane.view.live.live_session import Session, round_up_to_nice
-from crane.view.page.scene import ground_height, read_visuals
+from crane.view.live.live_session import Session
+from crane.view.page.scene import (
+    ground_height,
+    link_poses,
+    read_visuals,
+    round_up_to_nice,
+    scene_bounds,
+)
 
 _CAMERA_DIRECTION = np.array(
     [0.55, -1.0, 0.45]
@@ -51,7 +57,9 @@ class LiveScene:
 
     def update_poses(self) -> None:
         """Update the poses of all links from the session."""
-        for frame, pose in zip(self._frames, self._session.link_poses(self._links), strict=True):
+        q = self._session.readout.configuration[None]
+        poses = link_poses(self._session.machine, q, self._links)
+        for frame, (pose,) in zip(self._frames, poses.values(), strict=True):
             x, y, z, w = pin.Quaternion(pose[:3, :3]).coeffs()
             frame.position = pose[:3, 3]
             frame.wxyz = np.array([w, x, y, z])
@@ -156,25 +164,11 @@ def _motion_bounds(visuals: Sequence[Visual], session: Session) -> tuple[Array, 
     Joints with a range of half a turn or more stay at home, because the space would be too large.
     """
     machine, home_readout = session.machine, session.readout
-    points = []
+    configurations = [home_readout.configuration]
     for joint, lower, upper in zip(machine.active, session.lower, session.upper, strict=True):
         is_full_swing = machine.unit(joint) == "rad" and upper - lower >= np.pi
         for value in () if is_full_swing else (lower, upper):
-            session.move(joint, value)
-            points.append(_shape_corners(visuals, session))
+            configurations.append(session.move(joint, value).configuration)
             session.readout = home_readout
-    points.append(_shape_corners(visuals, session))
-    all_points = np.concatenate(points)
-    return all_points.min(axis=0), all_points.max(axis=0)
-
-
-def _shape_corners(visuals: Sequence[Visual], session: Session) -> Array:
-    """Return the corners (k, 3) of boxes around all shapes in the session's configuration."""
-    links = list(dict.fromkeys(visual.link for visual in visuals))
-    poses = dict(zip(links, session.link_poses(links), strict=True))
-    return np.concatenate(
-        [
-            visual.bounding_corners() @ poses[visual.link][:3, :3].T + poses[visual.link][:3, 3]
-            for visual in visuals
-        ]
-    )
+    links = {visual.link for visual in visuals}
+    return scene_bounds(visuals, link_poses(machine, np.array(configurations), links), {})

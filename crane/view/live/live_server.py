@@ -75,9 +75,8 @@ class AccessGuard:
         """Return whether a `Host` header names the host that is listened on."""
         try:
             name = urlsplit(f"//{host}").hostname or ""
-            if name in ("localhost", self.host.lower()):
-                return True
-            return ipaddress.ip_address(name).is_loopback or not self.is_local_only
+            is_named = name in ("localhost", self.host.lower())
+            return is_named or ipaddress.ip_address(name).is_loopback or not self.is_local_only
         except ValueError:
             return False
 

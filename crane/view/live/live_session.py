@@ -3,23 +3,19 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from crane.common.errors import (
-    ClosureError,
-    InputError,
-    RecordingError,
-    SingularConfigurationError,
-    suggest_names,
-)
+from crane.common.errors import ClosureError, InputError, check_name
 from crane.common.samples import Array, as_number
 from crane.dynamics.dynamics import Dynamics
 from crane.machine.machine import Machine
 from crane.machine.payload import Payload
 from crane.motion.kinematics import Kinematics
+from crane.motion.workspaces.workspace_patch import follow_branch, last_closed_configuration
 from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import DISPLAY_UNITS
+from crane.view.page.page_motion import recorded_configurations
+from crane.view.page.scene import round_up_to_nice
 
 
 class Playback:
@@ -40,47 +36,26 @@ class Playback:
     """
 
     def __init__(self, machine: Machine, recording: Recording):
-        columns = []
-        for joint in machine.active:
-            if joint not in recording.joints:
-                raise RecordingError(
-                    f"the recording has no joint '{joint}', which drives {machine.name}, "
-                    f"{suggest_names(recording.joints, joint)}"
-                )
-            columns.append(recording.joints.index(joint))
+        rows = np.arange(len(recording.time))
+        self.configurations = recorded_configurations(machine, recording, rows)
+        columns = [recording.joints.index(joint) for joint in machine.active]
         self._time = recording.time
-        self._active_count = len(columns)
-        self._coordinates_and_forces = np.hstack(
-            [recording.q[:, columns], recording.tau[:, columns]]
-        )
+        self._coordinates, self._forces = recording.q[:, columns], recording.tau[:, columns]
         self.start, self.end = float(self._time[0]), float(self._time[-1])
-        self.configurations = machine.closure.solve(
-            self._coordinates_and_forces[:, : self._active_count]
-        )
 
     def interpolate(self, time: float) -> tuple[Array, Array]:
         """Return active coordinates (n,) [m], [rad] and forces (n,) [N], [N m] at a time [s].
 
         Values are interpolated linearly between samples.
         """
-        next_index = int(
-            np.clip(np.searchsorted(self._time, time), 1, max(len(self._time) - 1, 1))
+        q_a, forces = (
+            np.array([np.interp(time, self._time, column) for column in values.T])
+            for values in (self._coordinates, self._forces)
         )
-        adjacent_rows = self._coordinates_and_forces[next_index - 1 : next_index + 1]
-        if len(adjacent_rows) == 1:
-            return adjacent_rows[0, : self._active_count], adjacent_rows[0, self._active_count :]
-        start_time, end_time = self._time[next_index - 1 : next_index + 1]
-        share = np.clip((time - start_time) / (end_time - start_time), 0.0, 1.0)
-        values = adjacent_rows[0] + share * (adjacent_rows[1] - adjacent_rows[0])
-        return values[: self._active_count], values[self._active_count :]
+        return q_a, forces
 
 
-_MAX_STEP_SHARE = 1 / 128  # of a move, at most
-_MIN_STEP_SHARE = 1e-11  # of a move, at which it gives up
-_STEPS_PER_CALL = 32  # steps that are tried before their length is thought over
-_MAX_CONDITION_NUMBER = (
-    1e4  # condition number above which a configuration counts as at the end of its branch
-)
+_STEP_COUNT = 128  # of a move, so that none jumps over a gap of the branch
 _UNLIMITED_ANGLE_RANGE, _UNLIMITED_STROKE_RANGE = (
     np.pi,
     1.0,
@@ -167,8 +142,7 @@ class Session:
             InputError: The joint is unknown, or the value is not finite or out of range.
         """
         active = self.machine.active
-        if joint not in active:
-            raise InputError(f"'{joint}' is no active joint, {suggest_names(active, joint)}")
+        check_name(joint, active, f"'{joint}' is no active joint")
         index = active.index(joint)
         unit = self.machine.unit(joint)
         value = as_number(value, f"the value of {joint}", unit)
@@ -181,18 +155,18 @@ class Session:
             )
         target = self.readout.q_a.copy()
         target[index] = value
-        path = self._path_configurations(target)
-        if path is None:
+        if not self.machine.closure.is_compiled:
             return self.set_active_coordinates(target)
-        for q in reversed(path):
-            try:
-                readout = self._compute_readout(q)
-            except SingularConfigurationError:
-                continue
-            if readout.condition_number < _MAX_CONDITION_NUMBER:
+        q = self.readout.configuration
+        path = np.linspace(self.readout.q_a, target, _STEP_COUNT + 1)[1:]
+        while len(path):
+            closed = follow_branch(self.machine, q, path)
+            q, path = np.vstack([q, closed])[-1], path[len(closed) :]
+            if not len(path):
                 break
-        else:
-            readout = self._compute_readout(self.readout.configuration)
+            q, is_reached = last_closed_configuration(self.machine, q, path[0])  # by smaller steps
+            path = path[1:] if is_reached else path[:0]
+        readout = self._compute_readout(q)
         if readout.q_a[index] != value:
             shown_unit, scale = DISPLAY_UNITS[unit]
             readout = replace(
@@ -238,50 +212,11 @@ class Session:
         )
         return self.readout
 
-    def link_poses(self, links: list[str]) -> Array:
-        """Return the poses (len(links), 4, 4) of links in the world."""
-        model = self.machine.model
-        data = model.createData()
-        pinocchio_configuration = self.machine.coordinates.configuration(
-            self.readout.configuration
-        )
-        pin.framesForwardKinematics(model, data, pinocchio_configuration)
-        return np.array(
-            [data.oMf[i].homogeneous for i in [self.machine.frame(link) for link in links]]
-        ).reshape(-1, 4, 4)
-
     def tip_positions(self, q: Array) -> Array:
         """Return tip positions (N, 3) [m] at closed configurations (N, nq); (0, 3) if no tip."""
         if self._kinematics is None:
             return np.empty((0, 3))
         return self._kinematics.positions_at_configurations(q)
-
-    def _path_configurations(self, target: Array) -> list[Array] | None:
-        """Return configurations on the straight line to a target (n,), as far as the branch goes.
-
-        Steps are small, so that none jumps over a gap of the branch, and smaller near its end.
-        None if the closure is not compiled.
-        """
-        closure = self.machine.closure
-        if not closure.is_compiled:
-            return None
-        cursor, start = closure.compiled_closure.new_cursor(), self.readout.q_a
-        path: list[Array] = []
-        completed_share, step = 0.0, _MAX_STEP_SHARE
-        if not closure.compiled_closure.start_cursor_at(cursor, self.readout.configuration):
-            return path
-        while completed_share < 1.0 and step > _MIN_STEP_SHARE:
-            shares = np.unique(
-                np.minimum(completed_share + step * np.arange(1, _STEPS_PER_CALL + 1), 1.0)
-            )
-            targets = start + shares[:, None] * (target - start)
-            targets[shares == 1.0] = target
-            out = np.empty((len(targets), len(self.machine.joints)))
-            count = closure.compiled_closure.follow_targets(cursor, targets, out)
-            path += list(out[:count])
-            completed_share = float(shares[count - 1]) if count else completed_share
-            step = min(4 * step, _MAX_STEP_SHARE) if count == len(targets) else step / 8
-        return path
 
     def _compute_readout(self, q: Array) -> Readout:
         """Return the readout of a closed configuration (nq,).
@@ -334,11 +269,3 @@ class Session:
                 ).argmax()
             )
         ]
-
-
-def round_up_to_nice(value: float) -> float:
-    """Round a positive value up to 1, 2 or 5 times a power of ten."""
-    power_of_ten = 10.0 ** np.floor(np.log10(value))
-    return float(
-        next(x for x in (1, 2, 5, 10) if x * power_of_ten >= value * (1 - 1e-9)) * power_of_ten
-    )

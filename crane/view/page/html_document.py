@@ -1,6 +1,6 @@
 """Self-contained HTML documents of text, tables and figures."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from pathlib import Path
 
@@ -50,7 +50,6 @@ def write_document(path: str | Path, heading: str, parts: Iterable[str]) -> Path
     Raises:
         OutputError: The file's suffix is not .html or .htm, or it cannot be written.
     """
-    check_page_suffix(path)
     heading = escape(heading)
     text = (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
@@ -58,25 +57,18 @@ def write_document(path: str | Path, heading: str, parts: Iterable[str]) -> Path
         f"<title>{heading}</title>\n<style>{_CSS}</style>\n</head>\n<body>\n"
         f"<h1>{heading}</h1>\n" + "\n".join(parts) + "\n</body>\n</html>\n"
     )
-    return write_page(path, text)
+    return write_page(path, lambda: text)
 
 
-def check_page_suffix(path: str | Path) -> None:
-    """Check that a file name is that of a page.
+def write_page(path: str | Path, create_text: Callable[[], str]) -> Path:
+    """Create the HTML text of a page, write it to a file, and return the path.
 
     Raises:
-        OutputError: The suffix is not .html or .htm.
+        OutputError: The file's suffix is not .html or .htm, or it cannot be written.
     """
     if Path(path).suffix.lower() not in PAGE_SUFFIXES:
         raise OutputError(f"{path}: a page is for a browser, end the name in .html")
-
-
-def write_page(path: str | Path, text: str) -> Path:
-    """Write the HTML text of a page to a file, and return the path.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    text = create_text()
     with replace_file(path) as part:
         part.write_text(text, encoding="utf-8", errors="backslashreplace")
     return Path(path)

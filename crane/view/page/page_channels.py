@@ -244,13 +244,9 @@ def page_columns(machine: Machine, recording: Recording) -> Iterator[PageColumn]
         group, label = _group_and_label(machine, name, unit)
         yield PageColumn(name, group, label, unit, values, reference(name))
         if name == "potential" and unit == units.get("kinetic") == "J":
-            yield PageColumn(
-                "kinetic + potential",
-                group,
-                "kinetic + potential",
-                unit,
-                _sum_blockwise(channels["kinetic"], values),
-            )
+            total = "kinetic + potential"
+            energy = _sum_blockwise(channels["kinetic"], values)
+            yield PageColumn(total, group, total, unit, energy)
     for name, values in channels.items():
         if name.startswith(REFERENCE_PREFIX) and name not in used_references:
             yield PageColumn(name, "Other", name, units[name], values)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from crane.common.errors import InputError, RecordingError, suggest_names
+from crane.common.errors import InputError, RecordingError, check_name
 from crane.common.samples import Array
 from crane.description.rotation_vectors import ROTATION_COUNT
 from crane.machine.machine import Machine
@@ -162,17 +162,11 @@ def check_joints(machine: Machine, recording: Recording) -> None:
         RecordingError: The recording lacks an active joint, or has an unknown joint or unit.
     """
     for joint in machine.active:
-        if joint not in recording.joints:
-            raise RecordingError(
-                f"the recording has no joint '{joint}', which drives {machine.name}, "
-                f"{suggest_names(recording.joints, joint)}"
-            )
+        problem = f"the recording has no joint '{joint}', which drives {machine.name}"
+        check_name(joint, recording.joints, problem, RecordingError)
     for joint in recording.joints:
-        if joint not in machine.joints:
-            raise RecordingError(
-                f"the recording has a joint '{joint}' that {machine.name} does not have, "
-                f"{suggest_names(machine.joints, joint)}"
-            )
+        problem = f"the recording has a joint '{joint}' that {machine.name} does not have"
+        check_name(joint, machine.joints, problem, RecordingError)
         if recording.units[joint] != machine.unit(joint):
             raise RecordingError(
                 f"'{joint}' is recorded in {recording.units[joint]}, in {machine.name} it is in "

@@ -2,6 +2,7 @@
 
 import json
 import webbrowser
+from collections.abc import Sequence
 from html import escape
 from importlib.resources import files
 from math import cos, sin
@@ -27,7 +28,7 @@ from crane.recordings.recording_summary import (
     summarize,
 )
 from crane.view.page.force_markers import actuator_markers, load_markers, spring_markers
-from crane.view.page.html_document import check_page_suffix, write_page
+from crane.view.page.html_document import write_page
 from crane.view.page.page_channels import ThinningGrid, plot_groups
 from crane.view.page.page_motion import (
     check_joints,
@@ -77,8 +78,7 @@ def report(
         InputError: A configuration is not finite.
         OutputError: The file's suffix is not .html or .htm, or it cannot be written.
     """
-    check_page_suffix(path)
-    return write_page(path, report_html(machine, recording, second_recording))
+    return write_page(path, lambda: report_html(machine, recording, second_recording))
 
 
 def report_html(
@@ -234,52 +234,35 @@ def summarize_run(machine: Machine, recording: Recording | None) -> dict[str, An
         facts: pairs of name and text; forces: rows (joint, range, peak and RMS force); limits:
             sentences.
     """
-    facts = [
-        (
-            "moving mass",
-            format_quantity(
-                sum([inertia.mass for inertia in list(machine.model.inertias)[1:]]), "kg", 4
-            ),
-        )
+    mass = sum(inertia.mass for inertia in list(machine.model.inertias)[1:])
+    changed = (f"{name} = {value:g}" for name, value in machine.parameter_changes.items())
+    held = (f"{joint} at {value:g}" for joint, value in machine.locked_joints.items())
+    machine_facts = [
+        ("moving mass", format_quantity(mass, "kg", 4)),
+        ("changed", ", ".join(changed)),
+        ("held", ", ".join(held)),
     ]
-    if machine.parameter_changes:
-        changed_text = ", ".join(
-            f"{name} = {value:g}" for name, value in machine.parameter_changes.items()
-        )
-        facts.append(("changed", changed_text))
-    if machine.locked_joints:
-        locked_text = ", ".join(
-            f"{joint} at {value:g}" for joint, value in machine.locked_joints.items()
-        )
-        facts.append(("held", locked_text))
     if recording is None:
-        return {"facts": facts, "forces": [], "limits": []}
-    summary = summarize(recording)
-    if recording.controller:
-        facts.insert(0, ("controller", recording.controller))
-    count = len(recording.time)
+        return {"facts": _without_empty(machine_facts), "forces": [], "limits": []}
+    summary, count, start = summarize(recording), len(recording.time), recording.time[0]
     rate = f", {(count - 1) / summary.duration:.4g} per second" if count > 1 else ""
-    facts.insert(0, ("samples", f"{count}{rate}"))
-    if abs(recording.time[0]) > 1e5:  # the page shows the time from there
-        facts.insert(0, ("time 0 is", f"{np.floor(recording.time[0]):.0f} s"))
-    if recording.stopped:
-        facts.insert(0, ("stopped", recording.stopped))
+    # the page shows a late time from there
+    late_start = f"{np.floor(start):.0f} s" if abs(start) > 1e5 else ""
+    facts = [
+        ("stopped", recording.stopped),
+        ("time 0 is", late_start),
+        ("samples", f"{count}{rate}"),
+        ("controller", recording.controller),
+        *machine_facts,
+    ]
     if count > 1:
         facts.insert(0, ("duration", f"{summary.duration:.4g} s"))
-        delivered_work, returned_work = mechanical_work(recording)
-        text = f"{_format_quantity(delivered_work, 'J')} delivered"
-        if returned_work > 1e-3 * delivered_work:
-            text += f", {_format_quantity(returned_work, 'J')} returned"
-        facts.append(("work of the actuators", text))
-    channels = recording.channels
-    for name, text in (("dissipated", "friction losses"), ("pump_work", "work of the pump")):
-        if count < 2 or recording.channel_units.get(name) != "J":
-            continue
-        change = float(channels[name][-1] - channels[name][0])
-        if _format_number(change) != "0":
-            facts.append((text, _format_quantity(change, "J")))
-    if count > 1 and summary.balance_text:
-        facts.append(("maximum energy imbalance", summary.balance_text.replace("-", "\u2212")))
+        facts += [
+            ("work of the actuators", _work_text(recording)),
+            ("friction losses", _energy_change_text(recording, "dissipated")),
+            ("work of the pump", _energy_change_text(recording, "pump_work")),
+            ("maximum energy imbalance", summary.balance_text.replace("-", "\u2212")),
+        ]
     if summary.tip_rms_error is not None and summary.tip_peak_error is not None:
         peak, rms = 1e3 * summary.tip_peak_error, 1e3 * summary.tip_rms_error
         facts.append(("tip to reference", f"{rms:.3g} mm RMS, {peak:.3g} mm peak"))
@@ -298,10 +281,29 @@ def summarize_run(machine: Machine, recording: Recording | None) -> dict[str, An
             )
         )
     return {
-        "facts": facts,
+        "facts": _without_empty(facts),
         "forces": forces,
         "limits": reached_limit_sentences(machine, recording),
     }
+
+
+def _without_empty(facts: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    return [fact for fact in facts if fact[1]]
+
+
+def _work_text(recording: Recording) -> str:
+    delivered, returned = mechanical_work(recording)
+    text = f"{_format_quantity(delivered, 'J')} delivered"
+    if returned > 1e-3 * delivered:
+        text += f", {_format_quantity(returned, 'J')} returned"
+    return text
+
+
+def _energy_change_text(recording: Recording, name: str) -> str:
+    if recording.channel_units.get(name) != "J":
+        return ""
+    change = float(recording.channels[name][-1] - recording.channels[name][0])
+    return "" if _format_number(change) == "0" else _format_quantity(change, "J")
 
 
 def mechanical_work(recording: Recording) -> tuple[float, float]:

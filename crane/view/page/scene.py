@@ -17,8 +17,8 @@ from crane.formats.visuals.urdf_shapes import (
     CylinderShape,
     MeshShape,
     SphereShape,
+    UrdfShapes,
     Visual,
-    read_shapes,
 )
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
@@ -90,10 +90,7 @@ def draw_surroundings(viewer: Any, lower: Array, upper: Array, ground_height: fl
     viewer["/Grid"].set_property("visible", False)
     viewer["/Axes"].set_property("visible", False)
     size = float(np.linalg.norm(upper - lower))
-    power_of_ten = 10.0 ** np.floor(np.log10(size / 12))
-    spacing = power_of_ten * min(
-        (1, 2, 5, 10), key=lambda step: abs(np.log(12 * step * power_of_ten / size))
-    )
+    spacing = round_up_to_nice(size / 12)
     count = int(np.ceil(size / spacing))
     end = count * spacing
     ticks = np.arange(-count, count + 1) * spacing
@@ -103,6 +100,14 @@ def draw_surroundings(viewer: Any, lower: Array, upper: Array, ground_height: fl
     points[:, :2] = np.concatenate([line_ends, line_ends[:, ::-1]]) + centre
     geometry = g.PointsGeometry(np.ascontiguousarray(points.T, dtype=np.float32))
     viewer.set_object(g.LineSegments(geometry, g.LineBasicMaterial(color=_GRID_COLOUR)))
+
+
+def round_up_to_nice(value: float) -> float:
+    """Round a positive value up to 1, 2 or 5 times a power of ten."""
+    power_of_ten = 10.0 ** np.floor(np.log10(value))
+    return float(
+        next(x for x in (1, 2, 5, 10) if x * power_of_ten >= value * (1 - 1e-9)) * power_of_ten
+    )
 
 
 _SAMPLED_FRAMES = 300  # frames that determine the size of the scene
@@ -170,15 +175,9 @@ def build_scene(
         configurations[sampled_rows],
         tuple(dict.fromkeys(visual.link for visual in visuals)),
     )
-    lower, upper = _scene_bounds(
-        visuals,
-        poses,
-        link_poses(
-            machine,
-            configurations[sampled_rows],
-            {link for item in machine.force_elements for link in item.between or ()},
-        ),
-    )
+    element_links = {link for item in machine.force_elements for link in item.between or ()}
+    ends = link_poses(machine, configurations[sampled_rows], element_links)
+    lower, upper = scene_bounds(visuals, poses, ends)
     floor_height = ground_height(machine, visuals)
     lower[2], upper[2] = min(lower[2], floor_height), max(upper[2], floor_height)
 
@@ -251,16 +250,22 @@ def _tip_heading(machine: Machine, q: Array, size: float) -> float:
     return float(np.arctan2(y, x)) if np.hypot(x, y) > 1e-3 * size else 0.0
 
 
-def _scene_bounds(
-    visuals: Sequence[Visual], poses: Mapping[str, Array], element_end_poses: Mapping[str, Array]
-) -> tuple[Array, Array]:
-    """Return the corners of the bounding box over all frames, ends of springs included."""
-    points = [pose[:, :3, 3] for pose in element_end_poses.values()]
+def shape_corners(visuals: Sequence[Visual], poses: Mapping[str, Array]) -> Array:
+    """Return the corners (k, 3) of boxes around all shapes, at poses (N, 4, 4) of their links."""
+    points = []
     for visual in visuals:
         pose, corners = poses[visual.link], visual.bounding_corners()
         world_corners = corners @ pose[:, :3, :3].transpose(0, 2, 1) + pose[:, None, :3, 3]
         points.append(world_corners.reshape(-1, 3))
-    all_points = np.concatenate(points)
+    return np.concatenate(points)
+
+
+def scene_bounds(
+    visuals: Sequence[Visual], poses: Mapping[str, Array], further_poses: Mapping[str, Array]
+) -> tuple[Array, Array]:
+    """Return the corners of the bounding box of shapes, and of origins of further links."""
+    origins = [pose[:, :3, 3] for pose in further_poses.values()]
+    all_points = np.concatenate([shape_corners(visuals, poses), *origins])
     lower, upper = all_points.min(axis=0), all_points.max(axis=0)
     return lower, np.maximum(
         upper, lower + (_MIN_SIDE_SHARE * float((upper - lower).max()) or _MIN_SIZE)
@@ -286,7 +291,7 @@ def read_visuals(machine: Machine) -> list[Visual]:
     box = BoxShape((0.15 * (distance or 1.0),) * 3)
     with open_robots(machine) as sources:
         for xml in sources:
-            drawn_visuals = read_shapes(xml, replacement=box)
+            drawn_visuals = UrdfShapes(xml, replacement=box)
             visuals += drawn_visuals.shapes["visual"]
             missing_meshes += drawn_visuals.missing_meshes
             problems += drawn_visuals.problems

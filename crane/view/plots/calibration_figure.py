@@ -20,12 +20,15 @@ from crane.view.plots.figure_style import (
     INK_COLOUR,
     RECORDED_COLOUR,
     add_heading,
+    add_residual_legend,
+    create_residual_panels,
+    create_time_panels,
     envelope,
     escape_label,
     figure_style,
 )
 
-HELD_OUT_COLOUR = "#f1efe8"
+_HELD_OUT_COLOUR = "#f1efe8"
 _MAX_PANELS = 18  # panels
 
 
@@ -33,21 +36,14 @@ _MAX_PANELS = 18  # panels
 def calibration_figure(calibration: Calibration) -> Figure:
     """Return a panel per channel; held-out instants have a darker background."""
     sensors = calibration.channels[:_MAX_PANELS]
-    columns = 2 if len(sensors) > 1 else 1
-    rows = -(-len(sensors) // columns)
-    figure = Figure(figsize=(5.6 * columns, 1.9 * rows + 0.8), layout="constrained")
+    figure, panels = create_time_panels(len(sensors), 2, 5.6, 0.8)
     has_several_recordings = len({sensor.recording for sensor in sensors}) > 1
-    for i, sensor in enumerate(sensors):
-        axes = figure.add_subplot(rows, columns, i + 1)
+    for axes, sensor in zip(panels, sensors, strict=True):
         unit = draw_channel(axes, sensor)
-        for start, end in mask_spans(sensor.time, np.logical_not(sensor.train_mask)):
-            axes.axvspan(start, end, color=HELD_OUT_COLOUR, zorder=-1)
+        _shade_held_out(axes, sensor)
         name = f"{sensor.recording}: {sensor.name}" if has_several_recordings else sensor.name
         axes.set_title(escape_label(f"{name} [{unit}]"), fontsize=8.5)
-        if i >= len(sensors) - columns:
-            axes.set_xlabel("time [s]")
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    figure.legend(handles=panels[0].get_lines(), loc="outside lower center", ncols=3)
     add_heading(figure, escape_label(result_title(calibration.machine.name, "calibration")))
     return figure
 
@@ -71,11 +67,18 @@ def draw_channel(axes: Axes, sensor: CalibrationChannel) -> str:
     return unit
 
 
-def mask_spans(time: "np.ndarray", mask: "np.ndarray") -> list[tuple[float, float]]:
-    """Return the intervals (start, end) in which a mask (N,) is true."""
-    edges = np.diff(np.concatenate([[0], mask.astype(int), [0]]))
-    starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
-    return [(float(time[a]), float(time[b])) for a, b in zip(starts, ends, strict=True)]
+def _shade_held_out(axes: Axes, channel: CalibrationChannel) -> None:
+    axes.fill_between(
+        channel.time,
+        0.0,
+        1.0,
+        where=(~channel.train_mask).tolist(),
+        step="mid",
+        transform=axes.get_xaxis_transform(),
+        color=_HELD_OUT_COLOUR,
+        linewidth=0,
+        zorder=-1,
+    )
 
 
 _MAX_DOTS = 4000  # of a picture
@@ -85,23 +88,15 @@ _DIRECTION_LABELS = {-1: "back", 0: "rest", 1: "out"}
 
 def channel_residual_figure(channel: CalibrationChannel, name: str) -> Figure:
     """Return a channel over time, measured, before and fitted, with the residual below."""
-    figure = Figure(figsize=(5.8, 3.3))
-    grid = {"height_ratios": (2.2, 1), "left": 0.14, "right": 0.985, "top": 0.9, "bottom": 0.13}
-    upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={**grid, "hspace": 0.12})
-    unit = draw_channel(upper, channel)
     residual = channel.simulated_after - channel.measured
     residual_unit, scale = display_unit(channel.unit, float(np.abs(residual).max()))
+    figure, upper, lower = create_residual_panels(escape_label(name), "", residual_unit)
+    upper.set_ylabel(f"[{draw_channel(upper, channel)}]")
     lower.plot(*envelope(channel.time, scale * residual), color=RECORDED_COLOUR, linewidth=0.7)
     lower.axhline(0.0, color=INK_COLOUR, linewidth=0.6)
     for axes in (upper, lower):
-        for start, end in mask_spans(channel.time, np.logical_not(channel.train_mask)):
-            axes.axvspan(start, end, color=HELD_OUT_COLOUR, zorder=-1)
-        axes.yaxis.set_label_coords(-0.125, 0.5)
-    upper.set_ylabel(f"[{unit}]")
-    lower.set(ylabel=f"residual [{residual_unit}]", xlabel="time [s]")
-    upper.margins(x=0.0)
-    upper.set_title(escape_label(name), loc="left", fontsize=8.5)
-    upper.legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=3, borderpad=0, fontsize=8)
+        _shade_held_out(axes, channel)
+    add_residual_legend(upper, 3)
     return figure
 
 
@@ -172,6 +167,7 @@ _MAX_COLUMNS = 3
 _MAX_POINTS = 4000  # instants that a line needs
 
 
+@figure_style
 def comparison_figure(comparison: Comparison) -> Figure:
     """Return the figure of a comparison, a panel per channel.
 
@@ -180,14 +176,10 @@ def comparison_figure(comparison: Comparison) -> Figure:
     """
     if not comparison.channels:
         raise InputError("the file has no channel that the simulation has too")
-    count = len(comparison.channels)
-    column_count = min(_MAX_COLUMNS, count)
-    rows = -(-count // column_count)
-    figure = Figure(figsize=(3.4 * column_count, 1.9 * rows + 0.4), layout="constrained")
-    panels = figure.subplots(rows, column_count, sharex=True, squeeze=False).ravel()
+    figure, panels = create_time_panels(len(comparison.channels), _MAX_COLUMNS, 3.4, 0.4)
     stride = -(-len(comparison.time) // _MAX_POINTS)
     time = comparison.time[::stride]
-    for axes, channel in zip(panels, comparison.channels, strict=False):
+    for axes, channel in zip(panels, comparison.channels, strict=True):
         unit, scale = display_unit(
             channel.unit,
             max(float(np.abs(x).max()) for x in (channel.measured, channel.simulated)),
@@ -200,10 +192,5 @@ def comparison_figure(comparison: Comparison) -> Figure:
         error_text = f"RMS {scale * channel.rms:.3g} {unit}, {100 * channel.relative_rms:.3g} %"
         axes.set_title(escape_label(f"{channel.name}{label}\n{error_text}"), fontsize=8)
         axes.margins(x=0.0)
-    for axes in panels[count:]:
-        axes.set_visible(False)
-    for axes in panels[max(count - column_count, 0) : count]:
-        axes.tick_params(labelbottom=True)
-        axes.set_xlabel("time [s]")
     panels[0].legend(loc="best", fontsize=7)
     return figure

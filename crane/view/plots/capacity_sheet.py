@@ -3,9 +3,7 @@
 import textwrap
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
 from crane.ratings.capacity_report import (
     LoadTable,
@@ -35,7 +33,7 @@ _PAGE_WIDTH, _PAGE_HEIGHT, _PAGE_MARGIN = (
     0.45,
 )  # A4 landscape and margin [inch]
 _LINE_HEIGHT = 0.152  # between lines [inch]
-_TEXT_SIZE, _CELL_TEXT_SIZE = 7.5, 7.5  # sizes of letters [points]
+_TEXT_SIZE = 7.5  # size of letters [points]
 _FACTS_WIDTH = 3.5  # width of the facts beside the charts [inch]
 _HEADING_HEIGHT = 0.35  # height of the heading [inch]
 
@@ -56,8 +54,8 @@ def capacity_sheet_figure(chart: Capacity) -> Figure:
     )
     _write_text(figure, _PAGE_MARGIN, _PAGE_MARGIN, table_note(chart, table), colour="#555555")
     table_top = _draw_table(figure, chart, table, _PAGE_MARGIN + 1.6 * _LINE_HEIGHT)
-    charts_right = _draw_charts(figure, chart, table_top + 0.2, top - _HEADING_HEIGHT)
-    _draw_facts(figure, chart, charts_right, top - _HEADING_HEIGHT)
+    _draw_charts(figure, chart, table_top + 0.2, top - _HEADING_HEIGHT)
+    _draw_facts(figure, chart, top - _HEADING_HEIGHT)
     return figure
 
 
@@ -75,39 +73,37 @@ def _write_text(
     figure.text(x, y, escape_text(text), fontsize=size, color=colour, **options)
 
 
-def _draw_charts(figure: Figure, chart: Capacity, bottom: float, top: float) -> float:
-    """Draw one panel per slew angle, and return the right end of the panels [inch]."""
+def _draw_charts(figure: Figure, chart: Capacity, bottom: float, top: float) -> None:
+    """Draw one panel per slew angle, in as many lines as make them largest."""
     lower, upper = drawing_extent(chart)
-    panel_count, available_width = len(chart.slews), _PAGE_WIDTH - 2 * _PAGE_MARGIN - _FACTS_WIDTH
+    count, width = len(chart.slews), _PAGE_WIDTH - 2 * _PAGE_MARGIN - _FACTS_WIDTH
     aspect = (upper - lower)[1] / (upper - lower)[0]
 
     def panel_width(lines: int) -> float:
-        columns = -(-panel_count // lines)
         return float(
-            min(available_width / columns - 0.55, ((top - bottom) / lines - 0.6) / aspect)
+            min(width / -(-count // lines) - 0.55, ((top - bottom) / lines - 0.6) / aspect)
         )
 
-    lines = max(range(1, panel_count + 1), key=panel_width)
-    columns, best_width = -(-panel_count // lines), panel_width(lines)
-    for k in range(panel_count):
-        row, column = divmod(k, columns)
-        axes = figure.add_axes(
-            (
-                (_PAGE_MARGIN + 0.5 + column * (best_width + 0.55)) / _PAGE_WIDTH,
-                (top - 0.2 - row * (top - bottom) / lines - best_width * aspect) / _PAGE_HEIGHT,
-                best_width / _PAGE_WIDTH,
-                best_width * aspect / _PAGE_HEIGHT,
-            )
-        )
+    lines = max(range(1, count + 1), key=panel_width)
+    grid = figure.add_gridspec(
+        lines,
+        -(-count // lines),
+        left=(_PAGE_MARGIN + 0.5) / _PAGE_WIDTH,
+        right=(_PAGE_MARGIN + width) / _PAGE_WIDTH,
+        bottom=(bottom + 0.4) / _PAGE_HEIGHT,
+        top=(top - 0.2) / _PAGE_HEIGHT,
+        hspace=0.25,
+    )
+    for k in range(count):
+        axes = figure.add_subplot(grid[k], anchor="NW")
         draw_capacity_panel(axes, chart, k)
-        if column:
+        if k % grid.ncols:
             axes.set_ylabel("")
-    return _PAGE_MARGIN + columns * (best_width + 0.55)
 
 
-def _draw_facts(figure: Figure, chart: Capacity, left: float, top: float) -> None:
+def _draw_facts(figure: Figure, chart: Capacity, top: float) -> None:
     """Write conditions and limiting factors, in the colours of the charts."""
-    left, y = left + 0.2, top - 0.1
+    left, y = _PAGE_WIDTH - _PAGE_MARGIN - _FACTS_WIDTH + 0.2, top - 0.1
     line_length = int((_FACTS_WIDTH - 0.2) * 72 / (0.56 * _TEXT_SIZE))
     for name, text in capacity_facts(chart):
         for i, line in enumerate(textwrap.wrap(f"{name}: {text}", line_length)):
@@ -135,64 +131,36 @@ def _draw_table(figure: Figure, chart: Capacity, table: LoadTable, bottom: float
         Top of the table [inch].
     """
     rows, names = table.format_rows(), slew_labels(chart)
-    slew_count = len(names)
-    first_column, available_width = _PAGE_MARGIN + 0.6, _PAGE_WIDTH - 2 * _PAGE_MARGIN - 0.6
-    width = min(available_width / len(rows[0]), 0.75)
-    size = min(_CELL_TEXT_SIZE, 72 * width / 4.6)
-    right_edges = (
-        first_column + width * (1 + np.arange(len(rows[0]))) - 0.08
-    )  # right ends of columns
-    for i, (height, row) in enumerate(zip(table.heights, rows, strict=True)):
-        y = bottom + _LINE_HEIGHT * (len(rows) - 1 - i)
-        if i % 2 == 0:
-            figure.add_artist(
-                Rectangle(
-                    (_PAGE_MARGIN / _PAGE_WIDTH, (y - 0.045) / _PAGE_HEIGHT),
-                    (first_column + width * len(row) - _PAGE_MARGIN) / _PAGE_WIDTH,
-                    _LINE_HEIGHT / _PAGE_HEIGHT,
-                    facecolor=FAINT_COLOUR,
-                    alpha=0.45,
-                    transform=figure.transFigure,
-                    linewidth=0,
-                    zorder=-1,
-                )
-            )
-        _write_text(
-            figure,
-            _PAGE_MARGIN + 0.5,
-            y,
-            f"{height:g} m",
-            size=size,
-            ha="right",
-            fontweight="bold",
+    headings = [*(f"{radius:g} m" for radius in table.radii), "farthest"]
+    labels = [f"{heading}\n{name}".strip() for heading in headings for name in names]
+    count = len(rows[0])
+    column_width = min((_PAGE_WIDTH - 2 * _PAGE_MARGIN - 0.6) / count, 0.75)
+    width, height = 0.6 + column_width * count, _LINE_HEIGHT * (len(rows) + 2)
+    axes = figure.add_axes(
+        (
+            _PAGE_MARGIN / _PAGE_WIDTH,
+            bottom / _PAGE_HEIGHT,
+            width / _PAGE_WIDTH,
+            height / _PAGE_HEIGHT,
         )
-        for x, cell in zip(right_edges, row, strict=True):
-            _write_text(figure, x, y, cell, size=size, ha="right")
-    y = bottom + _LINE_HEIGHT * len(rows)
-    if any(names):
-        for j in range(len(rows[0]) - 1):
-            _write_text(
-                figure,
-                right_edges[j],
-                y,
-                names[j % slew_count],
-                size=size,
-                ha="right",
-                colour="#555555",
-            )
-        y += _LINE_HEIGHT
-    for j, heading_text in enumerate([f"{radius:g} m" for radius in table.radii] + ["farthest"]):
-        middle = right_edges[slew_count * j : slew_count * (j + 1)].mean() - (
-            width / 2 - 0.08 if slew_count > 1 else 0.0
-        )
-        _write_text(
-            figure,
-            middle,
-            y,
-            heading_text,
-            size=size,
-            ha="center" if slew_count > 1 else "right",
-            fontweight="bold",
-        )
-    _write_text(figure, right_edges[-1], y, "at [m]", size=size, ha="right", fontweight="bold")
-    return y + _LINE_HEIGHT
+    )
+    axes.axis("off")
+    cells = axes.table(
+        cellText=[[f"{x:g} m", *row] for x, row in zip(table.heights, rows, strict=True)],
+        colLabels=["", *labels, "at [m]"],
+        cellLoc="right",
+        colLoc="right",
+        colWidths=[0.6 / width, *[column_width / width] * count],
+        bbox=(0.0, 0.0, 1.0, 1.0),  # type: ignore[arg-type]
+        edges="horizontal",
+    )
+    cells.auto_set_font_size(False)
+    cells.set_fontsize(min(_TEXT_SIZE, 72 * column_width / 4.6))
+    for (row, column), cell in cells.get_celld().items():
+        cell.set(edgecolor=FAINT_COLOUR, linewidth=0.5)
+        cell.PAD = 0.04
+        if row == 0:
+            cell.set_height(2 * cell.get_height())
+        if 0 in (row, column):
+            cell.set_text_props(fontweight="bold")
+    return bottom + height

@@ -28,6 +28,10 @@ FIGURE_FORMATS: dict[str, dict[str, None] | None] = {  # metadata without dates
 }
 DASHED_STYLE: Any = {"color": "#e0701a", "linestyle": (0, (4, 2)), "linewidth": 1.1}
 RECORDED_COLOUR, INK_COLOUR, FAINT_COLOUR = "#1f5fa8", "#333333", "#d4d4d4"
+CURVE_COLOURS = (
+    "#1f5fa8", "#e0701a", "#2a8c4a", "#8a5fb0", "#d9b53f", "#b04a7a", "#3f8f9f", "#9a6b3f",
+    "#7a7a7a", "#6f9bca", "#c2452d", "#333333",
+)  # fmt: skip
 FIGURE_STYLE: Any = {
     "font.family": "DejaVu Sans",
     "font.size": 8.5,
@@ -81,15 +85,50 @@ def escape_text(text: str) -> str:
 
 
 def joint_symbol(name: str) -> str:
-    """Return a joint's name as a label; q1 is set as q with index 1."""
-    if match := re.fullmatch(r"([A-Za-z])(\d+)", name):
-        return f"${match[1]}_{{{match[2]}}}$"
+    """Return a joint's name as a label: q1 as q with index 1, X_lift as X with index lift."""
+    if match := re.fullmatch(r"([A-Za-z])(\d+|_[A-Za-z]+)", name):
+        return f"${match[1]}_{{\\mathrm{{{match[2].removeprefix('_')}}}}}$"
     return escape_label(name)
 
 
 def add_heading(figure: Figure, text: str) -> None:
     """Add a bold heading at the upper left."""
     figure.suptitle(text, x=0.01, ha="left", fontsize=11, fontweight="bold")
+
+
+def create_time_panels(
+    count: int, max_columns: int, width: float, extra_height: float
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure of panels over time, the lowest ones with their label; sizes in inches."""
+    columns = max(min(count, max_columns), 1)
+    rows = max(-(-count // columns), 1)
+    size = (width * columns, 1.9 * rows + extra_height)
+    figure = Figure(figsize=size, layout="constrained")
+    panels = [figure.add_subplot(rows, columns, k + 1) for k in range(count)]
+    for axes in panels[-columns:]:
+        axes.set_xlabel("time [s]")
+    return figure, panels
+
+
+def create_residual_panels(title: str, unit: str, residual_unit: str) -> tuple[Figure, Axes, Axes]:
+    """Return a figure of a quantity over time, with a lower panel for its residual."""
+    figure = Figure(figsize=(5.8, 3.3))
+    grid = {"height_ratios": (2, 1), "left": 0.14, "right": 0.985, "top": 0.9, "bottom": 0.13}
+    upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={**grid, "hspace": 0.12})
+    upper.set_ylabel(unit)
+    upper.set_title(title, loc="left", fontsize=8.5)
+    upper.margins(x=0.0)
+    lower.set(ylabel=f"residual [{residual_unit}]", xlabel="time [s]")
+    for axes in (upper, lower):
+        axes.yaxis.set_label_coords(-0.125, 0.5)
+    return figure, upper, lower
+
+
+def add_residual_legend(axes: Axes, columns: int) -> None:
+    """Add the legend of `create_residual_panels` above its upper panel."""
+    axes.legend(
+        loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=columns, borderpad=0, fontsize=8
+    )
 
 
 def set_round_ticks(axes: Axes, count: int) -> None:

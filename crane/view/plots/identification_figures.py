@@ -23,6 +23,8 @@ from crane.view.plots.figure_style import (
     FAINT_COLOUR,
     INK_COLOUR,
     RECORDED_COLOUR,
+    add_residual_legend,
+    create_residual_panels,
     envelope,
     escape_label,
     figure_style,
@@ -35,9 +37,7 @@ def force_time_figure(
     comparison: ForceComparison, drive_index: int, unit: str, name: str
 ) -> Figure:
     """Return measured and modelled force of a drive over time, with the residual below."""
-    figure = Figure(figsize=(5.8, 3.3))
-    grid = {"height_ratios": (2, 1), "left": 0.14, "right": 0.985, "top": 0.9, "bottom": 0.13}
-    upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={**grid, "hspace": 0.12})
+    figure, upper, lower = create_residual_panels(name, f"force [{unit}]", unit)
     moving_mask = np.where(comparison.is_moving[:, drive_index], 1.0, np.nan)
     upper.plot(
         *envelope(comparison.time, comparison.measured[:, drive_index]),
@@ -51,19 +51,13 @@ def force_time_figure(
         **{**DASHED_STYLE, "linewidth": 0.9},
         label="model",
     )
-    upper.set_ylabel(f"force [{unit}]")
-    upper.set_title(name, loc="left", fontsize=8.5)
-    upper.legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=2, borderpad=0, fontsize=8)
+    add_residual_legend(upper, 2)
     lower.plot(
         comparison.time,
         comparison.residuals[:, drive_index] * moving_mask,
         color=INK_COLOUR,
         linewidth=0.7,
     )
-    lower.set(ylabel=f"residual [{unit}]", xlabel="time [s]")
-    upper.margins(x=0.0)
-    for axes in (upper, lower):
-        axes.yaxis.set_label_coords(-0.125, 0.5)
     return figure
 
 
@@ -184,8 +178,7 @@ def equation_sides_figure(runs: Mapping[str, EquationSides], unit: str = "m") ->
         axes.set_title(f"{title}: {error}", loc="left", fontsize=9)
         axes.margins(x=0.0)
     rows[-1].set_xlabel("time [s]")
-    handles, labels = rows[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", ncols=3)
+    figure.legend(handles=rows[0].get_lines(), loc="outside upper right", ncols=3)
     return figure
 
 
@@ -249,34 +242,30 @@ def draw_friction(axes: Axes, friction: CylinderFriction, unit: str = "m") -> No
 _MAX_POINTS = 2000  # instants that a line needs
 
 
+_MotionRow = tuple[str, Sequence[Array], Sequence[float]]  # label, lines (N,), limits
+
+
 @figure_style
 def excitation_figure(excitation: Excitation) -> Figure:
     """Return the figure of a trajectory; limits are dashed, lead times shaded."""
     machine, reference, bounds = excitation.machine, excitation.trajectory, excitation.limits
     time, q, v, _, tau = (x[:: -(-len(x) // _MAX_POINTS)] for x in excitation.motion())
-    figure, grid = _create_grid(2.4, len(machine.active))
+    columns: dict[str, list[_MotionRow]] = {}
     for i, joint in enumerate(machine.active):
         unit, scale = DISPLAY_UNITS[machine.unit(joint)]
-        force_unit, middle = FORCE_UNITS[machine.unit(joint)], bounds.stroke_middle[i]
         rows = (
-            ("stroke", unit, scale, q, middle, bounds.half_stroke[i]),
-            ("velocity", f"{unit}/s", scale, v, 0.0, bounds.velocity[i]),
-            ("force", force_unit, 1.0, tau, 0.0, bounds.force[i]),
+            (f"stroke [{unit}]", scale, q, bounds.stroke_middle[i], bounds.half_stroke[i]),
+            (f"velocity [{unit}/s]", scale, v, 0.0, bounds.velocity[i]),
+            (f"force [{FORCE_UNITS[machine.unit(joint)]}]", 1.0, tau, 0.0, bounds.force[i]),
         )
-        for axes, (name, label, factor, values, centre, limit) in zip(
-            grid[:, i], rows, strict=True
-        ):
-            lines = [(factor * values[:, i], RECORDED_COLOUR)]
-            limits = [factor * (centre - limit), factor * (centre + limit)]
-            _draw_lines(axes, time, lines, limits, f"{name} [{label}]")
-            axes.axvspan(0, reference.lead, color=FAINT_COLOUR, alpha=0.5)
-            axes.axvspan(
-                reference.duration - reference.lead,
-                reference.duration,
-                color=FAINT_COLOUR,
-                alpha=0.5,
-            )
-        grid[0, i].set_title(escape_label(joint))
+        columns[joint] = [
+            (label, [factor * x[:, i]], (factor * (centre - limit), factor * (centre + limit)))
+            for label, factor, x, centre, limit in rows
+        ]
+    figure = _motion_figure(time, columns, 2.4)
+    for axes in figure.axes:
+        for start in (0, reference.duration - reference.lead):
+            axes.axvspan(start, start + reference.lead, color=FAINT_COLOUR, alpha=0.5)
     return figure
 
 
@@ -285,45 +274,34 @@ def signals_figure(excitation: SignalExcitation) -> Figure:
     """Return the figure of valve signals: signal, stroke with dashed limits, pressures."""
     run, machine = excitation.run.columns(), excitation.machine
     bar, per_bar = display_unit("Pa", 1e5)
-    figure, grid = _create_grid(3.0, len(excitation.signals))
-    for i, joint in enumerate(excitation.signals):
+    columns: dict[str, list[_MotionRow]] = {}
+    for joint in excitation.signals:
         unit, scale = DISPLAY_UNITS[machine.unit(joint)]
         index = machine.active.index(joint)
         limits = scale * machine.lower[index], scale * machine.upper[index]
-        rows = (
-            ("signal [V]", 1.0, [f"voltage_{joint}"], ()),
-            (f"stroke [{unit}]", scale, [joint], limits),
-            (f"pressures A, B [{bar}]", per_bar, [f"pressure_{joint}_{x}" for x in "ab"], ()),
-        )
-        for axes, (label, factor, names, dashed) in zip(grid[:, i], rows, strict=True):
-            colours = zip(names, (RECORDED_COLOUR, "#2a8c4a"), strict=False)
-            lines = [(factor * run[name], colour) for name, colour in colours]
-            _draw_lines(axes, excitation.run.time, lines, dashed, label)
-        grid[0, i].set_title(escape_label(joint))
+        pressures = [per_bar * run[f"pressure_{joint}_{side}"] for side in "ab"]
+        columns[joint] = [
+            ("signal [V]", [run[f"voltage_{joint}"]], ()),
+            (f"stroke [{unit}]", [scale * run[joint]], limits),
+            (f"pressures A, B [{bar}]", pressures, ()),
+        ]
+    return _motion_figure(excitation.run.time, columns, 3.0)
+
+
+def _motion_figure(
+    time: Array, columns: Mapping[str, Sequence[_MotionRow]], panel_width: float
+) -> Figure:
+    """Return a figure with a column per joint, whose rows have finite limits dashed."""
+    figure = Figure(figsize=(panel_width * len(columns) + 0.6, 6.0), layout="constrained")
+    grid = figure.subplots(3, len(columns), sharex=True, squeeze=False)
+    for panels, (joint, rows) in zip(grid.T, columns.items(), strict=True):
+        panels[0].set_title(escape_label(joint))
+        panels[-1].set_xlabel("time [s]")
+        for axes, (label, lines, limits) in zip(panels, rows, strict=True):
+            for values, colour in zip(lines, (RECORDED_COLOUR, "#2a8c4a"), strict=False):
+                axes.plot(time, values, color=colour)
+            for limit in filter(np.isfinite, limits):
+                axes.axhline(limit, **DASHED_STYLE)
+            axes.set_ylabel(label)
+            axes.margins(x=0.0)
     return figure
-
-
-def _create_grid(panel_width: float, columns: int) -> tuple[Figure, Any]:
-    """Return a figure with three rows of panels over time."""
-    figure = Figure(figsize=(panel_width * columns + 0.6, 6.0), layout="constrained")
-    grid = figure.subplots(3, columns, sharex=True, squeeze=False)
-    for axes in grid[-1]:
-        axes.set_xlabel("time [s]")
-    return figure, grid
-
-
-def _draw_lines(
-    axes: Axes,
-    time: Array,
-    lines: Sequence[tuple[Array, str]],
-    limits: Sequence[float],
-    label: str,
-) -> None:
-    """Draw lines (N,) in their colours, and finite limits dashed."""
-    for values, colour in lines:
-        axes.plot(time, values, color=colour)
-    for limit in limits:
-        if np.isfinite(limit):
-            axes.axhline(limit, **DASHED_STYLE)
-    axes.set_ylabel(label)
-    axes.margins(x=0.0)

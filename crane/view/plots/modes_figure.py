@@ -15,23 +15,15 @@ from crane.recordings.recording_summary import DISPLAY_UNITS, result_title
 from crane.simulation.linear.linear_model import LinearModel, Mode
 from crane.simulation.sensitivity.motion_sensitivities import ZERO_TOLERANCE, Sensitivities
 from crane.view.plots.figure_style import (
+    CURVE_COLOURS,
     INK_COLOUR,
     RECORDED_COLOUR,
     add_heading,
+    create_time_panels,
     escape_label,
     figure_style,
 )
 
-_CURVE_COLOURS = (
-    "#1f5fa8",
-    "#e0701a",
-    "#2a8c4a",
-    "#8a5fb0",
-    "#c2452d",
-    "#7f7f3f",
-    "#3f8f9f",
-    "#909090",
-)
 _FREQUENCY_COUNT = 600  # frequencies of a response
 _MAX_INPUT_PANELS = 6  # panels of inputs
 _MIN_MODAL_ASSURANCE = 0.2  # modal assurance of a mode that goes on
@@ -71,7 +63,7 @@ def parameter_modes_figure(models: Sequence[tuple[dict[str, float], LinearModel]
     figure = Figure(figsize=(6.4, 5.6), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
     for color, (family_values, family) in zip(
-        itertools.cycle(_CURVE_COLOURS), families.items(), strict=False
+        itertools.cycle(CURVE_COLOURS), families.items(), strict=False
     ):
         label_text = ", ".join(
             f"{name} {value:g}" for name, value in zip(names[1:], family_values, strict=True)
@@ -194,7 +186,7 @@ def _draw_response(
     axes: Axes, model: LinearModel, frequencies: Array, response: Array, input_index: int
 ) -> None:
     position_outputs = _position_outputs(model)
-    for color, i in zip(itertools.cycle(_CURVE_COLOURS), position_outputs, strict=False):
+    for color, i in zip(itertools.cycle(CURVE_COLOURS), position_outputs, strict=False):
         joint = model.outputs[i]
         unit, factor = DISPLAY_UNITS[model.machine.unit(joint)]
         if response[:, i].max() > _MIN_RESPONSE_SHARE * response[:, position_outputs].max():
@@ -223,11 +215,8 @@ def sensitivities_figure(sensitivities: Sensitivities) -> Figure:
         if scale * largest > ZERO_TOLERANCE:
             panels.append((output, unit, scale * effects[:, k]))
     panels = panels[:_MAX_PANELS]
-    columns = 2 if len(panels) > 1 else 1
-    rows = max(1, -(-len(panels) // columns))
-    figure = Figure(figsize=(5.6 * columns, 1.9 * rows + 0.9), layout="constrained")
-    for k, (output, unit, values) in enumerate(panels):
-        axes = figure.add_subplot(rows, columns, k + 1)
+    figure, all_axes = create_time_panels(len(panels), 2, 5.6, 0.9)
+    for axes, (output, unit, values) in zip(all_axes, panels, strict=True):
         for i, name in enumerate(sensitivities.parameters):
             axes.plot(
                 sensitivities.recording.time,
@@ -236,11 +225,8 @@ def sensitivities_figure(sensitivities: Sensitivities) -> Figure:
                 label=escape_label(f"{name} + {sensitivities.typical_changes[i]:.3g}"),
             )
         axes.set_title(escape_label(f"{output} [{unit}]"), fontsize=8.5)
-        if k >= len(panels) - columns:
-            axes.set_xlabel("time [s]")
     if panels:
-        handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=3)
+        figure.legend(handles=all_axes[0].get_lines(), loc="outside lower center", ncols=3)
     add_heading(
         figure,
         escape_label(

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,23 +20,19 @@ from crane.studies.power_balance_result import (
     part_kind,
     part_owner,
 )
-from crane.view.plots.figure_style import INK_COLOUR, add_heading, escape_label, figure_style
+from crane.view.plots.figure_style import (
+    CURVE_COLOURS,
+    INK_COLOUR,
+    add_heading,
+    escape_label,
+    figure_style,
+)
 
 _CLASS_PALETTE = (
     "#2a8c4a", "#9a6b3f", "#1f5fa8", "#6f9bca", "#e0701a", "#b04a7a", "#7a7a7a", "#8a5fb0",
     "#d9b53f",
 )  # fmt: skip
 CLASS_COLOURS: Mapping[str, str] = dict(zip(POWER_CLASSES, _CLASS_PALETTE, strict=True))
-_OWNER_COLOURS = (
-    "#1f5fa8",
-    "#e0701a",
-    "#2a8c4a",
-    "#8a5fb0",
-    "#d9b53f",
-    "#b04a7a",
-    "#3f8f9f",
-    "#9a6b3f",
-)
 _MAX_POINTS = 1500  # points of a stack
 
 
@@ -56,9 +53,7 @@ def power_figure(balance: PowerBalance) -> Figure:
         by_class[part_class(balance, name)] += power
     unit, scale = display_unit("W", float(np.abs(balance.shaft_power).max()))
     order = [*balance.joints, *(x for x in by_owner if x not in balance.joints)]
-    colors = dict(
-        zip(order, _OWNER_COLOURS * (1 + len(order) // len(_OWNER_COLOURS)), strict=False)
-    )
+    colors = dict(zip(order, itertools.cycle(CURVE_COLOURS), strict=False))
     figure = Figure(figsize=(8.6, 6.4), layout="constrained")
     upper_axes, lower_axes = figure.subplots(2, 1, sharex=True)
     _draw_stack(upper_axes, balance, by_class, CLASS_COLOURS, scale)
@@ -85,25 +80,20 @@ def _draw_stack(
 ) -> None:
     """Stack layers (N,) upwards where positive, downwards where negative."""
     time, shaft = _block_means(balance.time), scale * _block_means(balance.shaft_power)
-    positive_sum, negative_sum = np.zeros_like(time), np.zeros_like(time)
     min_power = 1e-3 * max(float(np.abs(balance.shaft_power).max()), 1e-9)
-    for name, power in layers.items():
-        if np.abs(power).max() < min_power:
-            continue
-        values, color = scale * _block_means(power), colors[name]
-        upper_edge, lower_edge = (
-            positive_sum + np.maximum(values, 0.0),
-            negative_sum + np.minimum(values, 0.0),
-        )
-        axes.fill_between(
-            time, positive_sum, upper_edge, color=color, linewidth=0, label=escape_label(name)
-        )
-        axes.fill_between(time, negative_sum, lower_edge, color=color, linewidth=0)
-        positive_sum, negative_sum = upper_edge, lower_edge
+    shown = [name for name, power in layers.items() if np.abs(power).max() >= min_power]
+    values = scale * np.array([_block_means(layers[name]) for name in shown])
+    values = values.reshape(-1, len(time))
+    style: Any = {"colors": [colors[name] for name in shown], "linewidth": 0}
+    positive, negative = np.maximum(values, 0.0), np.minimum(values, 0.0)
+    axes.stackplot(time, positive, labels=[escape_label(name) for name in shown], **style)
+    axes.stackplot(time, negative, **style)
     axes.plot(time, shaft, color=INK_COLOUR, linewidth=1.1, label="shafts")
     axes.axhline(0.0, color=INK_COLOUR, linewidth=0.6)
     axes.margins(x=0.0)
-    axes.set_ylim(-_axis_end(-negative_sum, -shaft), _axis_end(positive_sum, shaft))
+    axes.set_ylim(
+        -_axis_end(-negative.sum(axis=0), -shaft), _axis_end(positive.sum(axis=0), shaft)
+    )
 
 
 def _axis_end(stack_edge: Array, shaft: Array) -> float:
@@ -120,16 +110,6 @@ def _block_means(values: Array) -> Array:
     )
 
 
-_RUN_COLOURS = (
-    "#1f5fa8",
-    "#e0701a",
-    "#2a8c4a",
-    "#8a5fb0",
-    "#b04a7a",
-    "#3f8f9f",
-    "#9a6b3f",
-    "#7a7a7a",
-)
 _BAR_HEIGHT, _GROUP_GAP = 0.14, 0.12  # of a bar, between groups of them [inch]
 _MIN_BAR_SHARE = 1e-3  # share of the largest run's energy that has a bar
 
@@ -153,7 +133,7 @@ def power_comparison_figure(comparison: PowerComparison) -> Figure:
     time_axes, bar_axes = figure.subplots(2, 1, height_ratios=(2.4, bars_height))
     peaks = [float(np.abs(balance.shaft_power).max()) for balance in comparison.balances.values()]
     power_unit, power_scale = display_unit("W", max(peaks))
-    for i, (run, color) in enumerate(zip(runs, itertools.cycle(_RUN_COLOURS), strict=False)):
+    for i, (run, color) in enumerate(zip(runs, itertools.cycle(CURVE_COLOURS), strict=False)):
         time, power = comparison.shaft_power_over_time(run)
         label = (
             f"{run}: {format_number(scale * totals[run])} {unit} in {format_number(time[-1])} s"

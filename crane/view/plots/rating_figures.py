@@ -1,7 +1,7 @@
 """Figures of load charts and tool forces over radius and height, by limiting factor."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,6 @@ from matplotlib.colors import ListedColormap
 from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from matplotlib.patches import Patch as Swatch
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
@@ -19,6 +18,7 @@ from crane.common.samples import Array
 from crane.common.units import display_unit
 from crane.ratings.capacity_report import slew_labels
 from crane.ratings.lifting_capacity import Capacity
+from crane.ratings.rating_chart import RatingChart
 from crane.ratings.tool_forces import ToolForce
 from crane.recordings.recording_summary import result_title
 from crane.view.plots.figure_style import (
@@ -37,12 +37,7 @@ FACTOR_COLOURS = (
 )  # fmt: skip
 _UNLIMITED_COLOUR = "#eeeeee"  # where nothing ends a load
 BODY_COLOUR, ROD_COLOUR = "#4a4f57", "#8b929b"
-_LABEL_SIZE, _LETTER_WIDTH, _MIN_LABEL_DISTANCE = (
-    7,
-    0.62,
-    1.5,
-)  # of labels: points, width, distance by that
-_LABEL_POSITIONS = (0.5, 0.35, 0.65, 0.2, 0.8, 0.1, 0.9)  # shares of a line
+_LABEL_SIZE = 7  # of contours [points]
 _ROOM = 0.1  # above and below panels [inch]
 _DENSE = 8  # parts of a contour within a cell, to end it where the cells do
 _MAX_CONTOURS, _CONTOUR_QUANTILES = (
@@ -80,24 +75,56 @@ def capacity_figure(chart: Capacity) -> Figure:
     return figure
 
 
+def _draw_factors(axes: Axes, chart: RatingChart, k: int) -> None:
+    """Draw the limiting factors at slew angle k."""
+    active_factors = list(chart.active_factors)
+    index = np.full(chart.values.shape[1:], np.nan)
+    for i, cause in enumerate(active_factors):
+        index[chart.limiting_factor_index[k] == cause] = i
+    index[np.isinf(chart.values[k])] = len(active_factors)
+    tints = [*factor_colours(chart).values(), _UNLIMITED_COLOUR]
+    if min(index.shape) > 1:
+        axes.pcolormesh(
+            chart.radii,
+            chart.heights,
+            np.ma.masked_invalid(index),
+            cmap=ListedColormap(tints),
+            vmin=-0.5,
+            vmax=len(tints) - 0.5,
+            shading="nearest",
+            rasterized=True,
+            zorder=1,
+        )
+        return
+    b, a = np.nonzero(np.isfinite(index))
+    axes.scatter(
+        chart.radii[a],
+        chart.heights[b],
+        c=[tints[int(i)] for i in index[b, a]],
+        edgecolors=INK_COLOUR,
+        s=30,
+        zorder=3,
+    )
+
+
 def capacity_heading(chart: Capacity) -> str:
     """Return the heading of a load chart."""
     rule_text = "" if chart.rule.name == "none" else f" by {chart.rule.name}"
     return result_title(chart.machine.name, f"lifting capacity at {chart.frame}{rule_text}")
 
 
-def factor_colours(chart: Capacity) -> Mapping[int, str]:
+def factor_colours(chart: RatingChart) -> Mapping[int, str]:
     """Return the colour of each active limiting factor, by index."""
     return {k: FACTOR_COLOURS[i % len(FACTOR_COLOURS)] for i, k in enumerate(chart.active_factors)}
 
 
-def legend_patches(chart: Capacity) -> list[Patch]:
+def legend_patches(chart: RatingChart) -> list[Patch]:
     """Return the legend: limiting factors in their colours."""
     patches = [
         Patch(color=colour, label=escape_label(str(chart.limiting_factors[k])))
         for k, colour in factor_colours(chart).items()
     ]
-    if np.isinf(chart.loads).any():
+    if np.isinf(chart.values).any():
         patches.append(Patch(color=_UNLIMITED_COLOUR, label="no limit"))
     return patches
 
@@ -116,14 +143,8 @@ def home_outlines(chart: Capacity) -> list[MachineOutline]:
 def drawing_extent(chart: Capacity) -> tuple[Array, Array]:
     """Return the lower and upper corner (2,) of the drawing [m]."""
     b, a = np.nonzero(~np.isnan(chart.loads).all(axis=0))
-    points = [np.column_stack([chart.radii[a], chart.heights[b]])]
-    for home_outline in home_outlines(chart):
-        points += [
-            *home_outline.bodies,
-            home_outline.cylinders.reshape(-1, 2),
-            home_outline.stationary_hull,
-        ]
-    all_points = np.concatenate(points)
+    reached = np.column_stack([chart.radii[a], chart.heights[b]])
+    all_points = np.concatenate([reached, *(x.points for x in home_outlines(chart))])
     margin = 0.03 * float(np.ptp(all_points, axis=0).max())
     return all_points.min(axis=0) - margin, all_points.max(axis=0) + margin
 
@@ -133,38 +154,11 @@ def draw_capacity_panel(axes: Axes, chart: Capacity, k: int) -> None:
     lower, upper = drawing_extent(chart)
     axes.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), aspect="equal")
     axes.grid(visible=False)
-    active_factors = list(chart.active_factors)
-    index = np.full(chart.loads.shape[1:], np.nan)
-    for i, cause in enumerate(active_factors):
-        index[chart.limiting_factor_index[k] == cause] = i
-    index[np.isinf(chart.loads[k])] = len(active_factors)
-    factor_tints = [*factor_colours(chart).values(), _UNLIMITED_COLOUR]
-    if len(chart.radii) > 1 and len(chart.heights) > 1:
-        axes.pcolormesh(
-            chart.radii,
-            chart.heights,
-            np.ma.masked_invalid(index),
-            cmap=ListedColormap(factor_tints),
-            vmin=-0.5,
-            vmax=len(factor_tints) - 0.5,
-            shading="nearest",
-            rasterized=True,
-            zorder=1,
-        )
-        _draw_contours(axes, chart, k)
-    else:
-        b, a = np.nonzero(np.isfinite(index))
-        axes.scatter(
-            chart.radii[a],
-            chart.heights[b],
-            c=[factor_tints[int(i)] for i in index[b, a]],
-            edgecolors=INK_COLOUR,
-            s=30,
-            zorder=3,
-        )
+    _draw_factors(axes, chart, k)
+    _draw_contours(axes, chart, k)
     if lower[1] < 0 < upper[1] and chart.section.coordinate_names[1] == "height":
         axes.axhline(0.0, color=INK_COLOUR, linewidth=1.0, zorder=2)
-    _draw_machine(axes, home_outlines(chart)[k])
+    draw_machine(axes, home_outlines(chart)[k])
     u, w = chart.section.coordinate_names
     axes.set(xlabel=f"{u} [m]", ylabel=f"{w} [m]")
     axes.set_title(slew_labels(chart)[k], fontsize=9.5, loc="left")
@@ -240,52 +234,18 @@ def _draw_contours(axes: Axes, chart: Capacity, k: int) -> None:
         return f"{scale * level:g} {unit}"
 
     axes.apply_aspect()
-    size = float(np.ptp(axes.transData.transform([(0, 0), (1, 0)])[:, 0])) * 72 / axes.figure.dpi
-    label_positions = contour_label_positions(
-        [(format_level(level), lines) for level, lines in contour_lines], size
-    )
-    if not label_positions:
-        return
-    labels = axes.clabel(lines, fmt=format_level, fontsize=_LABEL_SIZE, manual=label_positions)
-    for label in labels or ():
-        label.set_path_effects([withStroke(linewidth=1.6, foreground="white")])
-
-
-def contour_label_positions(
-    lines: Sequence[tuple[str, list[Array]]], size: float
-) -> list[tuple[float, float]]:
-    """Return positions of labels on contours that do not overlap.
-
-    Args:
-        lines: Labels with their lines (n, 2) [m].
-        size: Points per metre.
-    """
-    occupied = np.empty((0, 2))
+    style: Any = {"fmt": format_level, "fontsize": _LABEL_SIZE}
     positions: list[tuple[float, float]] = []
-    for text, polylines in lines:
-        label_width = _LETTER_WIDTH * _LABEL_SIZE * len(text) / size
-        label_height = _MIN_LABEL_DISTANCE * _LABEL_SIZE / size
-        for polyline in polylines:
-            arc_lengths = np.append(
-                0.0, np.cumsum(np.linalg.norm(np.diff(polyline, axis=0), axis=1))
-            )
-            if arc_lengths[-1] < 1.5 * label_width:
-                continue
-            for share in _LABEL_POSITIONS:
-                label_arc_lengths = arc_lengths[-1] * share + label_width * np.linspace(
-                    -0.5, 0.5, 5
-                )
-                if label_arc_lengths[0] < 0 or label_arc_lengths[-1] > arc_lengths[-1]:
-                    continue
-                label_points = np.column_stack(
-                    [np.interp(label_arc_lengths, arc_lengths, x) for x in polyline.T]
-                )
-                distances = np.linalg.norm(label_points[:, None] - occupied, axis=2)
-                if (distances > label_height).all():
-                    occupied = np.concatenate([occupied, label_points])
-                    positions.append((float(label_points[2, 0]), float(label_points[2, 1])))
-                    break
-    return positions
+    boxes: list[Any] = []
+    for draft in axes.clabel(lines, inline=False, **style):
+        box = draft.get_window_extent()
+        if not box.count_overlaps(boxes):
+            positions.append(draft.get_position())
+            boxes.append(box)
+        draft.remove()
+    labels = axes.clabel(lines, manual=positions, **style) if positions else []
+    for label in labels:
+        label.set_path_effects([withStroke(linewidth=1.6, foreground="white")])
 
 
 def _contour_levels(low: float, high: float) -> list[float]:
@@ -299,7 +259,8 @@ def _contour_levels(low: float, high: float) -> list[float]:
     return sorted(levels)
 
 
-def _draw_machine(axes: Axes, machine_outline: MachineOutline) -> None:
+def draw_machine(axes: Axes, machine_outline: MachineOutline) -> None:
+    """Draw the outline of a machine."""
     if len(machine_outline.stationary_hull) > 1:  # an undercarriage is often no more than its feet
         axes.fill(
             *machine_outline.stationary_hull.T,
@@ -319,35 +280,19 @@ def _draw_machine(axes: Axes, machine_outline: MachineOutline) -> None:
                   solid_capstyle="butt")  # fmt: skip
 
 
-_FORCE_COLOURS = (
-    "#1f5fa8",
-    "#e0701a",
-    "#2a8c4a",
-    "#8a5fb0",
-    "#d9b53f",
-    "#b04a7a",
-    "#3f8f9f",
-    "#9a6b3f",
-    "#7a7a7a",
-    "#6f9bca",
-    "#c2452d",
-    "#333333",
-)
 _MAX_ARROWS = 12  # along the larger side
 
 
 @figure_style
 def tool_force_figure(chart: ToolForce) -> Figure:
     """Return a row per slew angle: forces with arrows, and limiting factors."""
-    count, active_factors = len(chart.slews), chart.active_factors
+    count = len(chart.slews)
     all_forces, directions = chart.forces / 1e3, chart.section_directions()
     largest_force = float(np.nanmax(np.where(np.isfinite(all_forces), all_forces, np.nan)))
     aspect = float(np.ptp(chart.heights)) / max(float(np.ptp(chart.radii)), 1e-9)
     height = float(np.clip(4.2 * aspect, 2.6, 6.5)) * count + 2.0
     figure = Figure(figsize=(9.6, height), layout="constrained")
     grid = figure.subplots(count, 2, squeeze=False, sharex=True, sharey=True)
-    colors = {k: _FORCE_COLOURS[j % len(_FORCE_COLOURS)] for j, k in enumerate(active_factors)}
-    options: Any = {"shading": "nearest", "rasterized": True}
     u, w = chart.section.coordinate_names
     for axes in grid[-1]:
         axes.set_xlabel(f"{u} [m]")
@@ -355,7 +300,7 @@ def tool_force_figure(chart: ToolForce) -> Figure:
         forces = np.ma.masked_invalid(all_forces[s])
         mesh = left.pcolormesh(
             chart.radii, chart.heights, forces, cmap="viridis", vmin=0.0, vmax=largest_force,
-            **options,
+            shading="nearest", rasterized=True,
         )  # fmt: skip
         if np.ptp(forces.compressed()) > 0 and min(forces.shape) > 1:
             lines = left.contour(chart.radii, chart.heights, forces,
@@ -364,28 +309,14 @@ def tool_force_figure(chart: ToolForce) -> Figure:
             left.clabel(lines, fmt="%g", fontsize=7)
         _draw_arrows(left, chart, all_forces[s], directions[s], largest_force)
         add_side_colour_bar(left, mesh, "force [kN]")
-        factor_index = np.full(forces.shape, np.nan)
-        for j, k in enumerate(active_factors):
-            factor_index[chart.limiting_factor_index[s] == k] = j
-        palette = ListedColormap(list(colors.values()) or [INK_COLOUR])
-        right.pcolormesh(chart.radii, chart.heights, np.ma.masked_invalid(factor_index),
-                         cmap=palette, vmin=-0.5, vmax=max(len(colors), 1) - 0.5,
-                         **options)  # fmt: skip
+        _draw_factors(right, chart, s)
         slew_text = f", slewed {np.rad2deg(chart.slews[s]):.4g}°" if count > 1 else ""
         left.set(title=f"largest force{slew_text}", ylabel=f"{w} [m]")
         right.set_title("limiting factor")
         for axes in (left, right):
             axes.set_aspect("equal")
             axes.grid(False)
-    figure.legend(
-        handles=[
-            Swatch(color=color, label=escape_label(str(chart.limiting_factors[k])))
-            for k, color in colors.items()
-        ],
-        loc="outside lower center",
-        ncols=2,
-        fontsize=8,
-    )
+    figure.legend(handles=legend_patches(chart), loc="outside lower center", ncols=2, fontsize=8)
     add_heading(
         figure, escape_label(result_title(chart.machine.name, f"tool force, {chart.direction}"))
     )

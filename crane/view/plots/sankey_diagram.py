@@ -1,5 +1,6 @@
 """Sankey diagram of the energy of a hydraulic run."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -222,8 +223,7 @@ class _SankeyDiagram:
             self._owner_groups[-1].ribbons[-1].centre,
         )
         flow = sum(group.total_energy - group.returned_energy for group in self._owner_groups)
-        top = ribbon_top = 0.5 * (first_centre + last_centre + scale * flow)
-        self._draw_bar(x, top, scale * flow, INK_COLOUR)
+        top = 0.5 * (first_centre + last_centre + scale * flow)
         self._draw_text(
             x - 0.04,
             top - 0.5 * scale * flow,
@@ -232,12 +232,9 @@ class _SankeyDiagram:
             "center",
             is_vertical=True,
         )
-        for group in self._owner_groups:
-            ribbon_height = scale * (group.total_energy - group.returned_energy)
-            self._draw_ribbon(
-                (x + _BAR_WIDTH, ribbon_top), (target_x, group.top), ribbon_height, _NEUTRAL_COLOUR
-            )
-            ribbon_top -= ribbon_height
+        groups = self._owner_groups
+        flows = [(x.total_energy - x.returned_energy, x.top, _NEUTRAL_COLOUR) for x in groups]
+        self._draw_flows(x, top, target_x, flows)
         return top
 
     def _draw_sources(self, bar_top: float) -> None:
@@ -249,7 +246,6 @@ class _SankeyDiagram:
         y = bar_top + scale * next(iter(sources.values()))[1]
         y += 0.5 * _GROUP_GAP * (len(sources) - 1)
         for label, (energy, loss) in sources.items():
-            self._draw_bar(x, y, scale * energy, INK_COLOUR)
             self._draw_text(
                 x - 0.08,
                 y - 0.5 * scale * energy,
@@ -257,25 +253,27 @@ class _SankeyDiagram:
                 ha="right",
                 va="center",
             )
-            if loss > 0:
-                self._draw_ribbon(
-                    (x + _BAR_WIDTH, y), (group_x, loss_top), scale * loss, CLASS_COLOURS["pump"]
-                )
-                loss_top -= scale * loss
-            ribbon_height = scale * (energy - loss)
-            self._draw_ribbon(
-                (x + _BAR_WIDTH, y - scale * loss),
-                (bar_x, target_top),
-                ribbon_height,
-                _NEUTRAL_COLOUR,
+            self._draw_flows(x, y, group_x, [(loss, loss_top, CLASS_COLOURS["pump"])])
+            self._draw_flows(
+                x, y - scale * loss, bar_x, [(energy - loss, target_top, _NEUTRAL_COLOUR)]
             )
-            target_top -= ribbon_height
+            loss_top -= scale * loss
+            target_top -= scale * (energy - loss)
             y -= scale * energy + _GROUP_GAP
+
+    def _draw_flows(
+        self, x: float, top: float, target_x: float, flows: Iterable[tuple[float, float, str]]
+    ) -> None:
+        """Draw a bar and its ribbons: energies [J], tops of their targets [inch], colours."""
+        for energy, target_top, colour in flows:
+            height = self._scale * energy
+            self._draw_bar(x, top, height, INK_COLOUR)
+            self._draw_ribbon((x + _BAR_WIDTH, top), (target_x, target_top), height, colour)
+            top -= height
 
     def _draw_group(self, group: _SankeyGroup) -> None:
         scale, (_, _, x, target_x) = self._scale, _COLUMN_POSITIONS
         bar_height, return_height = scale * group.total_energy, scale * group.returned_energy
-        self._draw_bar(x, group.top, bar_height, INK_COLOUR)
         label = f"{escape_label(group.label)}\n{self._energy_text(group.total_energy)}"
         self._draw_text(x, group.top + 0.05, label, weight="bold")
         if group.returned_energy > _MIN_RIBBON_SHARE * self._total_energy:
@@ -303,25 +301,17 @@ class _SankeyDiagram:
             self._draw_text(
                 left - 0.05, bar_bottom + 0.5 * return_height, label, ha="right", va="center"
             )
-        ribbon_top = group.top
-        for ribbon in group.ribbons:
-            ribbon_height = scale * ribbon.energy
-            self._draw_ribbon(
-                (x + _BAR_WIDTH, ribbon_top),
-                (target_x, ribbon.centre + 0.5 * ribbon_height),
-                ribbon_height,
-                ribbon.color,
-            )
-            self._draw_bar(
-                target_x, ribbon.centre + 0.5 * ribbon_height, ribbon_height, ribbon.color
-            )
+        tops = [ribbon.centre + 0.5 * scale * ribbon.energy for ribbon in group.ribbons]
+        flows = [(x.energy, end, x.color) for x, end in zip(group.ribbons, tops, strict=True)]
+        self._draw_flows(x, group.top, target_x, flows)
+        for ribbon, ribbon_top in zip(group.ribbons, tops, strict=True):
+            self._draw_bar(target_x, ribbon_top, scale * ribbon.energy, ribbon.color)
             self._draw_text(
                 target_x + _BAR_WIDTH + 0.07,
                 ribbon.centre,
                 f"{ribbon.label}  {self._energy_text(ribbon.energy)}",
                 va="center",
             )
-            ribbon_top -= ribbon_height
 
     def _energy_text(self, energy: float) -> str:
         return (

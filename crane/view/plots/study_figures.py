@@ -14,6 +14,7 @@ from crane.recordings.recording_summary import result_title
 from crane.studies.optimization.design_optimization import Design
 from crane.studies.study_table import Study
 from crane.view.plots.figure_style import (
+    CURVE_COLOURS,
     DASHED_STYLE,
     RECORDED_COLOUR,
     add_heading,
@@ -24,7 +25,6 @@ from crane.view.plots.figure_style import (
 _MAX_PANELS = 12  # measures of one picture
 _MAX_SCATTER_ROWS = 6
 _MAX_COLUMNS = 3
-_TASK_COLORS = ("#2a9d6f", "#8a5fb0", "#c2452d", "#7f7f3f", "#3f8f9f")
 _INFEASIBLE_COLOUR = "#d9d9d9"
 
 
@@ -74,15 +74,10 @@ def _draw_panels(study: Study, shown_measures: list[str]) -> Figure:
         axes.set(
             title=_column_label(study, name), xlabel=_column_label(study, study.parameters[0])
         )
-    lines = {
-        line.get_label(): line
-        for axes in figure.axes
-        for line in axes.get_lines()
-        if not str(line.get_label()).startswith("_")
-    }
-    if lines:
-        handles, labels = list(lines.values()), [str(label) for label in lines]
-        figure.legend(handles, labels, loc="outside lower center", ncols=min(len(lines), 6))
+    lines = {line.get_label(): line for axes in figure.axes for line in axes.get_lines()}
+    named = [line for label, line in lines.items() if not str(label).startswith("_")]
+    if named:
+        figure.legend(handles=named, loc="outside lower center", ncols=min(len(named), 6))
     return figure
 
 
@@ -95,14 +90,13 @@ def _draw_curves(axes: Axes, study: Study, name: str) -> None:
     for k, task in enumerate(study.tasks):
         values = study.columns.get(f"{name} {task}")
         if values is not None:
-            color = _TASK_COLORS[k % len(_TASK_COLORS)]
             axes.plot(
                 x,
                 values[order],
                 marker=marker,
                 ms=2.5,
                 lw=1.0,
-                color=color,
+                color=CURVE_COLOURS[2 + k % 10],
                 label=escape_label(task),
             )
     measure_values = study.columns[name][order]
@@ -131,12 +125,12 @@ def _draw_curves(axes: Axes, study: Study, name: str) -> None:
         color=DASHED_STYLE["color"],
         label="best",
     )
-    for parameter_value, value in zip(x, measure_values, strict=True):
-        if not np.isfinite(value):  # a cross at the foot
-            axes.plot(
-                [parameter_value], [0.02], "x", ms=4, color="#909090", label="not possible",
-                transform=axes.get_xaxis_transform(),
-            )  # fmt: skip
+    missing = x[~np.isfinite(measure_values)]
+    if len(missing):  # crosses at the foot
+        axes.plot(
+            missing, np.full(len(missing), 0.02), "x", ms=4, color="#909090",
+            label="not possible", transform=axes.get_xaxis_transform(),
+        )  # fmt: skip
 
 
 def _draw_map(figure: Figure, axes: Axes, study: Study, name: str) -> None:
@@ -264,12 +258,6 @@ def design_figure(result: Design) -> Figure:
             xlabel=escape_label(result.objectives[0]), ylabel=escape_label(result.objectives[1])
         )
     goal = "; ".join(result.objectives)
-    figure.suptitle(
-        escape_label(f"{result.machine.name}: {goal}"),
-        x=0.01,
-        ha="left",
-        fontsize=10,
-        fontweight="bold",
-    )
+    add_heading(figure, escape_label(f"{result.machine.name}: {goal}"))
     figure.tight_layout(rect=(0, 0, 1, 0.97))
     return figure

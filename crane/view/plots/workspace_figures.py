@@ -1,11 +1,9 @@
 """Figures of workspaces and working ranges: reach, map of the strokes, dimension lines."""
 
 import string
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
-import pinocchio as pin
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm, Normalize
@@ -14,6 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch as Swatch
 
 from crane.common.samples import Array
+from crane.motion.kinematics import Kinematics
 from crane.motion.workspaces import Workspace
 from crane.ratings.working_range_dimensions import Dimension
 from crane.ratings.working_ranges import WorkingRange
@@ -29,6 +28,8 @@ from crane.view.plots.figure_style import (
     joint_symbol,
     set_round_ticks,
 )
+from crane.view.plots.rating_figures import draw_machine
+from crane.view.sketches.mechanism_projection import MachineOutline, machine_outline
 
 _REGION_COLOUR, _GRID_COLOUR, _OPEN_COLOUR = "#e3ecf6", "#a9c3e0", "#d9d9d9"
 _CURVE_STYLES = {
@@ -56,8 +57,8 @@ def workspace_figure(reachable_space: Workspace) -> Figure:
     condition number of the drive and the smallest singular value of the tip's Jacobian, grey where
     the loops do not close.
     """
-    skeleton = skeleton_lines(reachable_space)
-    points = np.concatenate([reachable_space.section_positions, skeleton.reshape(-1, 2)])
+    outline = _home_outline(reachable_space)
+    points = np.concatenate([reachable_space.section_positions, outline.points])
     width, height = np.ptp(points, axis=0)
     stroke_map = reachable_space.stroke_map
     has_condition_panel = float(np.nanmax(stroke_map.condition)) > _MIN_SHOWN_CONDITION
@@ -65,7 +66,7 @@ def workspace_figure(reachable_space: Workspace) -> Figure:
     figure_height = float(np.clip(4.6 * aspect, 4.2, 6.2)) + 0.7
     figure = Figure(figsize=(9.6, figure_height), layout="constrained")
     grid = figure.add_gridspec(1 + has_condition_panel, 2, width_ratios=[1.3, 1.0])
-    _draw_section(figure.add_subplot(grid[:, 0]), reachable_space, skeleton, points)
+    _draw_section(figure.add_subplot(grid[:, 0]), reachable_space, outline, points)
     right = [figure.add_subplot(grid[k, 1]) for k in range(1 + has_condition_panel)]
     if has_condition_panel:
         _draw_stroke_map(
@@ -85,7 +86,9 @@ def workspace_figure(reachable_space: Workspace) -> Figure:
     return figure
 
 
-def _draw_section(axes: Axes, reachable_space: Workspace, skeleton: Array, points: Array) -> None:
+def _draw_section(
+    axes: Axes, reachable_space: Workspace, outline: MachineOutline, points: Array
+) -> None:
     if reachable_space.area:
         _draw_region(axes, reachable_space, 1.1)
         lines = _grid_images(reachable_space)
@@ -101,10 +104,8 @@ def _draw_section(axes: Axes, reachable_space: Workspace, skeleton: Array, point
             axes.plot(*curve.section_positions.T, zorder=4, **style)
         else:
             axes.plot(*curve.section_positions.T, "o", ms=5, color=style["color"], zorder=5)
-    axes.add_collection(LineCollection(list(skeleton), colors=INK_COLOUR, linewidths=1.6, zorder=5,
-                                       capstyle="round", alpha=0.75))  # fmt: skip
-    axes.plot(*skeleton.reshape(-1, 2).T, "o", ms=2.6, color=INK_COLOUR, zorder=5, alpha=0.75)
-    home = _section_positions(reachable_space, [reachable_space.machine.home])
+    draw_machine(axes, outline)
+    home = _section_positions(reachable_space, reachable_space.machine.home[None])
     axes.plot(*home[0], "o", ms=6, color=INK_COLOUR, mfc="white", mew=1.3, zorder=6)
     lower, upper = points.min(axis=0), points.max(axis=0)
     margin = 0.05 * float((upper - lower).max())
@@ -142,41 +143,16 @@ def _grid_images(reachable_space: Workspace) -> list[Array]:
     return [line for line in lines if len(line) > 1]
 
 
-def _section_positions(reachable_space: Workspace, configurations: Iterable[Array]) -> Array:
+def _section_positions(reachable_space: Workspace, configurations: Array) -> Array:
     """Return the positions (N, 2) of the frame in the section."""
-    machine = reachable_space.machine
-    data, frame = machine.model.createData(), machine.frame(reachable_space.frame)
-    positions = []
-    for q in configurations:
-        pin.forwardKinematics(machine.model, data, machine.coordinates.configuration(q))
-        positions.append(
-            np.array(pin.updateFramePlacement(machine.model, data, frame).translation)
-        )
-    return reachable_space.section.coordinates(np.array(positions))
+    kinematics = Kinematics(reachable_space.machine, reachable_space.frame)
+    positions = kinematics.positions_at_configurations(configurations)
+    return reachable_space.section.coordinates(positions)
 
 
-def skeleton_lines(reachable_space: Workspace) -> Array:
-    """Return lines (k, 2, 2) between the joints of the machine at home, in the section."""
-    machine, model = reachable_space.machine, reachable_space.machine.model
-    data = model.createData()
-    pin.framesForwardKinematics(model, data, machine.coordinates.configuration(machine.home))
-    line_ends = [
-        (data.oMi[parent].translation, data.oMi[joint].translation)
-        for joint, parent in enumerate(model.parents)
-        if parent > 0
-    ]
-    names = [
-        name
-        for loop in machine.closure.equations.loops
-        for name in (loop.predecessor, loop.successor)
-    ]
-    for name in [*names, reachable_space.frame]:
-        frame = machine.frame(name)
-        parent = model.frames[frame].parentJoint
-        if parent > 0 or name == reachable_space.frame:
-            line_ends.append((data.oMi[parent].translation, data.oMf[frame].translation))
-    points = np.array(line_ends).reshape(-1, 3)
-    return reachable_space.section.coordinates(points).reshape(-1, 2, 2)
+def _home_outline(reach: Workspace) -> MachineOutline:
+    """Return the outline of the machine at home."""
+    return machine_outline(reach.machine, reach.frame, reach.section, reach.machine.home)
 
 
 def _draw_stroke_map(axes: Axes, reachable_space: Workspace, values: Array, label: str) -> None:
@@ -288,17 +264,15 @@ def working_range_figure(result: WorkingRange) -> Figure:
     Shorter lines are closer to the machine, so that no line crosses another one.
     """
     reach = result.workspace
-    skeleton = skeleton_lines(reach)
-    points = np.vstack([skeleton.reshape(-1, 2), reach.section_positions])
+    outline = _home_outline(reach)
+    points = np.concatenate([outline.points, reach.section_positions])
     lower, upper = points.min(axis=0), points.max(axis=0)
     lower = np.minimum(lower, [0.0, result.ground_height])
     gap = _LINE_GAP_SHARE * float((upper - lower).max())
     figure = Figure(figsize=(9.6, 6.8), layout="constrained")
     axes = figure.subplots()
     _draw_region(axes, reach, 1.2)
-    for line in skeleton:
-        axes.plot(*line.T, color=INK_COLOUR, linewidth=1.6, solid_capstyle="round", zorder=5)
-    axes.plot(*skeleton.reshape(-1, 2).T, "o", ms=2.6, color=INK_COLOUR, zorder=5)
+    draw_machine(axes, outline)
     letters = dict(zip(string.ascii_uppercase, result.dimensions, strict=False))
     right = _draw_vertical_lines(axes, letters, result.ground_height, max(upper[0], 0.0), gap)
     axes.plot(
@@ -309,8 +283,8 @@ def working_range_figure(result: WorkingRange) -> Figure:
     for dimension in result.dimensions:
         if "level bottom" in dimension.name:
             u, w = dimension.section_position
-            style: Any = {"color": DASHED_STYLE["color"], "linewidth": 1.8, "zorder": 6}
-            axes.plot([u, u + result.level_length], [w, w], **style)
+            ends = [u, u + result.level_length]
+            axes.plot(ends, [w, w], color=DASHED_STYLE["color"], linewidth=1.8, zorder=6)
     names = reach.section.coordinate_names
     axes.set(xlim=(lower[0] - gap, right), ylim=(bottom, top), aspect="equal",
              xlabel=f"{names[0]} [m]", ylabel=f"{names[1]} [m]")  # fmt: skip
@@ -328,8 +302,10 @@ def _draw_region(axes: Axes, reach: Workspace, line_width: float) -> None:
     raster = reach.raster
     covered = raster.fill_cracks(2 if reach.is_complete else 6)
     axes.contourf(raster.u, raster.w, covered, [0.5, 1.5], colors=[_REGION_COLOUR], zorder=1)
-    style: Any = {"colors": [RECORDED_COLOUR], "linewidths": line_width, "zorder": 3}
-    axes.contour(raster.u, raster.w, covered, [0.5], **style)
+    axes.contour(
+        raster.u, raster.w, covered, [0.5], colors=[RECORDED_COLOUR], linewidths=line_width,
+        zorder=3,
+    )  # fmt: skip
 
 
 def _draw_vertical_lines(
@@ -340,13 +316,12 @@ def _draw_vertical_lines(
     Dimensions above and below ground share a line, the shortest first.
     """
     counts = {False: 0, True: 0}
-    for letter, dimension in sorted(letters.items(), key=lambda item: item[1].value):
-        if any(word in dimension.name for word in _VERTICAL_WORDS):
-            position = dimension.section_position
-            is_above = bool(position[1] > ground)
-            counts[is_above] += 1
-            u = right + gap * counts[is_above]
-            _draw_dimension_line(axes, letter, (u, ground), (u, position[1]), position)
+    for letter, dimension in _shortest_first(letters, is_vertical=True):
+        position = dimension.section_position
+        is_above = bool(position[1] > ground)
+        counts[is_above] += 1
+        u = right + gap * counts[is_above]
+        _draw_dimension_line(axes, letter, (u, ground), (u, position[1]), position)
     return right + gap * (max(counts.values()) + 0.7)
 
 
@@ -355,19 +330,28 @@ def _draw_horizontal_lines(
 ) -> tuple[float, float]:
     """Draw lines below and above the reach, and return the vertical limits of the drawing."""
     heights = {False: bottom, True: top}
-    has_lines = False
-    for letter, dimension in sorted(letters.items(), key=lambda item: item[1].value):
-        if not any(word in dimension.name for word in _VERTICAL_WORDS):
-            is_above, position = "slewing" in dimension.name, dimension.section_position
-            has_lines = True
-            heights[is_above] += gap if is_above else -gap
-            w = heights[is_above]
-            _draw_dimension_line(axes, letter, (0.0, w), (position[0], w), position)
+    lines = _shortest_first(letters, is_vertical=False)
+    for letter, dimension in lines:
+        is_above, position = "slewing" in dimension.name, dimension.section_position
+        heights[is_above] += gap if is_above else -gap
+        w = heights[is_above]
+        _draw_dimension_line(axes, letter, (0.0, w), (position[0], w), position)
     limits = heights[False] - gap, heights[True] + gap
-    if has_lines:
-        style: Any = {"color": _LINE_COLOUR, "linewidth": 0.8, "linestyle": (0, (8, 2, 1, 2))}
-        axes.plot([0, 0], limits, zorder=2, **style)
+    if lines:
+        dashes = (0, (8, 2, 1, 2))
+        axes.plot([0, 0], limits, zorder=2, color=_LINE_COLOUR, linewidth=0.8, linestyle=dashes)
     return limits
+
+
+def _shortest_first(
+    letters: Mapping[str, Dimension], is_vertical: bool
+) -> list[tuple[str, Dimension]]:
+    """Return the vertical or the horizontal dimensions with their letters."""
+    return [
+        (letter, dimension)
+        for letter, dimension in sorted(letters.items(), key=lambda item: item[1].value)
+        if any(word in dimension.name for word in _VERTICAL_WORDS) == is_vertical
+    ]
 
 
 def _draw_dimension_line(

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
-from numpy.typing import NDArray
 
 from crane.common.samples import Array
 from crane.view.sketches.sketch_canvas import GREY, SketchCanvas
@@ -167,10 +167,11 @@ def find_clear_point(
     """Find a point (2,) in a polygon, outside of others, and its distance to all lines [m]."""
     lower, upper = polygon.min(axis=0), polygon.max(axis=0)
     grid = np.stack(np.meshgrid(*np.linspace(lower, upper, 41).T), axis=-1).reshape(-1, 2)
-    grid = grid[_is_within_polygon(grid, polygon)]
+    grid = grid[Path(polygon).contains_points(grid)]
     for excluded_polygon in excluded_polygons:
-        if len(remaining := grid[np.logical_not(_is_within_polygon(grid, excluded_polygon))]):
-            grid = remaining
+        is_excluded = Path(excluded_polygon).contains_points(grid)
+        if not is_excluded.all():
+            grid = grid[~is_excluded]
     if not len(grid):
         return polygon.mean(axis=0), 0.0
     distance = np.full(len(grid), np.inf)
@@ -189,13 +190,3 @@ def find_clear_point(
             ),
         )
     return grid[distance.argmax()], float(distance.max())
-
-
-def _is_within_polygon(points: Array, corners: Array) -> NDArray[np.bool_]:
-    """Return whether points (n, 2) lie within a polygon (k, 2)."""
-    inside = np.zeros(len(points), dtype=bool)
-    x, y = points.T
-    for (a, b), (c, d) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        if b != d:
-            inside ^= ((b > y) != (d > y)) & (x < a + (y - b) * (c - a) / (d - b))
-    return inside

@@ -10,6 +10,7 @@ import pinocchio as pin
 from crane.common.samples import Array
 from crane.machine.machine import Machine
 from crane.motion.workspaces.workspace_section import WorkspaceSection
+from crane.ratings.rating_rules import rotate_about_axis, slew_angles
 from crane.view.sketches.sketch_canvas import convex_hull
 from crane.view.sketches.sketch_elements import (
     DrawingPlane,
@@ -290,6 +291,11 @@ class MachineOutline(NamedTuple):
     cylinders: Array
     stationary_hull: Array
 
+    @property
+    def points(self) -> Array:
+        """(k, 2) points of all parts."""
+        return np.concatenate([*self.bodies, self.cylinders.reshape(-1, 2), self.stationary_hull])
+
 
 def machine_outline(
     machine: Machine, frame: str, section: WorkspaceSection, q: Array
@@ -307,7 +313,7 @@ def machine_outline(
     model, data = machine.model, machine.model.createData()
     pin.framesForwardKinematics(model, data, machine.coordinates.configuration(q))
     plane = DrawingPlane(
-        _forward_direction(machine, frame, section, data),
+        _forward_direction(machine, frame, section, q, data),
         section.second_direction,
         section.coordinate_names,
     )
@@ -338,7 +344,7 @@ def machine_outline(
 
 
 def _forward_direction(
-    machine: Machine, frame: str, section: WorkspaceSection, data: pin.Data
+    machine: Machine, frame: str, section: WorkspaceSection, q: Array, data: pin.Data
 ) -> Array:
     """Return the direction (3,) of the section's first coordinate."""
     if section.is_radial:
@@ -351,11 +357,6 @@ def _forward_direction(
         return np.asarray(lateral if lateral.any() else np.eye(3)[0])
     if section.slewing_joint is None:
         return section.first_direction
-    home_data = machine.model.createData()
-    pin.forwardKinematics(
-        machine.model, home_data, machine.coordinates.configuration(machine.home)
-    )
-    joint = machine.model.getJointId(machine.active[section.slewing_joint])
-    return np.asarray(
-        (data.oMi[joint].rotation @ home_data.oMi[joint].rotation.T) @ section.first_direction
-    )
+    slew = q[machine.closure.active[section.slewing_joint]]
+    angles = slew_angles(machine, section, np.array([slew]))
+    return rotate_about_axis(section.first_direction[None], section.second_direction, angles)[0]

@@ -1,6 +1,5 @@
 """Canvas of a sketch: lines and symbols of kinematic diagrams, layout of the figure."""
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,15 +10,14 @@ from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from matplotlib.path import Path
+from matplotlib.patheffects import withTickedStroke
 from matplotlib.ticker import MaxNLocator
 
 from crane.common.samples import Array
 from crane.machine.machine import Machine
 from crane.recordings.recording_summary import DISPLAY_UNITS
-from crane.view.plots.figure_style import INK_COLOUR, escape_label
+from crane.view.plots.figure_style import INK_COLOUR, escape_label, joint_symbol
 from crane.view.sketches.sketch_elements import DrawingPlane, SketchMechanism
-
-HullCorner = tuple[float, ...]
 
 GREY = "#8a8a8a"
 JOINT_MARKER: Any = {"marker": "o", "markersize": 6.5, "markerfacecolor": "white"}
@@ -109,22 +107,10 @@ class SketchCanvas:
 
     def draw_hatching(self, start: Array, end: Array, down_direction: Array) -> None:
         """Draw a line from start to end [m], hatched on the side of a unit vector."""
-        self.draw_line(np.array([start, end]), INK_COLOUR, 1.2, zorder=2)
-        direction = (end - start) / np.linalg.norm(end - start)
-        count = max(int(np.linalg.norm(end - start) / (5 * self.point_size)), 2)
-        for share in (np.arange(count) + 0.9) / count:
-            line_point = start + share * (end - start)
-            self.axes.plot(
-                *np.array(
-                    [
-                        line_point,
-                        line_point + 6 * self.point_size * (down_direction - 0.8 * direction),
-                    ]
-                ).T,
-                color=INK_COLOUR,
-                linewidth=0.7,
-                zorder=2,
-            )
+        (x, y), (down_x, down_y) = end - start, down_direction
+        angle = -135 if x * down_y < y * down_x else 135
+        hatching = withTickedStroke(spacing=5, angle=angle, length=1.4, linewidth=0.7)
+        self.draw_line(np.array([start, end]), INK_COLOUR, 1.2, zorder=2, path_effects=[hatching])
         offset = 3 * self.point_size * down_direction
         self.occupied_segments.append(np.array([start + offset, end + offset]))
         self.occupied_segments.append(np.array([start + 2 * offset, end + 2 * offset]))
@@ -173,37 +159,23 @@ def marker_options(style: dict[str, Any]) -> dict[str, Any]:
 
 
 def convex_hull(points: Array) -> Array:
-    """Return the corners (k, 2) of the convex hull of points (n, 2), counterclockwise."""
-    ordered = sorted(map(tuple, points.tolist()))
-    return np.array(_half_hull(ordered) + _half_hull(ordered[::-1]) or ordered)
+    """Return the corners (k, 2) of the convex hull of points (n, 2), counterclockwise.
 
+    Those of points on a line are its ends.
+    """
+    from scipy.spatial import ConvexHull, QhullError  # slow to import
 
-def _half_hull(ordered: Sequence[HullCorner]) -> list[HullCorner]:
-    """Return the lower hull of points from left to right, without the last one."""
-    chain: list[HullCorner] = []
-    for corner in ordered:
-        while len(chain) > 1 and not _turns_left(chain[-2], chain[-1], corner):
-            chain.pop()
-        chain.append(corner)
-    return chain[:-1]
-
-
-def _turns_left(one: HullCorner, two: HullCorner, three: HullCorner) -> bool:
-    (a, b), (c, d), (x, y) = one, two, three
-    return (c - a) * (y - b) - (d - b) * (x - a) > 0
+    try:
+        return points[ConvexHull(points).vertices]
+    except (QhullError, ValueError):
+        direction = np.linalg.svd(points - points.mean(axis=0))[2][0]
+        return points[np.argsort(points @ direction)[[0, -1]]]
 
 
 _MAX_WIDTH, _MAX_HEIGHT, _MIN_WIDTH = 454.0, 353.0, 331.0  # of the axes [points]
 _MARGIN = 36.0  # around the mechanism [points]
 _LEFT_MARGIN, _RIGHT_MARGIN, _BOTTOM_MARGIN = 46.0, 12.0, 38.0  # around the axes [points]
 _LINE_HEIGHT = 12.5  # height of a line of words [points]
-
-
-def format_joint_symbol(name: str) -> str:
-    """Return a joint's name as a label: q1 as q with index 1, X_lift as X with index lift."""
-    if match := re.fullmatch(r"([A-Za-z])(\d+|_[A-Za-z]+)", name):
-        return f"${match[1]}_{{\\mathrm{{{match[2].removeprefix('_')}}}}}$"
-    return escape_label(name)
 
 
 def create_sketch_layout(
@@ -308,5 +280,5 @@ def _coordinate_lines(machine: Machine, q: Array, line_length: int) -> list[str]
             length = 0
         length += text_length
         unit_text = "°" if unit == "deg" else f"\u2009{unit}"
-        lines[-1].append(f"{format_joint_symbol(joint)} = {number}{unit_text}")
+        lines[-1].append(f"{joint_symbol(joint)} = {number}{unit_text}")
     return [",   ".join(texts) for texts in lines]

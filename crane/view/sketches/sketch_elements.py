@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.common.samples import Array
 from crane.machine.machine import Machine
 
@@ -60,8 +60,7 @@ def find_plane(machine: Machine, q: Array, view: str | None = None) -> DrawingPl
         InputError: The view is unknown, or too few axes are parallel.
     """
     if view is not None:
-        if view not in VIEW_DIRECTIONS:
-            raise InputError(f"view '{view}' is unknown, {suggest_names(VIEW_DIRECTIONS, view)}")
+        check_name(view, VIEW_DIRECTIONS, f"view '{view}' is unknown")
         return _label_plane(*VIEW_DIRECTIONS[view])
     home_data = pin.Data(machine.model)
     to_pinocchio = machine.coordinates.configuration

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.machine.machine import Machine
-from crane.view.plots.figure_style import escape_label, figure_style, write_figure
+from crane.view.plots.figure_style import escape_label, figure_style, joint_symbol, write_figure
 from crane.view.sketches.label_placement import SketchLabel, find_clear_point, place_labels
 from crane.view.sketches.mechanism_projection import COINCIDENCE_TOLERANCE, project_mechanism
 from crane.view.sketches.sketch_canvas import (
@@ -28,7 +28,6 @@ from crane.view.sketches.sketch_canvas import (
     SketchCanvas,
     convex_hull,
     create_sketch_layout,
-    format_joint_symbol,
     marker_options,
 )
 from crane.view.sketches.sketch_elements import (
@@ -331,26 +330,22 @@ def _create_labels(mechanism: SketchMechanism) -> list[SketchLabel]:
             (x.name for x in itertools.compress(remaining, is_coincident)),
             key=lambda name: [(x.isdigit(), x.zfill(9)) for x in re.split(r"(\d+)", name)],
         )  # in natural order, q2 before q10
-        labels.append(
-            SketchLabel(", ".join(map(format_joint_symbol, names)), position, 4.0, "label")
-        )
+        labels.append(SketchLabel(", ".join(map(joint_symbol, names)), position, 4.0, "label"))
         remaining = [x for x, is_in in zip(remaining, is_coincident, strict=True) if not is_in]
     for x in mechanism.pins:
         if number := x.loop_number:
             number_text = chr(0x2460 + number - 1) if number <= 20 else f"({number})"
             labels.append(
-                SketchLabel(
-                    f"{number_text} {format_joint_symbol(x.name)}", x.position, 6.0, "label"
-                )
+                SketchLabel(f"{number_text} {joint_symbol(x.name)}", x.position, 6.0, "label")
             )
     labels += [
-        SketchLabel(format_joint_symbol(item.name), item.position, 8.0, "label")
+        SketchLabel(joint_symbol(item.name), item.position, 8.0, "label")
         for item in mechanism.collars
     ]
     for slide in mechanism.slides:
         labels.append(
             SketchLabel(
-                format_joint_symbol(slide.name),
+                joint_symbol(slide.name),
                 slide.rod_inner_end if slide.is_rail else (slide.start + slide.mouth) / 2,
                 6.0,
                 "label",

@@ -63,10 +63,6 @@ class SymbolPose:
             out.append((self.x + x, self.y + y))
         return out
 
-    def transform_point(self, x: float, y: float) -> SheetPoint:
-        """Transform one point to the sheet."""
-        return self((x, y))[0]
-
 
 @dataclass(frozen=True)
 class CircuitWire:

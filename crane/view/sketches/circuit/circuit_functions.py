@@ -3,12 +3,13 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from crane.common.units import format_quantity
 from crane.hydraulics.circuit_elements import TANK_NODE, Supply
 from crane.hydraulics.components import Cylinder, Valve
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.view.sketches.circuit import valve_symbols
 from crane.view.sketches.circuit.circuit_canvas import CircuitCanvas, SheetPoint, SymbolPose
-from crane.view.sketches.circuit.valve_symbols import format_flow, format_pressure
+from crane.view.sketches.circuit.valve_symbols import format_flow
 
 _PORT_LANES = {"Ta": -26.0, "LS": -20.0, "P": 0.0, "T": 12.0}
 _SUPPLY_LANE_BESIDE_CENTRE = -7.0  # lane of P beside an open centre
@@ -91,8 +92,8 @@ class CircuitFunction:
         else:
             texts += [" | ".join(flows), "l/min"]
         if valve.margin > 0:
-            return [*texts, f"Δp {format_pressure(valve.margin)}"]
-        return [*texts, "sharing" if margin else f"at {format_pressure(_ORIFICE_DROP)}"]
+            return [*texts, f"Δp {format_quantity(valve.margin, 'Pa')}"]
+        return [*texts, "sharing" if margin else f"at {format_quantity(_ORIFICE_DROP, 'Pa')}"]
 
 
 def port_lane(function: CircuitFunction, port: str) -> float:

@@ -2,9 +2,10 @@
 
 from collections.abc import Mapping
 
+from crane.common.units import format_number, format_quantity
 from crane.hydraulics.circuit_elements import TANK_NODE
 from crane.hydraulics.components import CounterbalanceValve
-from crane.view.plots.figure_style import escape_label
+from crane.view.plots.figure_style import escape_label, joint_symbol
 from crane.view.sketches.circuit import machine_symbols, valve_symbols
 from crane.view.sketches.circuit.circuit_canvas import (
     NAME_TEXT_SIZE,
@@ -16,13 +17,10 @@ from crane.view.sketches.circuit.circuit_functions import CircuitFunction, port_
 from crane.view.sketches.circuit.valve_symbols import (
     SPOOL_HEIGHT,
     SpoolSymbol,
-    format_area,
     format_displacement,
     format_flow,
-    format_number,
     format_pressure,
 )
-from crane.view.sketches.sketch_canvas import format_joint_symbol
 
 SECTION_WIDTH = 122.0
 TOP_HEIGHT = 46.0  # above the middle of an actuator, with its words
@@ -181,7 +179,7 @@ class CircuitSection:
             canvas.draw_text(
                 text_x,
                 y + 23,
-                f"Δp {format_pressure(self._function.cylinder.cross_relief)}",
+                f"Δp {format_quantity(self._function.cylinder.cross_relief, 'Pa')}",
                 f"label cross {joint}",
                 ha="left",
             )
@@ -222,7 +220,10 @@ class CircuitSection:
                 4.5,
                 drop=3,
             )
-            text, alignment = format_pressure(cylinder.relief), "left" if sign > 0 else "right"
+            text, alignment = (
+                format_pressure(cylinder.relief),
+                "left" if sign > 0 else "right",
+            )
             canvas.draw_text(lane + sign * 4, top + 6, text, f"label {component}", ha=alignment)
         if cylinder.refill:
             position, component = lane + sign * (34 if cylinder.relief else 15), f"suction {net}"
@@ -314,7 +315,8 @@ class CircuitSection:
             machine_symbols.draw_cylinder(
                 canvas, (x, y), component, nets, cylinder.area_b / cylinder.area_a
             )
-            texts = [f"{format_area(cylinder.area_a)} | {format_area(cylinder.area_b)} cm²"]
+            areas = (format_number(1e4 * x) for x in (cylinder.area_a, cylinder.area_b))
+            texts = [f"{' | '.join(areas)} cm²"]
         if function.stroke < 1e6 and not cylinder.motor:
             texts.append(
                 f"{format_number(function.stroke * 57.29578)}°"
@@ -323,5 +325,5 @@ class CircuitSection:
             )
         canvas.draw_labels(
             (x, y + TOP_HEIGHT - NAME_TEXT_SIZE / 2), component,
-            format_joint_symbol(function.joint), map(escape_label, texts), SECTION_WIDTH - 8,
+            joint_symbol(function.joint), map(escape_label, texts), SECTION_WIDTH - 8,
         )  # fmt: skip

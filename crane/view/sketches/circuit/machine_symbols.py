@@ -107,7 +107,7 @@ def _draw_ports(
     canvas: CircuitCanvas, pose: SymbolPose, component: str, nets: tuple[str, str]
 ) -> None:
     for net, x in zip(nets, (-PORT_OFFSET, PORT_OFFSET), strict=True):
-        canvas.add_port(component, net, pose.transform_point(x, -BARREL_HALF_HEIGHT))
+        canvas.add_port(component, net, pose((x, -BARREL_HALF_HEIGHT))[0])
 
 
 def _draw_rotating_shaft(canvas: CircuitCanvas, pose: SymbolPose, y: float) -> None:
@@ -155,7 +155,7 @@ def draw_accumulator(
 ) -> None:
     """Draw an accumulator with gas above its diaphragm, its port below."""
     pose = SymbolPose(*position)
-    canvas.add_port(component, net, pose.transform_point(0, -17))
+    canvas.add_port(component, net, pose((0, -17))[0])
     upper_half = [
         (8 * math.cos(t), 9 + 8 * math.sin(t)) for t in [k * math.pi / 16 for k in range(17)]
     ]

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from crane.common.units import format_number, format_quantity
 from crane.hydraulics.circuit_elements import (
     TANK_NODE,
     Accumulator,
@@ -26,9 +27,7 @@ from crane.view.sketches.circuit.valve_symbols import (
     THROTTLE_HALF_LENGTH,
     WirePaths,
     format_flow,
-    format_number,
     format_pressure,
-    format_volume,
 )
 
 _SHAFT_DEPTH = 58.0  # of pumps and engine, below where they hang
@@ -161,7 +160,11 @@ def _create_pump(
                 drop=3,
             )
             canvas.draw_text(
-                lane + 14, pose.y + 4, format_pressure(supply.relief), f"label {relief}", ha="left"
+                lane + 14,
+                pose.y + 4,
+                format_pressure(supply.relief),
+                f"label {relief}",
+                ha="left",
             )
 
     return SupplyItem(
@@ -190,11 +193,11 @@ def _pump_texts(supply: Supply) -> list[str]:
     texts = [f"{format_flow(supply.flow)} l/min" if supply.flow else "unlimited flow"]
     if supply.control != "fixed":
         limit = "" if supply.control == "pressure" else "max. "
-        texts.append(f"{limit}{format_pressure(supply.pressure)}")
+        texts.append(f"{limit}{format_quantity(supply.pressure, 'Pa')}")
     if supply.control == "load-sensing":
-        texts.append(f"LS + {format_pressure(supply.margin)}")
+        texts.append(f"LS + {format_quantity(supply.margin, 'Pa')}")
     if supply.control == "negative":
-        texts.append(f"pN {format_pressure(supply.signal)}")
+        texts.append(f"pN {format_quantity(supply.signal, 'Pa')}")
     if supply.power:
         sharing_text = f" of {', '.join(supply.summed)}" if supply.summed else ""
         texts.append(f"{format_number(supply.power / 1e3)} kW{sharing_text}")
@@ -211,7 +214,7 @@ def _create_accumulator(name: str, gas: Accumulator) -> SupplyItem:
             (position, middle - 32),
             component,
             escape_label(name),
-            (format_volume(gas.volume), f"p₀ {format_pressure(gas.precharge)}"),
+            (format_quantity(gas.volume, "m3"), f"p₀ {format_quantity(gas.precharge, 'Pa')}"),
             62,
         )
 

@@ -3,21 +3,13 @@
 import math
 from collections.abc import Sequence
 
+from crane.common.units import format_number, format_quantity
 from crane.view.sketches.circuit.circuit_canvas import CircuitCanvas, SheetPoint, SymbolPose
-
-
-def format_number(value: float) -> str:
-    """Return a number with three digits, without exponent in the usual range."""
-    if value == 0 or 1e-3 <= abs(value) < 1e6:
-        digits = max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0
-        text = f"{value:.{digits}f}"
-        return text.rstrip("0").rstrip(".") if "." in text else text
-    return f"{value:.2e}"
 
 
 def format_pressure(pressure: float) -> str:
     """Return a pressure [Pa] as text in bar."""
-    return f"{format_number(pressure / 1e5)} bar"
+    return format_quantity(pressure, "Pa")
 
 
 def format_flow(flow: float) -> str:
@@ -25,26 +17,9 @@ def format_flow(flow: float) -> str:
     return format_number(flow * 6e4)
 
 
-def format_volume(cubic: float) -> str:
-    """Return a volume [m3] as text."""
-    return (
-        f"{format_number(cubic * 1e3)} l" if cubic >= 1e-4 else f"{format_number(cubic * 1e6)} cm³"
-    )
-
-
-def format_area(area: float) -> str:
-    """Return an area [m2] in cm2, without unit."""
-    return format_number(area * 1e4)
-
-
 def format_displacement(displacement: float) -> str:
     """Return a displacement [m3/rad] as text per revolution."""
-    volume_per_turn = displacement * 2 * math.pi
-    return (
-        f"{format_number(volume_per_turn * 1e3)} l/rev"
-        if volume_per_turn >= 1e-3
-        else f"{format_number(volume_per_turn * 1e6)} cm³/rev"
-    )
+    return f"{format_number(displacement * 2e6 * math.pi)} cm³/rev"
 
 
 SPOOL_HEIGHT = 20.0
@@ -228,7 +203,7 @@ def draw_check_valve(
     """Draw a check valve, optionally with a spring."""
     _draw_ports(canvas, pose, component, nets, paths, CHECK_HALF_LENGTH, CHECK_HALF_LENGTH)
     canvas.draw_line(pose((0, -CHECK_HALF_LENGTH), (0, -3.8)), linewidth=1.0)
-    canvas.draw_circle(pose.transform_point(0, 0.4), 3.0, gid=component)
+    canvas.draw_circle(pose((0, 0.4))[0], 3.0, gid=component)
     canvas.draw_line(pose((-4.4, 0.4), (0, -3.9), (4.4, 0.4)))
     outlet = pose((0, 3.4), (0, CHECK_HALF_LENGTH))
     if has_spring:
@@ -270,7 +245,7 @@ def draw_rupture_valve(
     """Draw a hose rupture valve."""
     _draw_ports(canvas, pose, component, nets, paths, CHECK_HALF_LENGTH + 2, 6.5)
     canvas.draw_box(*pose((-6, -6.5), (6, 6.5)), gid=component)
-    canvas.draw_circle(pose.transform_point(0, 0.5), 2.2, zorder=3.1)
+    canvas.draw_circle(pose((0, 0.5))[0], 2.2, zorder=3.1)
     canvas.draw_line(pose((-3.4, -2.4), (0, -5.6), (3.4, -2.4)))
     canvas.draw_spring(*pose((0, -1.6), (0, -5.4)), half_width=1.2)
     canvas.draw_line(pose((0, 2.7), (0, 6.5)))

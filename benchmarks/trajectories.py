@@ -1,0 +1,131 @@
+"""Error against time: every engine on every trajectory problem, over a sweep of its settings."""
+
+import statistics
+import time
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from engines import ENGINES
+from engines.engine import Engine, UnsupportedError
+from problem import Problem
+
+ROUNDS = 3  # runs of a setting, whose median counts
+LONGEST_RUN = 2.0  # CPU time [s] after which finer settings are left out
+
+
+@dataclass(frozen=True)
+class Point:
+    """A run of an engine with a setting.
+
+    Attributes:
+        problem: Name of the problem.
+        engine: Name of the engine.
+        setting: Step length [s] or tolerance, and further settings.
+        error: Largest error of a centre of mass at the outputs [m].
+        time: CPU time of the run, median [s].
+        loop_error: Largest distance of the origins of a loop at the end [m].
+        energy_drift: Change of the energy over the run [J]; NaN where forces do work.
+        build: CPU time of building the simulator [s].
+        failure: Why there is none, in one line.
+    """
+
+    problem: str
+    engine: str
+    setting: str = ""
+    error: float = np.inf
+    time: float = np.inf
+    loop_error: float = np.inf
+    energy_drift: float = np.nan
+    build: float = np.nan
+    failure: str = ""
+
+    def as_json(self) -> dict[str, Any]:
+        """Its values, without those that are not finite."""
+        return {key: value for key, value in asdict(self).items()
+                if value != "" and (isinstance(value, str) or np.isfinite(value))}  # fmt: skip
+
+
+def measure(problem: Problem, engines: Iterable[Engine]) -> list[Point]:
+    """Points of all engines on a problem; engines take turns setting by setting."""
+    points: list[Point] = []
+    queues = {engine: list(engine.settings(problem)) for engine in engines}
+    while queues:
+        for engine in list(queues):
+            if not queues[engine]:
+                del queues[engine]
+                continue
+            setting = queues[engine].pop(0)
+            point = measure_setting(problem, engine, setting)
+            points.append(point)
+            if point.time > LONGEST_RUN and not point.failure:
+                del queues[engine]
+    return points
+
+
+def measure_setting(problem: Problem, engine: Engine, setting: Any) -> Point:
+    """The point of one setting."""
+    text = " ".join(f"{x:g}" for x in np.atleast_1d(setting))
+    found = {"problem": problem.name, "engine": engine.name, "setting": text}
+    start = time.process_time()
+    try:
+        simulator = engine.build(problem, setting)
+        built = time.process_time() - start
+        times, result = [], None
+        for _ in range(ROUNDS):
+            start = time.process_time()
+            result = simulator.run()
+            times.append(time.process_time() - start)
+            if times[-1] > LONGEST_RUN:
+                break
+        states = simulator.states(result)
+    except UnsupportedError as error:
+        return Point(**found, failure=str(error))
+    except Exception as error:  # an engine that gives up
+        return Point(**found, failure=f"{type(error).__name__}: {error}".splitlines()[0])
+    if len(states) < len(problem.times) - 1:
+        return Point(**found, failure=f"unstable after {len(states)} outputs")
+    positions = np.array([state.position for state in states])
+    error = problem.error(positions)
+    if not np.isfinite(error):
+        return Point(**found, failure="unstable")
+    system = problem.system
+    drift = np.nan
+    if problem.is_conservative:
+        energies = [system.energy(state) for state in states]
+        drift = max(abs(energy - system.energy(system.start)) for energy in energies)
+    return Point(
+        **found,
+        error=error,
+        time=statistics.median(times),
+        loop_error=max(system.loop_error(state) for state in states),
+        energy_drift=drift,
+        build=built,
+    )
+
+
+def time_at_error(points: Iterable[Point], error: float) -> float | None:
+    """Least time [s] in which an engine gets below an error, None if it never does.
+
+    Times between two settings of the frontier are interpolated on logarithmic scales.
+    """
+    frontier: list[Point] = []
+    for point in sorted(points, key=lambda point: point.time):
+        if not point.failure and (not frontier or point.error < frontier[-1].error):
+            frontier.append(point)
+    if not frontier or frontier[-1].error > error:
+        return None
+    errors = np.log([max(point.error, 1e-16) for point in frontier[::-1]])
+    times = np.log([point.time for point in frontier[::-1]])
+    return float(np.exp(np.interp(np.log(error), errors, times)))
+
+
+def available_engines() -> tuple[list[Engine], list[str]]:
+    """The engines that are installed, and a line for each that is not."""
+    missing = [
+        f"{engine.name} is left out: {engine.package} is not installed"
+        for engine in ENGINES
+        if not engine.version()
+    ]
+    return [engine for engine in ENGINES if engine.version()], missing

@@ -1,0 +1,97 @@
+"""The referee of `benchmarks/`: reference solutions, engines, and what it makes of them."""
+
+import hydraulic_crane
+import numpy as np
+import pytest
+from engines import ENGINES
+from engines.crane_engine import Crane
+from engines.mujoco_engine import MuJoCo
+from engines.pinocchio_engine import Pinocchio
+from problem import Problem, problems
+from reference import crane_positions, independent_positions
+from trajectories import Point, measure_setting, time_at_error
+from warned import quiet
+
+PROBLEMS = {problem.name: problem for problem in problems()}
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_problems_start_closed_and_have_a_reference(name):
+    problem = PROBLEMS[name]
+    system = quiet(lambda: problem.system)
+    assert system.loops and system.loop_error(system.start) < 1e-12
+    assert problem.reference.shape == (10, len(system.bodies), 3)
+    assert all(abs(problem.times[1] / step % 1 - 0.5) > 0.499999 for step in problem.steps)
+
+
+def test_the_squeezer_ends_where_the_test_set_for_ivp_solvers_says():
+    problem = PROBLEMS["andrews_squeezer"]
+    system = problem.system
+    q = np.array([problem.published[body.name] for body in system.bodies])
+    ends = system.state(q, np.zeros(len(q))).position
+    np.testing.assert_allclose(problem.reference[-1], ends, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [
+        ("bricard", 1e-11),
+        *(pytest.param(name, error, marks=pytest.mark.slow)
+          for name, error in (("mini_forwarder", 1e-11), ("andrews_squeezer", 1e-13),
+                              ("flyball_governor", 1e-11),
+                              ("slider_crank", 1e-9), ("n_four_bar_2", 2e-8),
+                              ("n_four_bar_40", 2e-6))),
+    ],
+)  # fmt: skip
+def test_references_by_two_ways(name, error):
+    """Dense equations with multipliers, or a closed form, against crane."""
+    problem = PROBLEMS[name]
+    assert problem.error(quiet(crane_positions, problem)) < error
+    if name in ("mini_forwarder", "slider_crank"):
+        assert problem.error(independent_positions(problem)[0]) < 1e-11
+
+
+@pytest.mark.parametrize(
+    ("engine", "setting", "error"),
+    [
+        (Crane("DOP853"), 1e-10, 1e-10),
+        (Crane("rk4"), 1e-3, 1e-8),
+        (Pinocchio("lcaba"), (5e-3, 0.0), 1e-5),
+        (Pinocchio("constraintDynamics"), (1e-3, 0.0), 1e-4),
+        (MuJoCo("RK4"), (1e-3, 0.45, 0.9999), 1e-5),
+    ],
+    ids=lambda value: getattr(value, "name", ""),
+)
+def test_engines_move_the_mini_forwarder_alike(engine, setting, error):
+    if not engine.version():
+        pytest.skip(f"{engine.package} is not installed")
+    point = measure_setting(PROBLEMS["mini_forwarder"], engine, setting)
+    assert not point.failure and point.error < error and point.loop_error < 10 * error
+    assert 0 < point.time < np.inf
+
+
+def test_an_unstable_run_is_a_failure_in_one_line():
+    point = measure_setting(PROBLEMS["bricard"], MuJoCo("Euler"), (0.05, 0.1, 0.9999))
+    assert point.failure and "\n" not in point.failure and point.error == np.inf
+
+
+def test_time_at_an_error_is_that_of_the_frontier():
+    points = [Point("p", "e", error=e, time=t) for e, t in ((1e-2, 1), (1e-1, 3), (1e-4, 10))]
+    points.append(Point("p", "e", failure="unstable"))
+    assert time_at_error(points, 1.0) == 1 and time_at_error(points, 1e-5) is None
+    assert time_at_error(points, 1e-3) == pytest.approx(10**0.5)
+
+
+def test_names_of_engines_and_problems_are_unique():
+    assert len({engine.name for engine in ENGINES}) == len(ENGINES)
+    assert all(isinstance(problem, Problem) and problem.source for problem in PROBLEMS.values())
+
+
+@pytest.mark.slow
+def test_the_two_arm_crane_follows_equations_by_hand():
+    machine, state = quiet(hydraulic_crane.start)
+    assert (state[4:] > 0.99e5).all()
+    found = quiet(hydraulic_crane.simulate_crane, machine, 1e-8)
+    strokes = found.q[1:]
+    assert np.ptp(strokes, axis=0).min() > 0.01
+    np.testing.assert_allclose(strokes, hydraulic_crane.reference(), rtol=0, atol=2e-9)
