@@ -16,6 +16,7 @@ from crane.identification.mechanics.smoothed_motion import (
 from crane.identification.signals import kalman_smoother
 from crane.identification.signals import signal_processing as signals
 from crane.identification.signals.signal_processing import Motion, differentiate
+from crane.identification.signals.signal_quality import spectral_edge_frequency
 
 JOINTS, UNITS = ("q1", "X1"), {"q1": "rad", "X1": "m"}
 
@@ -412,3 +413,14 @@ def test_forces_come_late():
     )
     with pytest.raises(RecordingError, match="'q1_force' is 200 ms behind its model"):
         check_forces(late, modelled[50:], JOINTS)
+
+
+@pytest.mark.parametrize(("amplitude", "edge"), [(0.05, 1.03), (0.1, 4.0)])
+def test_a_spectral_edge_leaves_out_half_a_percent_of_the_power(amplitude, edge):
+    """Of 20.6 and 80 periods, so that the first one leaks; its Hann window holds it together."""
+    time = 0.02 * np.arange(1000)
+    x = np.sin(2 * np.pi * 1.03 * time) + amplitude * np.sin(2 * np.pi * 4.0 * time)
+    found = spectral_edge_frequency(np.column_stack([np.ones(1000), 1e3 * x + 7.0]), 0.02)
+    assert found == pytest.approx(edge, abs=2 / 20.0)
+    held = spectral_edge_frequency(np.sin(2 * np.pi * 1.03 * time)[:, None], 0.02, 0.9999)
+    assert held == pytest.approx(1.03, abs=4 / 20.0)
