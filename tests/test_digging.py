@@ -183,6 +183,12 @@ def test_directions_beside_the_plane_through_the_slewing_axis(excavator):
     assert np.abs(field.section_directions() - expected).max() < 1e-9
 
 
+def test_a_quarter_turn_is_rated_where_the_machine_can_tip(excavator):
+    given = {"direction": "up", "radii": [6.0], "heights": [0.0]}
+    assert np.ptp(crane.ratings.tool_force(excavator, **given).slews) == pytest.approx(np.pi / 2)
+    assert len(crane.ratings.tool_force(excavator, **given, weights=False).slews) == 1
+
+
 @pytest.mark.parametrize(
     ("given", "gap"),
     [

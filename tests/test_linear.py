@@ -130,6 +130,8 @@ def test_a_mass_on_a_spring_under_a_force(tmp_path):
     s = 2j * np.pi * 0.7
     wanted = 1.0 / (2000 * s * s + 300 * s + 5e4)
     np.testing.assert_allclose(model.response([0.7])[0, 0, 0], wanted, rtol=1e-12)
+    rising = crane.linearize(machine, drive="forces", velocity={"x": 0.2})
+    assert rising.u[0] - model.u[0] == pytest.approx(300.0 * 0.2, rel=1e-9)
 
 
 def deviations(machine, model, controller, start, moved, times):
