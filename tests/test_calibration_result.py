@@ -3,6 +3,9 @@
 import numpy as np
 import pytest
 
+import crane
+from crane.description.parameter_changes import parameters
+from crane.formats.machine_loading import MachineVariants
 from crane.identification.calibration.calibration_result import (
     FittedParameter,
     correlation_ratio,
@@ -15,6 +18,18 @@ from crane.identification.calibration.calibration_statistics import (
     estimate_with_profiles,
     evaluate_profile_ends,
 )
+from crane.identification.calibration.unknowns import build_unknowns
+
+
+def test_numbers_keep_their_sign():
+    """A piston that drives its joint backwards has a negative area."""
+    spec = MachineVariants(crane.load("kr300")).spec
+    numbers = parameters(spec)
+    names = ["gas_spring.stroke.area", "gas_spring.stroke.pressure", "link2_anchor.x"]
+    area, pressure, pin = build_unknowns(names, spec, numbers, {})
+    assert area.start < area.high < 0 and area.low == -np.inf
+    assert 0 < pressure.low < pressure.start and pressure.high == np.inf
+    assert (pin.low, pin.high) == (-np.inf, np.inf)
 
 
 class Fake:

@@ -185,6 +185,12 @@ def test_small_motions_under_forces_are_the_simulation(patu, velocity):
         assert gaps[1] < 2e-2
 
 
+def test_in_motion_the_pump_keeps_its_pressure(patu):
+    model = crane.linearize(patu, velocity={"X_lift": 0.03})
+    rate = model.rate[list(model.states).index("pressure_supply")]
+    assert abs(rate) < 1.0  # of 1e8 Pa/s where the pump's flow is not taken
+
+
 def test_small_motions_on_the_valves_are_the_simulation(patu):
     """The boom rings on its oil after a push; a valve that is open answers its signal."""
     # both chambers well above the tank, whose valves let oil in below

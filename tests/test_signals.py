@@ -12,6 +12,7 @@ from crane.common.errors import CraneWarning, InputError, RecordingError
 from crane.identification.mechanics.force_comparison import check_forces
 from crane.identification.mechanics.smoothed_motion import (
     check_recording,
+    signal_delay,
 )
 from crane.identification.signals import kalman_smoother
 from crane.identification.signals import signal_processing as signals
@@ -424,3 +425,15 @@ def test_a_spectral_edge_leaves_out_half_a_percent_of_the_power(amplitude, edge)
     assert found == pytest.approx(edge, abs=2 / 20.0)
     held = spectral_edge_frequency(np.sin(2 * np.pi * 1.03 * time)[:, None], 0.02, 0.9999)
     assert held == pytest.approx(1.03, abs=4 / 20.0)
+
+
+@pytest.mark.parametrize("delay", [-0.1234, -0.004, 0.0, 0.003, 0.2468])
+def test_delays_of_parts_of_a_sample(delay):
+    """Of a smooth signal that does not repeat; a parabola errs by a hundredth of a sample."""
+    time = 0.01 * np.arange(1000)
+
+    def signal(t):
+        return sum(np.sin(rate * t + rate) for rate in (2.0, 3.3, 5.1, 7.7))
+
+    found = signal_delay(time, signal(time), signal(time - delay))
+    assert found == pytest.approx(delay, abs=2e-4)
