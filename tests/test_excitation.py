@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import urdf_text
 from command_line import typed
 
 import crane
@@ -324,6 +325,18 @@ def test_command(tmp_path):
         result = typed(*arguments, *extra)
         assert result.returncode == 2 and result.stdout == ""
         assert len(result.stderr.splitlines()) == 1 and text in result.stderr
+
+
+def test_joints_without_limits_stay_near_home(tmp_path):
+    """Within 1 rad, and within the 0.4 m between the joints."""
+    parts = [
+        urdf_text.body("beam", 1.0), urdf_text.joint("h", "base", "beam", axis=(0, 1, 0)),
+        urdf_text.body("slider", 1.0),
+        urdf_text.joint("s", "beam", "slider", (0.4, 0, 0), "prismatic", (1, 0, 0)),
+    ]  # fmt: skip
+    machine = crane.load(urdf_text.write(tmp_path, "two", "base", *parts))
+    limits = trajectory_limits(machine, margin=0.1)
+    np.testing.assert_allclose(limits.half_stroke, [0.9, 0.36], rtol=1e-12)
 
 
 @pytest.mark.parametrize(("pump", "through"), [(1.6667e-3, 6.6667e-4), (4e-4, 4e-4)])
