@@ -1,11 +1,14 @@
 """Estimators: closed forms, robustness, coverage of their intervals, and the jackknife."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter, sosfiltfilt
 from scipy.stats import f, t
 
 from crane.common.errors import InputError
+from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt
 from crane.identification.estimation.estimators import (
     huber,
     instrumental_variables,
@@ -222,6 +225,28 @@ def test_how_long_noise_is_correlated():
         e[k] += 0.9 * e[k - 1]
     long, white = (NoiseModel.fit(x, np.arange(len(x))).correlation_time for x in (e, u))
     assert long == pytest.approx(1.81 / 0.19, rel=0.1) and white == pytest.approx(1, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("decay", "count", "expected"),
+    [
+        (0.9, 1000, 4 * 0.02 * (1 - 0.9**29) / 0.1),  # correlations down to 0.9^28 = 0.052
+        (0.0, 1000, (9.99 + 19.98) / 40),
+        (0.99, 1000, (9.99 + 19.98) / 8),
+    ],
+)
+def test_blocks_of_a_calibration_last_four_correlation_times(decay, count, expected):
+    """Residuals decay^k, whose autocorrelation is decay^k; at least 8 blocks, at most 40."""
+    residuals, cases = [], []
+    for step, its_decay in ((0.01, 0.0), (0.02, decay)):
+        time = step * np.arange(count)
+        inputs = SimpleNamespace(time=time)
+        mask = np.full(count, True)
+        cases.append(SimpleNamespace(inputs=inputs, train_mask=mask, sensors=("x", "p")))
+        columns = [np.zeros(count), its_decay ** np.arange(count)]
+        residuals.append(np.column_stack(columns).ravel())
+    fit = SimpleNamespace(training_cases=cases, residual=np.concatenate(residuals))
+    assert LevenbergMarquardt._block_duration(fit) == pytest.approx(expected, rel=0.02)
 
 
 @pytest.mark.parametrize("estimator", [least_squares, weighted_least_squares, huber])

@@ -1,5 +1,7 @@
 """Results write themselves into folders, from Python as from the command line."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from writing_commands import read
@@ -158,6 +160,20 @@ CASES = {
 SLOW = "Calibration", "SignalExcitation"
 
 
+@pytest.mark.parametrize("signal_range", [5.0, -5.0])
+def test_slopes_of_what_a_valve_curve_gives_a_machine_file(signal_range):
+    """Beside central differences, for valves that extend at high and at low signals."""
+    curve = dataclasses.replace(valve_curve(None), signal_range=signal_range)
+    curve.values[:] = [0.7, -0.4, 0.11, 0.09]
+    _, _, slopes = curve.valve_parameters()
+    for i, step in enumerate(1e-6 * np.eye(4)):
+        more, less = (
+            dataclasses.replace(curve, values=curve.values + sign * step).valve_parameters()[1]
+            for sign in (1, -1)
+        )
+        np.testing.assert_allclose(slopes[:, i], (more - less) / 2e-6, rtol=1e-7, atol=1e-12)
+
+
 def test_every_result_has_a_case():
     def subclasses(of):
         return {x for one in of.__subclasses__() for x in {one, *subclasses(one)}}
@@ -178,6 +194,7 @@ def test_written_from_python(name, folder, tmp_path):
     make, options, names = CASES[name]
     result = make(folder)
     assert type(result).__name__ == name
+    assert len(repr(result)) <= 200 and "\n" not in repr(result)
     options = {key: x(folder) if callable(x) else x for key, x in options.items()}
     target = tmp_path / "new" / "result"
     text = result.write(target, **options)
