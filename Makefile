@@ -21,7 +21,7 @@ help:
 	@echo "make test    fast tests"
 	@echo "make slow    slow tests: browser, MuJoCo, long simulations"
 	@echo "make long    more of the same for an hour, before a release"
-	@echo "make mutants   100 random faults in the code, and which of them fast tests notice; hours"
+	@echo "make mutants   100 random faults in the code, and which of them fast tests notice; an hour"
 	@echo "make lint    ruff and mypy"
 	@echo "make docs    the site, its tutorials executed and its links followed; build/site/index.html"
 	@echo "make bench   measure speed; results in docs/performance.md"
