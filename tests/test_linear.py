@@ -185,8 +185,10 @@ def test_small_motions_under_forces_are_the_simulation(patu, velocity):
         assert gaps[1] < 2e-2
 
 
-def test_in_motion_the_pump_keeps_its_pressure(patu):
-    model = crane.linearize(patu, velocity={"X_lift": 0.03})
+@pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+@pytest.mark.parametrize(("name", "joint"), [("patu655", "X_lift"), ("excavator_ls", "X_boom")])
+def test_in_motion_the_pump_keeps_its_pressure(name, joint):
+    model = crane.linearize(crane.load(name), velocity={joint: 0.03})
     rate = model.rate[list(model.states).index("pressure_supply")]
     assert abs(rate) < 1.0  # of 1e8 Pa/s where the pump's flow is not taken
 
