@@ -17,6 +17,7 @@ from crane.identification.estimation.estimators import (
 )
 from crane.identification.estimation.noise_model import Jackknife, NoiseModel
 from crane.identification.mechanics.identifiability import essential_parameters
+from crane.identification.mechanics.identify_payload import _widen_covariance
 
 
 def white(count=800, size=4, seed=0, noise=0.5):
@@ -247,6 +248,21 @@ def test_blocks_of_a_calibration_last_four_correlation_times(decay, count, expec
         residuals.append(np.column_stack(columns).ravel())
     fit = SimpleNamespace(training_cases=cases, residual=np.concatenate(residuals))
     assert LevenbergMarquardt._block_duration(fit) == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("inflation", [0.5, 1.5, 4.0])
+def test_payloads_are_as_uncertain_as_their_segments_differ(inflation):
+    """A mean of ten segments, whose jackknife gives sum (m_i - m)^2 / (K (K - 1))."""
+    means = np.random.default_rng(3).normal(size=10)
+    variance = np.square(means - means.mean()).sum() / 90
+    segments = np.array([[[1.0, m], [0.0, 0.0]] for m in means])
+    equations = SimpleNamespace(segment_factors=lambda count: segments[:count])
+    estimate = SimpleNamespace(
+        noise=np.ones(10), covariance=np.array([[variance / inflation]]), degrees_of_freedom=77.0
+    )
+    covariance, freedom = _widen_covariance(equations, np.eye(1), estimate, np.eye(1))
+    assert covariance[0, 0] == pytest.approx(variance / min(inflation, 1.0), rel=1e-12)
+    assert freedom.tolist() == [9.0 if inflation > 1 else 77.0]
 
 
 @pytest.mark.parametrize("estimator", [least_squares, weighted_least_squares, huber])
