@@ -9,7 +9,7 @@ import pinocchio as pin
 import crane
 from crane.codegen import Program
 from crane.control import ControlLaw, ValveDrive
-from crane.simulation.integration.charts import Chart, row_layout
+from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.integrators import ErrorControlledIntegrator, FixedStepIntegrator
 from crane.simulation.integration.rosenbrock import RosenbrockStepper
 
@@ -62,13 +62,13 @@ class Runner:
     def __init__(self, machine: crane.Machine, control: ControlLaw, q_a: Array, v_a: Array):
         own = control.start(q_a)
         self._start = np.concatenate([machine.closure.solve(q_a), v_a, own, np.zeros(2)])
-        chart = Chart.from_dynamics(crane.Dynamics(machine))
+        chart = Chart.from_dynamics(crane.Dynamics(machine), control, len(own))
         self._way = (
-            ErrorControlledIntegrator(chart, control, len(own), RosenbrockStepper)
+            ErrorControlledIntegrator(chart, RosenbrockStepper)
             if isinstance(control, ValveDrive)
-            else FixedStepIntegrator(chart, control, len(own))
+            else FixedStepIntegrator(chart)
         )
-        self._columns = row_layout(machine, control, len(own)).size
+        self._columns = chart.row_layout.size
 
     def run(self, step: float, steps: int) -> Array:
         """The state after so many steps."""

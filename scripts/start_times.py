@@ -97,7 +97,7 @@ def _compiling() -> Iterator[tuple[str, float]]:
         yield quantity, time.perf_counter() - start
     control = PI(mini, task_trajectory(mini, "lift"))
     start = time.perf_counter()
-    RungeKuttaStepper(Chart.from_dynamics(dynamics), control, 3)
+    RungeKuttaStepper(Chart.from_dynamics(dynamics, control, 3))
     yield "the simulation's loop with PI control", time.perf_counter() - start
 
 

@@ -219,6 +219,22 @@ def test_a_linkage_with_a_rod_that_spins_turns_on_and_on(rssr):
     assert runs[1].q[-1, 0] == pytest.approx(runs[0].q[-1, 0], abs=1e-8)
 
 
+@pytest.mark.parametrize(("name", "method"), [("rod", "RK45"), ("rod", "BDF"), ("rssr", "DOP853")])
+def test_methods_of_scipy_turn_past_half_a_turn(name, method, rssr, tmp_path):
+    """The rod in active coordinates, the linkage in active and passive ones: as compiled."""
+    machine = rssr if name == "rssr" else load(tmp_path, ROD)
+    start = ([0.1, 0.3, 2.9, 1.0], [0.0, 1.0, 6.0, 5.0]), 0.3, 1e-2
+    if name == "rssr":
+        start = (rssr.home[rssr.closure.active] + [0.0, 2.8], [2.0, 9.0]), 0.5, 1e-2
+    found = crane.simulate(
+        machine, None, *start, method=method, tolerance=1e-8, backend="pinocchio"
+    )
+    expected = crane.simulate(machine, None, *start, tolerance=1e-12)
+    assert np.abs(np.diff(expected.q, axis=0)).max() > 1.0
+    np.testing.assert_allclose(found.q, expected.q, atol=2e-7)
+    np.testing.assert_allclose(found.v, expected.v, atol=2e-6)
+
+
 @pytest.mark.parametrize("name", ["rod", "rssr"])
 def test_derivatives_through_the_former_poles(name, rssr, tmp_path):
     """Of forward dynamics along the velocities, against differences along the same motions."""

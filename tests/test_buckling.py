@@ -126,7 +126,7 @@ def circuit(**more):
     cylinder = Cylinder("stroke", 2 * 5e-3, 2 * 3e-3, 1e-4, 1e-4, count=2, **more)
     return Hydraulics(
         Supply(pressure=2e7), Oil(), {"stroke": cylinder},
-        {"stroke": Valve("stroke", 1e-7, 1e-7, 1e-7, 1e-7)},
+        {"stroke": Valve("stroke", **dict.fromkeys(("c1", "c2", "c3", "c4"), 1e-7))},
     )  # fmt: skip
 
 

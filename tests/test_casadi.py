@@ -133,8 +133,9 @@ def test_the_simulation_s_rates_are_those_that_are_integrated(log_crane):
     machine = smooth(log_crane)
     function = crane.simulation.casadi_function(machine, "simulation")
     drive = ValveDrive(machine, ValveSignals(machine, [0.0], {}))
-    circuit, chart = drive.circuit, Chart.from_dynamics(crane.Dynamics(machine))
-    stepper = RosenbrockStepper(chart, drive, circuit.state_count)
+    circuit = drive.circuit
+    chart = Chart.from_dynamics(crane.Dynamics(machine), drive, circuit.state_count)
+    stepper = RosenbrockStepper(chart)
     rng, out = np.random.default_rng(1), np.empty(stepper._program.formula_outputs("rate").size)
     for q, v, _ in states(machine):
         own = drive.start(q[machine.closure.active]) * rng.uniform(0.7, 1.0, circuit.state_count)

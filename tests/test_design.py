@@ -140,12 +140,13 @@ def test_a_front_of_two_goals_is_that_of_a_grid():
     grid = []
     for a in np.linspace(low[0], high[0], 7):
         for b in np.linspace(low[1], high[1], 7):
-            values = np.array([a, b])
             try:
                 point = VariantEvaluation(
-                    variants, list(vary), values, high - low, MeasureOptions(user_measures=own)
+                    variants,
+                    dict(zip(vary, (a, b), strict=True)),
+                    MeasureOptions(user_measures=own),
                 )
-                grid.append([point.evaluate(x) for x in expressions])
+                grid.append([point.evaluate(x).value for x in expressions])
             except crane.CraneError:
                 continue
     grid = np.array(grid)
@@ -172,13 +173,15 @@ def test_slopes_are_those_of_variants_beside(text):
     ranges = np.array([0.5, 100.0, 0.3, 0.2])
     terms, expression = MeasureOptions(tasks=("grade",)), MeasureExpression(text)
 
-    def at(values):
-        return VariantEvaluation(variants, names, values, ranges, terms)
+    def at(values, exact=False):
+        point, intervals = (dict(zip(names, x.tolist(), strict=True)) for x in (values, ranges))
+        return VariantEvaluation(variants, point, terms, ranges=intervals if exact else None)
 
-    found = at(here).evaluate_dual(expression)
+    found = at(here, exact=True).evaluate(expression)
     for i, step in enumerate(1e-3 * ranges):
         more, less = (here + sign * step * np.eye(4)[i] for sign in (1, -1))
-        difference = (at(more).evaluate(expression) - at(less).evaluate(expression)) / (2 * step)
+        difference = at(more).evaluate(expression).value - at(less).evaluate(expression).value
+        difference /= 2 * step
         scale = max(abs(difference), abs(found.value) * 1e-2 / ranges[i])
         assert found.derivatives[i] == pytest.approx(difference, abs=2e-4 * scale)
 

@@ -9,8 +9,7 @@ import crane
 from crane.common.errors import CraneError
 from crane.formats.machine_loading import MachineVariants
 from crane.simulation.sensitivity import adjoint_integration, variational_integration
-from crane.simulation.sensitivity.motion_gradient import _largest_changes
-from crane.simulation.sensitivity.motion_sensitivities import SensitivityProblem
+from crane.simulation.sensitivity.motion_sensitivities import _largest_changes, follow_motion
 from crane.simulation.sensitivity.simulation_constants import SimulationConstants
 
 ORDER_8 = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
@@ -86,13 +85,13 @@ def hydraulic():
 
 def both(machine, controller, initial, duration, by, outputs, accuracy):
     """Sums of random weights of what `follow` gives, and the gradients of these."""
-    asked = SensitivityProblem.from_arguments(
+    track, _, _, asked = follow_motion(
         machine, controller, initial, duration, 1e-3, outputs, by, None, None, None
     )
-    track, several = asked.motion, 2
-    directions = asked.directions.derivatives(by, track.time)
-    base = asked.directions.nominal_constants(track.time)
-    sizes = {name: asked.directions.typical_change(name) for name in by}
+    several = 2
+    directions = asked.derivatives(by, track.time)
+    base = asked.nominal_constants(track.time)
+    sizes = {name: asked.typical_change(name) for name in by}
     stacked = SimulationConstants(*map(np.array, zip(*directions.values(), strict=True)))
     forward = variational_integration.VariationalIntegrator(
         track, outputs, base, stacked, np.array(list(sizes.values())), accuracy
@@ -153,19 +152,16 @@ def test_all_numbers_that_matter_are_found():
 def test_it_takes_no_more_for_more_numbers():
     """The way back, counted in lines."""
     machine, controller, initial, _, _, outputs = forwarder()
-    asked = SensitivityProblem.from_arguments(
+    track, _, _, asked = follow_motion(
         machine, controller, initial, 0.05, 1e-3, outputs, (), None, None, None
     )
-    track = asked.motion
-    base, names = asked.directions.nominal_constants(track.time), ["link3.mass", "link7.mass"]
+    base, names = asked.nominal_constants(track.time), ["link3.mass", "link7.mass"]
     names += [f"link{i}.com.{axis}" for i in (3, 4, 5, 6, 7) for axis in "xyz"]
-    every = asked.directions.derivatives(names, track.time)
+    every = asked.derivatives(names, track.time)
     work = []
     for count in (2, len(names)):
         some = {name: every[name] for name in names[:count]}
-        changes = _largest_changes(
-            some, {name: asked.directions.typical_change(name) for name in some}
-        )
+        changes = _largest_changes(some, {name: asked.typical_change(name) for name in some})
         gatherer = adjoint_integration.AdjointIntegrator(track, outputs, base, changes)
         with at_most(10**7) as counted:
             gatherer.integrate_backward(np.ones((1, 51, len(outputs))))

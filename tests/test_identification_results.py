@@ -19,7 +19,6 @@ from warned import without_a_word
 import crane
 from crane.common.errors import CraneWarning, InputError, OutputError, RecordingError
 from crane.identification.mechanics.identification_model import default_terms
-from crane.identification.mechanics.identified_description import divide_locked_bodies
 from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.identify_payload import identify_payload
 from crane.identification.mechanics.model_terms import (
@@ -27,6 +26,7 @@ from crane.identification.mechanics.model_terms import (
     body_names,
     friction_term,
 )
+from crane.identification.mechanics.write_identified import divide_locked_bodies
 from crane.identification.signals.signal_processing import Motion
 from crane.recordings.measured_recordings import read_run
 
@@ -98,22 +98,29 @@ def test_the_written_machine_is_the_identified_one(mini, found, tmp_path):
     assert abs(written.model.inertias[1].mass - mini.model.inertias[1].mass) > 1e-6
 
 
-def test_only_inertials_change_in_a_urdf(mini, found, tmp_path):
-    crane.identification.write_identified(found, tmp_path)
-    for chain in mini.chains:
-        before, after = (
-            etree.parse(str(file)).getroot() for file in (chain.urdf, tmp_path / chain.urdf.name)
-        )
-        for robot in (before, after):
-            for inertial in list(robot.iter("inertial")):
-                inertial.getparent().remove(inertial)
-        comments = [c.text for c in after.iter(etree.Comment)]
-        assert comments[0] == " Inertials: identified by wls, feasible. "
+def test_only_inertials_change_in_the_urdfs(mini, found, tmp_path):
+    written = crane.load(crane.identification.write_identified(found, tmp_path))
 
-        def said(robot):
-            return [(e.tag, dict(e.attrib)) for e in robot.iter("*")]
+    def places(machine):
+        return {
+            x.name: (x.kind, x.parent, x.child, x.xyz, x.rpy, x.axis, str(x.limits.lower))
+            for x in machine.tree.joints.values()
+        }
 
-        assert said(before) == said(after)
+    def shapes(machine):
+        robots = [etree.parse(str(chain.urdf)).getroot() for chain in machine.chains]
+        return {
+            link.get("name"): [dict(x.attrib) for x in link.iterfind("visual//*")]
+            for robot in robots
+            for link in robot.iter("link")
+        }
+
+    assert places(written) == places(mini) and written.tree.links.keys() == mini.tree.links.keys()
+    np.testing.assert_array_equal(written.home, mini.home)
+    assert shapes(written) == shapes(mini) and any(shapes(mini).values())
+    for chain in written.chains:
+        comment = chain.urdf.read_text().splitlines()[1]
+        assert "source: identified by wls, feasible; else " in comment
 
 
 LOADED = """<robot name="arm">
@@ -155,15 +162,12 @@ def test_one_urdf_with_a_loop_becomes_a_machine_file(tmp_path):
     noise = np.random.default_rng(0).normal(size=tau.shape)
     given = Motion(time[:, 0], q, v, a, 1.1 * tau + 0.1 * noise)
     result = identify(arm, given, prior=0.3, feasible=True)
-    with pytest.raises(OutputError) as caught:
-        crane.identification.write_identified(result, tmp_path / "sub" / "..")
-    assert "is what 'arm' was read from" in str(caught.value)
     written = crane.load(crane.identification.write_identified(result, tmp_path / "out"))
     at = result.model.samples(q, v, a)
     wanted = result.model.regressor(at) @ result.parameters
     again = crane.Dynamics(written).inverse(q, v, a, friction=True)
     assert np.abs(again - wanted).max() < 1e-10 * np.abs(wanted).max()
-    robot = etree.parse(str(tmp_path / "out" / "arm.urdf")).getroot()
+    robot = etree.parse(str(written.chains[0].urdf)).getroot()
     having = {link.get("name") for link in robot.iter("link") if link.find("inertial") is not None}
     assert having == {"base", "beam", "rocker", "rod"}
     assert robot.find("link[@name='tool']/visual") is not None
@@ -178,6 +182,9 @@ def test_the_load_that_a_machine_names_comes_along(edited, tmp_path):
     tau = crane.Dynamics(machine).inverse(q, v, a, friction=True)
     given = Motion(time[:, 0], q, v, a, tau + 0.1 * np.random.default_rng(0).normal(size=q.shape))
     result = identify(machine, given, prior=0.3, feasible=True)
+    with pytest.raises(OutputError) as caught:
+        crane.identification.write_identified(result, machine.path.parent / "sub" / "..")
+    assert f"is what '{machine.name}' was read from" in str(caught.value)
     file = crane.identification.write_identified(result, tmp_path / "out")
     assert (file.parent / "load.urdf").read_bytes() == load.read_bytes()
     written, loaded = (crane.load(file, {"payload.mass": mass}) for mass in (0.0, 3.0))
@@ -203,7 +210,6 @@ def test_what_cannot_be_written(mini, found, tmp_path):
     spring = [*default_terms(mini), Spring()]
     bodies = found.parameters.copy()
     bodies[4] = -1.0
-    changed = crane.load("mini_forwarder", {"link7.mass": 0.3})
     for result, message in (
         (plain, "forces determine base parameters only: give prior or feasible=True"),
         (
@@ -221,10 +227,6 @@ def test_what_cannot_be_written(mini, found, tmp_path):
                 ],
             ),
             "the model has friction over other velocities than the machine's",
-        ),
-        (
-            identify(changed, motion(changed), prior=0.3),
-            "'mini_forwarder' was loaded with parameter changes, identify it as its files",
         ),
     ):  # fmt: skip
         with pytest.raises(InputError) as caught:
@@ -552,6 +554,14 @@ def test_forces_at_rest_are_compared(mini):
 
 
 # --- locked machines -------------------------------------------------------------------------
+
+
+def test_a_machine_with_changes_is_written_with_them(mini, tmp_path):
+    changed = crane.load("mini_forwarder", {"link7.mass": 0.3, "end_stop.X1.stiffness": 3e6})
+    result = identify(changed, motion(changed), prior=0.3, feasible=True)
+    written = crane.load(crane.identification.write_identified(result, tmp_path / "out"))
+    assert written.end_stops == changed.end_stops != mini.end_stops
+    same_forces(result, written, *random_states(changed))
 
 
 def test_a_locked_machine_is_written_with_all_its_joints(mini, tmp_path):

@@ -297,5 +297,5 @@ def test_phases_in_python(machine):
         command.update(0.005, np.array([0.2, 0.2]), np.zeros(2), rest)
     with pytest.raises(crane.CraneError, match="there are no phases of levers"):
         crane.control.LeverPhases(machine, [])
-    with pytest.raises(crane.CraneError, match="the ramp of the levers is -1 s, give at least 0"):
+    with pytest.raises(crane.CraneError, match="the ramp of the levers is -1 s, it must not"):
         crane.control.LeverPhases(machine, phases, ramp=-1.0)

@@ -1,11 +1,13 @@
 """Limit cycles: detected in samples, reported for runs, predicted for load sensing."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from hydraulic_rig import COMPENSATED, rig
+from hydraulic_rig import AREA_A, AREA_B, COMPENSATED, HOSE, STROKE, rig
 from scipy.integrate import solve_ivp
+from warned import told
 
 import crane
 from crane.hydraulics.circuit_elements import Supply
@@ -189,6 +191,94 @@ def test_a_counterbalance_valve_that_swings_is_told(tmp_path, ratio, coefficient
     peak = np.fft.rfftfreq(16 * len(part), 1e-3)[lines.argmax()]
     assert found.frequency == pytest.approx(peak, rel=0.05) == pytest.approx(hertz, rel=0.05)
     assert f"pressure_x_a by {1e-5 * found.amplitude:.3g} bar at" in summarize(run).to_markdown()
+
+
+def lowered_by_hand(holding, mass, start, duration):
+    """The same load by equations that are written here, and scipy's Radau.
+
+    A chamber at the vapour pressure has a void, which its state counts in other units.
+    """
+    supply, tank, vapour, dead_band = 20e6, 1e5, 1e3, 0.1143
+    flow, margin = COMPENSATED["flow"], COMPENSATED["margin"]
+
+    def root(drop):
+        size = abs(drop)
+        laminar = 1.25e-2 * drop - 0.25e-10 * drop**3
+        return laminar if size < 1e4 else np.copysign(size**0.5, drop)
+
+    def rates(t, state):
+        x, v, *excess = state
+        a, b = (vapour + 1e5 * max(s, 0.0) for s in excess)
+        u = np.interp(t, [0.2, 0.3], [0.0, 0.5])
+        y = max(u - dead_band, 0.0) / (1 - dead_band)
+        opening = (a + holding["pilot_ratio"] * b - holding["pressure"]) / holding["range"]
+        spool = flow / margin**0.5 * y
+        valve = holding["coefficient"] * min(max(opening, 0.0), 1.0)
+        series = spool * valve / max(np.hypot(spool, valve), 1e-300)
+        net = [
+            -series * root(a - tank) - AREA_A * v,
+            spool * root(min(max(supply - b, 0.0), margin)) + AREA_B * v,
+        ]
+        volumes = [HOSE + AREA_A * x, HOSE + AREA_B * (STROKE - x)]
+        compliances = [
+            1e5 / MODULUS * (w if s > 0 else 2e-3) for w, s in zip(volumes, excess, strict=True)
+        ]
+        force = AREA_A * a - AREA_B * b - 300.0 * v
+        return [v, force / mass - 9.81, net[0] / compliances[0], net[1] / compliances[1]]
+
+    time = np.arange(0.0, duration + 5e-4, 1e-3)
+    carried = (mass * 9.81 + AREA_B * tank) / AREA_A
+    first = [start, 0.0, (carried - vapour) / 1e5, (tank - vapour) / 1e5]
+    run = solve_ivp(
+        rates, (0, duration), first, "Radau", t_eval=time, rtol=1e-8, atol=1e-8, max_step=5e-3
+    )
+    return run.y[0], vapour + 1e5 * np.maximum(run.y[2], 0.0)
+
+
+def test_a_counterbalance_valve_swings_as_by_equations_of_its_own(tmp_path):
+    holding = {"pressure": 9.7e6, "pilot_ratio": 4.0, "range": 3e6, "coefficient": 4e-7}
+    machine = rig(
+        tmp_path, COMPENSATED, {"counterbalance_a": holding}, {"pressure": 20e6}, mass=6000.0
+    )
+    lever = crane.control.ValveSignals(machine, [0, 0.2, 0.3, 3], {"x": [5.8, 5.8, 7.3, 7.3]})
+    run = crane.simulate(machine, lever, [0.5], duration=3.0, step=1e-3)
+    x, pressure = lowered_by_hand(holding, 6000.0, 0.5, 3.0)
+    assert np.abs(run.q[:, 0] - x).max() < 1e-6
+    assert np.abs(run["pressure_x_a"] - pressure).max() < 1e-3 * np.ptp(pressure)
+    (found,) = [one for one in limit_cycles(run) if one.channel == "pressure_x_a"]
+    swing = pressure[1000:]
+    up = np.flatnonzero((swing[:-1] < swing.mean()) & (swing[1:] >= swing.mean()))
+    ranges = [np.ptp(one) for one in np.split(swing, up)[1:-1]]
+    assert found.frequency == pytest.approx(1e3 / np.diff(up).mean(), rel=0.01)
+    assert found.amplitude == pytest.approx(np.median(ranges) / 2, rel=0.05) and found.end > 2.9
+    assert min(ranges) > 5e6
+
+
+def test_a_counterbalance_valve_that_cannot_open_is_told(tmp_path):
+    """Closed chambers carry the load on an oil spring: both pressures follow from the statics."""
+    load, supply, tank = 3000.0 * 9.81, 60e5, 1e5
+
+    def lower(ratio, level=6.2, duration=2.0):
+        holding = {"pressure": 2.1e7, "pilot_ratio": ratio, "range": 3e6, "coefficient": 4e-7}
+        valve = {"type": "orifice", **dict.fromkeys(("c1", "c2", "c3", "c4"), 1e-7)}
+        machine = rig(
+            tmp_path, valve, {"counterbalance_a": holding}, {"pressure": supply}, mass=3000.0,
+            friction={"viscous": 2e5},
+        )  # fmt: skip
+        lever = crane.control.ValveSignals(machine, [0, 0.2, 0.5], {"x": [0, 0, level]})
+        return told(crane.simulate, machine, lever, [0.3], duration=duration, step=1e-3)
+
+    run, (line,) = lower(1.5, -0.5)
+    held = (load + AREA_B * supply) / AREA_A
+    needed = (2.1e7 - held) / 1.5
+    assert run.q[-1, 0] == pytest.approx(0.3, abs=2e-3)
+    numbers = [1e5 * float(x) for x in re.findall(r"([\d.]+) bar", line)]
+    assert numbers == pytest.approx([held, needed, supply], rel=2e-3)
+    assert line.startswith("the counterbalance valve of chamber A of 'x' stays closed")
+    assert needed > supply > tank + (2.1e7 - held) / 4.0
+    for ratio, level, duration in ((4.0, -0.5, 2.0), (1.5, 0.5, 2.0), (1.5, 0.0, 2.0)):
+        assert lower(ratio, level, duration)[1] == []
+    assert lower(1.5, -0.5, 0.4)[1] == []  # the pilot pressure still rises
 
 
 def test_a_counterbalance_valve_that_settles_is_not(tmp_path):

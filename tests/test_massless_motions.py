@@ -64,13 +64,13 @@ def stewart(folder, axial, along="x"):
     return load(folder, lines, active=STROKES)
 
 
-def tie_rod(folder, axial, along="x", turned=0.7, more="", **options):
+def tie_rod(folder, axial, along="x", turned=0.7, more="", base="base", **options):
     """An arm that falls with a rod on a ball at its end."""
     e = np.eye(3)["xyz".index(along)]
     lines = [
         body("arm", 4.0, (0.5, 0, 0), (0.01, 0.3, 0.3)),
         body("rod", 1.0, 0.3 * e, np.where(e > 0, axial, 0.03)),
-        joint("h", "base", "arm", axis=(0, -1, 0)),
+        joint("h", base, "arm", axis=(0, -1, 0)),
         joint("b", "arm", "rod", (1, 0, 0), BALL),
         more,
     ]
@@ -376,3 +376,35 @@ def test_the_threshold_is_a_radius_of_gyration(tmp_path):
     assert found.forward(start(thin), np.zeros(4), np.zeros(4)) == pytest.approx(one, abs=0)
     idle = crane.Dynamics(wires[1e-6]).forward(start(thin), np.zeros(4), np.zeros(4))
     assert one[0] == pytest.approx(idle[0], rel=1e-8)
+
+
+@pytest.mark.parametrize("along", ["x", "y", "z"])
+def test_a_rod_that_spins_idly_sways_about_its_equilibrium(tmp_path, along):
+    """On an arm that hangs too: modes are those of a thick rod by Pinocchio, less its spin."""
+    free = ["h", "b_rx", "b_ry", "b_rz"]
+    pillar = body("pillar", 9.0, moments=(1, 1, 1)) + joint("az", "base", "pillar")
+    lines = {"active": ["az"], "free": free, "more": pillar}
+    thin, thick = (
+        tie_rod(tmp_path, axial, along, base="pillar", **lines) for axial in (0.0, 5e-3)
+    )
+    assert len(thin.held) == 1 and not thick.held
+    sway, begin = crane.motion.Sway(thin), start(thin)
+    begin[thin.active.index("h")] = -1.2
+    hanging = sway.hanging_equilibrium(begin)
+    assert len(sway.free_indices) == 3 and hanging[thin.active.index("h")] == pytest.approx(
+        -np.pi / 2
+    )
+    q = thick.coordinates.configuration(thick.closure.solve(hanging))
+    data, rows = thick.model.createData(), [thick.column(joint) for joint in free]
+    upper = pin.crba(thick.model, data, q)
+    mass = (np.triu(upper) + np.triu(upper, 1).T)[np.ix_(rows, rows)]
+    stiffness = pin.computeGeneralizedGravityDerivatives(thick.model, data, q)[np.ix_(rows, rows)]
+    squares = np.sort(np.linalg.eigvals(np.linalg.solve(mass, stiffness)).real)
+    assert abs(squares[0]) < 1e-6
+    omega, damping = sway.modes(hanging)
+    np.testing.assert_allclose(omega, np.sqrt(squares[1:]), rtol=1e-6)
+    assert not damping.any()
+    arm = tie_rod(tmp_path, 0.0, along)
+    assert arm.free and len(arm.held) == len(arm.free)
+    with pytest.raises(InputError, match="it has no free joints that move an inertia"):
+        crane.motion.Sway(arm)

@@ -12,7 +12,7 @@ from command_line import typed
 import crane
 from crane.common.errors import CraneError, CraneWarning, InputError, RecordingError
 from crane.description import Friction
-from crane.description.specification import EstimationSettings, ParameterPrior
+from crane.description.estimation_settings import EstimationSettings, ParameterPrior
 from crane.formats import write_machine
 from crane.identification.mechanics.cross_validation import (
     FOLD_COUNT,
@@ -23,7 +23,6 @@ from crane.identification.mechanics.cross_validation import (
 from crane.identification.mechanics.force_comparison import check_shared_samples
 from crane.identification.mechanics.identifiability import prior_from_names
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.identified_description import friction_laws
 from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.model_terms import (
     ForceDirection,
@@ -34,6 +33,7 @@ from crane.identification.mechanics.model_terms import (
     friction_term,
     root_friction_term,
 )
+from crane.identification.mechanics.write_identified import friction_laws
 from crane.identification.signals.signal_processing import Motion
 
 STEP = 5e-3
@@ -422,7 +422,7 @@ def test_the_prior_that_predicts_is_chosen(arm):
     ("tried", "options", "message"),
     [
         ({"link9": ["1 %"]}, {}, "prior 'link9' is unknown, did you mean 'link"),
-        ({"bodies": ["1 %", "3"]}, {}, "prior 'bodies' is 3.0, of bodies give a share"),
+        ({"bodies": ["1 %", "3"]}, {}, "prior 'bodies' is 3, of bodies give a share"),
         ({"bandwidth": [np.nan, 5.0]}, {}, "the bandwidth is nan Hz, give a number above 0"),
         ({"bandwidth": [5.0, -5.0]}, {}, "the bandwidth is -5.0 Hz, give a number above 0"),
         ({"bandwidth": ["x"]}, {}, "bandwidth is 'x', give numbers in Hz"),
@@ -462,7 +462,7 @@ def test_a_part_at_rest_judges_nothing(arm):
 def test_a_share_of_everything_stands_beside_what_is_tried(arm):
     (trial,) = cross_validate(arm, moved(arm), {"bodies": ["1 %"]}, prior=0.3, bandwidth=5.0)
     assert trial.mean_error < 0.1
-    assert identify_options(trial.settings, {"prior": 0.3})["prior"] == {
+    assert identify_options(arm, trial.settings, {"prior": 0.3})["prior"] == {
         "*": ParameterPrior(0.3, relative=True), "bodies": ParameterPrior(0.01, relative=True)
     }  # fmt: skip
 

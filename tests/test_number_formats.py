@@ -24,9 +24,11 @@ from crane.common.samples import (
     as_seed,
 )
 from crane.common.units import display_unit, format_number, format_quantity
-from crane.description.specification import ParameterPrior
+from crane.description.estimation_settings import ParameterPrior
+from crane.recordings.logs import read_log
 from crane.recordings.recording_summary import recorded_machine_name, result_title
 from crane.recordings.table_reader import read_csv
+from crane.studies.optimization.measure_expressions import MeasureExpression
 from crane.studies.variant_study import StudyJob, measure_variant
 
 
@@ -76,11 +78,17 @@ def test_a_number_is_the_same_in_every_file_and_option(slider_crank, tmp_path, t
     (tmp_path / "odd.urdf").write_text(re.sub('mass value="[^"]*"', f'mass value="{text}"', urdf))
     with pytest.raises(CraneError, match="is not a number, write digits"):
         crane.load(tmp_path / "odd.urdf")
-    with pytest.raises(InputError, match="says no standard deviation"):
+    with pytest.raises(InputError, match="says no standard deviation|no known unit"):
         ParameterPrior.parse(text)
     (tmp_path / "odd.csv").write_text(f"time [s],q [m]\n0,1\n1,{text}\n")
     with pytest.raises(RecordingError, match="line 3, column 'q': .* is not a finite number"):
         read_csv(tmp_path / "odd.csv")
+    with pytest.raises(InputError, match="is no expression|is not a number, write such as"):
+        MeasureExpression(f"2 * mass + {text}")
+    (tmp_path / "plain.csv").write_text("t,q\n0,1\n1,2\n")
+    (tmp_path / "columns.txt").write_text(f"time [s] = t\nq [m] = q + {text}\n")
+    with pytest.raises(RecordingError, match=r"columns.txt:2: .* cannot be computed"):
+        read_log(tmp_path / "plain.csv", tmp_path / "columns.txt")
     path = slider_crank.path
     for words in (
         ["simulate", path, "--step", text],

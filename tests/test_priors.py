@@ -7,7 +7,7 @@ from broken_machines import DATA
 import crane
 from crane.common.errors import InputError
 from crane.description import Friction
-from crane.description.specification import ParameterPrior
+from crane.description.estimation_settings import ParameterPrior
 from crane.identification.mechanics.identifiability import prior_from_names
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.identify import Motion, identify

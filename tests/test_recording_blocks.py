@@ -11,7 +11,7 @@ import forwarder_motions
 import numpy as np
 import pytest
 from command_line import typed
-from scipy.signal import lfilter
+from scipy.signal import butter, lfilter, sosfiltfilt
 
 import crane
 from crane.common import scratch_arrays
@@ -22,7 +22,7 @@ from crane.identification.estimation.estimators import (
     least_squares,
     weighted_least_squares,
 )
-from crane.identification.mechanics import regression_equations
+from crane.identification.mechanics import regression_equations, smoothed_motion
 from crane.identification.mechanics.identification_model import IdentificationModel, default_terms
 from crane.identification.mechanics.identify import build_equations, identify
 from crane.identification.mechanics.model_terms import PreslidingFriction
@@ -30,10 +30,11 @@ from crane.identification.mechanics.regression_equations import (
     CombinedRegressor,
     RegressionEquations,
 )
-from crane.identification.signals import kalman_smoother
+from crane.identification.signals import kalman_smoother, signal_processing
 from crane.identification.signals.signal_processing import Motion
-from crane.recordings.measured_recordings import read_run
+from crane.recordings.measured_recordings import _remove_free_forces, read_run
 from crane.recordings.recording import Recording
+from crane.recordings.timeseries import Table
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 motion = partial(forwarder_motions.motion, period=8.0, duration=16.0, step=2e-3, noise=1.0)
@@ -173,7 +174,7 @@ finally:
 @pytest.fixture
 def small(monkeypatch):
     """Scratch files for short recordings, too, in blocks of a few samples."""
-    monkeypatch.setattr(scratch_arrays, "_MIN_FILE_ELEMENTS", 1)
+    monkeypatch.setattr(scratch_arrays, "MIN_FILE_ELEMENTS", 1)
     monkeypatch.setattr(scratch_arrays, "BLOCK_SIZE", 64)
     monkeypatch.setattr("crane.recordings.timeseries.BLOCK_ROWS", 50)
 
@@ -228,7 +229,7 @@ def test_a_motion_is_smoothed_in_a_few_columns(mini, monkeypatch):
     """Whole series are in scratch files, and blocks take as much for any recording."""
     from crane.identification.mechanics.smoothed_motion import smoothed_motion
 
-    monkeypatch.setattr(scratch_arrays, "_MIN_FILE_ELEMENTS", 1)
+    monkeypatch.setattr(scratch_arrays, "MIN_FILE_ELEMENTS", 1)
     time = np.arange(0.0, 200.0, 1e-3)
     rates = 2 * np.pi * np.array([0.31, 0.43, 0.57])
     middle, reach = 0.5 * (mini.lower + mini.upper), 0.2 * (mini.upper - mini.lower)
@@ -292,3 +293,39 @@ def test_memory_grows_by_less_than_a_recording(tmp_path):
         ]  # fmt: skip
     growth = [(long - short) / 180e3 for short, long in zip(*taken.values(), strict=True)]
     assert max(growth) < 160, growth  # half of that: some columns at a time
+
+
+@pytest.mark.parametrize("cutoff", [1.0, 20.0])
+def test_a_low_pass_in_blocks_is_that_of_the_whole(cutoff, monkeypatch):
+    time = 1e-3 * np.arange(200_000)
+    x = np.cumsum(np.random.default_rng(0).normal(size=(len(time), 2)), axis=0)
+    whole = sosfiltfilt(butter(4, cutoff, output="sos", fs=1e3), x, axis=0)
+    monkeypatch.setattr(signal_processing, "MIN_FILE_ELEMENTS", 1)
+    for columns, expected in ((x, whole), (x[:, 0], whole[:, 0])):
+        found = signal_processing.low_pass(time, columns, cutoff)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10 * np.abs(x).max())
+
+
+def test_velocities_of_a_long_recording_are_compared_at_fewer_instants(monkeypatch):
+    monkeypatch.setattr(smoothed_motion, "_MAX_COMPARED_SAMPLES", 1000)
+    time = 1e-3 * np.arange(30_000)
+    phase = 2 * np.pi * np.outer(time, [0.7, 1.9]) + [0.0, 1.0]
+    rng = np.random.default_rng(0)
+    q, v = np.sin(phase).sum(axis=1), (2 * np.pi * np.cos(phase) * [0.7, 1.9]).sum(axis=1)
+    q, v = (x[:, None] + 1e-3 * rng.normal(size=(len(time), 1)) for x in (q, v))
+    check = partial(smoothed_motion.check_recording, joints=("j",), units={"j": "rad"})
+    check(time, q, np.cos(q), v=v)
+    for wrong, told in (
+        (np.degrees(v), r"57\.\d times the derivative of 'j', 'j_velocity' looks like deg"),
+        (9 * np.sin(20 * time)[:, None], "'j_velocity' is not the derivative of 'j'"),
+        (np.roll(v, 150, axis=0), "'j_velocity' is 150 ms behind"),
+    ):
+        with pytest.raises(crane.CraneError, match=told):
+            check(time, q, np.cos(q), v=wrong)
+
+
+def test_columns_of_a_recording_are_not_copied(mini):
+    names = [x + suffix for suffix in ("", "_velocity", "_force") for x in mini.active]
+    units = dict.fromkeys(["time", *names], "")
+    table = Table(units, np.asfortranarray(np.random.default_rng(0).normal(size=(50, 10))), {})
+    assert np.shares_memory(_remove_free_forces(mini, table).values, table.values)

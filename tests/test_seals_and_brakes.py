@@ -261,12 +261,11 @@ def test_machine_code_and_pinocchio_agree_along_a_motion(smoothing):
     machine = gripping(smooth if smoothing else ())
     drive = crane.control.ValveDrive(machine, levers(machine))
     compiled, plain = (
-        Chart.from_dynamics(Dynamics(machine, backend=backend))
+        Chart.from_dynamics(Dynamics(machine, backend=backend), drive, drive.circuit.state_count)
         for backend in ("compiled", "pinocchio")
     )
-    fast = RosenbrockStepper(compiled, drive, drive.circuit.state_count)
-    slow = PythonStepper(plain, drive, drive.circuit.state_count)
-    checked = PythonStepper(compiled, drive, drive.circuit.state_count)
+    fast = RosenbrockStepper(compiled)
+    slow, checked = PythonStepper(plain), PythonStepper(compiled)
     recording = crane.simulate(machine, drive, None, 0.8, 1e-2)
     rested, n = 0, len(machine.active)
     for i in range(0, 80, 7):
@@ -374,7 +373,7 @@ def test_seals_press_through_dead_centres(tmp_path):
     """A crank spins while the cylinder at its slider turns back: seen from others, the same."""
     parts = {
         "cylinders": {"s": Cylinder("s", 2e-4, 2e-4, 1e-3, 1e-3, seal_friction=2e-5)},
-        "valves": {"s": Valve("s", 4e-6, 4e-6, 4e-6, 4e-6)},
+        "valves": {"s": Valve("s", c1=4e-6, c2=4e-6, c3=4e-6, c4=4e-6)},
     }
     machine = singular_linkages.slider_crank(tmp_path, "s", 0.3, 0.6)
     machine = machine.replace(

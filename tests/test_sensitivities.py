@@ -5,6 +5,8 @@ import warnings
 import numpy as np
 import pytest
 from command_line import typed
+from test_ball_joints import ROD, RSSR, RSSR_FILE
+from test_floating import box, hinge
 from urdf_text import sliding_block
 
 import crane
@@ -159,6 +161,77 @@ def test_a_closed_chain_under_computed_torque():
 
     by = ("link3.mass", "friction.X1.viscous", "link3_G.x")
     compare(machine, made, by, 2.0, 1e-3, ("X1", "q2", "X1_force", "tip_z"), 1e-2)
+
+
+SHIP = (
+    '<robot name="ship">' + box("hull", 8.0, "0.02 -0.01 0.05") + box("crank", 1.0, "0.1 0 0")
+    + box("coupler", 2.0, "0.2 0.02 0") + box("rocker", 1.5, "0.15 0 0.01")
+    + hinge("c", "hull", "crank", "0.1 0 0.2") + hinge("d", "crank", "coupler", "0.2 0 0")
+    + hinge("r", "hull", "rocker", "0.5 0 0.2") + '<link name="eye"/><link name="pin"/>'
+    + hinge("e", "coupler", "eye", "0.45 0 0", kind="fixed")
+    + hinge("f", "rocker", "pin", "0.3 0 0", kind="fixed") + "</robot>"
+)  # fmt: skip
+SHIP_FILE = """
+name: ship
+chains: [{name: all, urdf: ship.urdf}]
+loops: [{name: l, type: revolute, predecessor: eye, successor: pin}]
+active: [c]
+home: {c: 0.8, d: -0.58, r: 0.93}
+"""
+# starts and parameters: an open tree, a rod whose spin alone is active, a floating loop
+TURNING = {
+    "rod": (
+        ([0.1, 0.3, 2.0, 1.0], [0.0, 1.0, 2.0, 5.0]),
+        ("start.b_ry", "start.b_rz_velocity", "rod.mass"),
+    ),
+    "rssr": (None, ("start.b_rx", "start.c", "rod.mass", "rod_end.x")),
+    "ship": (None, ("start.base_ry", "start.base_x", "start.c", "coupler.mass", "pin.x")),
+}
+
+
+@pytest.mark.parametrize("name", TURNING)
+def test_machines_that_turn_past_half_a_turn(name, tmp_path):
+    """To 1e-6 of differences of runs, but for where these have rotation vectors on both sides."""
+    (initial, by), texts = TURNING[name], {"rod": ROD, "rssr": RSSR, "ship": SHIP}
+    (tmp_path / f"{name}.urdf").write_text(texts[name])
+    path = tmp_path / f"{name}.urdf"
+    if name != "rod":
+        path = tmp_path / f"{name}.yaml"
+        path.write_text({"rssr": RSSR_FILE, "ship": SHIP_FILE}[name])
+    machine = crane.load(path, floating=name == "ship")
+    if initial is None:
+        speeds = {"c": 3.0, "b_rx": 8.0, "base_rx": 4.0, "base_rz": 3.0}
+        v_a = [speeds.get(joint, 0.0) for joint in machine.active]
+        initial = machine.home[machine.closure.active], v_a
+    made = (None, initial, 1.2, 2e-3)
+    found = crane.sensitivities(machine, *made, parameters=by, outputs=machine.active)
+    total = crane.simulation.gradient(
+        machine, *made, functional=lambda time, y: (0.5 * (y**2).sum(), y), parameters=by,
+        outputs=machine.active,
+    )  # fmt: skip
+    expected = np.einsum("nk,nkp->p", found.recording.q, found.derivatives)
+    np.testing.assert_allclose(total.derivatives, expected, rtol=1e-7)
+    wraps = np.abs(np.diff(found.recording.q, axis=0)).max(axis=1) > 1.0
+    assert wraps.any()
+    variants = MachineVariants(machine)
+    for k, parameter in enumerate(by):
+        h = 3e-4 * max(abs(found.values[k]), 0.1)
+
+        def moved(change, parameter=parameter):
+            start, (q, v) = parameter.removeprefix("start."), map(np.copy, initial)
+            if start == parameter:
+                varied = variants.machine({parameter: variants.values[parameter] + change})
+                return crane.simulate(varied, None, (q, v), *made[2:]).q
+            joint = start.removesuffix("_velocity")
+            (q if joint == start else v)[machine.active.index(joint)] += change
+            return crane.simulate(machine, None, (q, v), *made[2:]).q
+
+        weights = ((1, 2 / 3), (2, -1 / 12))
+        true = sum(w * (moved(j * h) - moved(-j * h)) for j, w in weights) / h
+        gap = np.abs(true - found.derivatives[:, :, k]).max(axis=1)
+        size = np.abs(found.derivatives[:, :, k]).max()
+        jumps = np.abs(true).max(axis=1) > 100.0 * size
+        assert jumps.sum() <= 4 * wraps.sum() and gap[~jumps].max() < 1e-6 * size, parameter
 
 
 HYDRAULIC = ("payload.mass", "oil.bulk_modulus", "valve.X_lift.c1", "cylinder.X_lift.hose_a",

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 import crane
 from crane.common import unit_conversions
-from crane.common.errors import CraneError
+from crane.common.errors import CraneError, DescriptionError
 from crane.common.unit_conversions import (
     COMMON_UNITS,
     UnitError,
@@ -30,6 +30,7 @@ from crane.formats.machine_file.json_schema import schema_text
 from crane.formats.machine_file.machine_reader import read_machine_spec
 from crane.formats.machine_file.machine_writer import write_machine
 from crane.formats.machine_file.yaml_text import parse_yaml_file
+from crane.identification.mechanics.identifiability import read_priors
 
 # a machine in units, and the same numbers in SI units
 IN_UNITS = """
@@ -458,3 +459,53 @@ def test_columns_in_any_unit(tmp_path):
     assert table.units == {"time": "s", "p": "Pa", "q": "m3/s", "n": "rad/s", "a": "g"}
     expected = [60.0, 200 * 6894.757293168361, 2 * 6.30901964e-5, math.pi, 4.0]
     np.testing.assert_allclose(table.values[1], expected, rtol=1e-14)
+
+
+def test_terms_and_priors_of_an_identification_take_units(tmp_path):
+    """By the kind of the parameter and the joint: q1 turns, X1 slides."""
+    path, base = tmp_path / "units.yaml", crane.load("mini_forwarder").path
+    lines = {
+        "terms": "{X1.presliding: 0.1 mm, q1.memory: [300 ms, 2 deg/s], q1.stiction: [45 deg/s]}",
+        "prior": "{X1.viscous: 0.8 +- 0.1 kN s/m, q1.coulomb: 5 N cm, link4.m: 200 g, "
+        "q1.viscous: 0.1 N m s/rad +- 10 %, bodies: 20 %}",
+    }
+
+    def load(**changed):
+        section = ", ".join(f"{key}: {text}" for key, text in (lines | changed).items())
+        path.write_text(f"extends: {base}\nidentification: {{{section}}}\n")
+        return crane.load(path)
+
+    machine = load()
+    known, turn = machine.estimation.prior, np.pi / 180
+    assert machine.estimation.terms == {
+        "X1.presliding": (1e-4,), "q1.memory": (0.3, 2 * turn), "q1.stiction": (np.pi / 4,)
+    }  # fmt: skip
+    assert (known["X1.viscous"].mean, known["X1.viscous"].std) == (800.0, 100.0)
+    assert (known["q1.coulomb"].std, known["link4.m"].std) == (0.05, 0.2)
+    assert known["q1.viscous"].mean == 0.1 and known["q1.viscous"].relative
+    written = write_machine(machine, tmp_path / "written")
+    text = written.read_text()
+    for words in ("0.1 mm", "300 ms", "2 deg/s", "0.8 +- 0.1 kN s/m", "5 N cm", "200 g"):
+        assert words in text
+    assert crane.load(written).estimation == machine.estimation
+    for changed, told in (
+        ({"terms": "{X1.presliding: 0.1 deg}"}, "'0.1 deg', and 'deg' is a unit of something"),
+        ({"terms": "{q1.memory: [0.3, 5 mm/s]}"}, "'5 mm/s', and 'mm/s' is a unit of something"),
+        ({"prior": "{X1.viscous: 0.8 +- 0.1 kN}"}, "'kN' is a unit of something else, give a"),
+        ({"prior": "{X1.viscous: 0.8 kN s/m +- 5}"}, "give the standard deviation a unit, too"),
+        ({"prior": "{bodies: 5 kg}"}, "'kg' is a unit of something else, give a number without"),
+        ({"prior": "{q1.coulomb: 5 Nmm3}"}, "'Nmm3' is no known unit"),
+    ):
+        with pytest.raises(DescriptionError, match=told) as caught:
+            load(**changed)
+        assert str(caught.value).startswith("units.yaml:2: ")
+    machine = load()
+    (prior,) = read_priors({"X1.coulomb": "20 +- 5 kN"}, machine).values()
+    assert (prior.mean, prior.std) == (2e4, 5e3)
+    for option, told in (
+        ("--prior=X1.coulomb=5 kg", "--prior X1.coulomb: it is '5 kg', and 'kg' is a unit of"),
+        ("--term=q1.presliding=1 mm", "--term is 'q1.presliding=1 mm', and 'mm' is a unit of"),
+        ("--try=X1.coulomb=5 N,6 Nm", "and 'Nm' is a unit of something else"),
+    ):
+        done = typed("identify", path, tmp_path / "none.csv", option)
+        assert done.returncode == 2 and told in done.stderr, done.stderr

@@ -393,5 +393,5 @@ def test_neighbours_without_a_manifest_are_packages_but_no_other_folders(tmp_pat
 def test_environment_is_not_read(tmp_path, monkeypatch):
     monkeypatch.setenv("SECRET", "hidden")
     assert load(stranger(tmp_path, "'$(optenv SECRET none)' == 'none'", "if")).joints == ("j",)
-    with pytest.raises(CraneError, match="variable 'SECRET' is not set"):
+    with pytest.raises(CraneError, match="variable 'SECRET' is not read, give --trust-xacro"):
         load(stranger(tmp_path, "'$(env SECRET)'", "property"))

@@ -15,6 +15,7 @@ import typer
 
 from crane.common.errors import InputError
 from crane.common.number_text import check_digits
+from crane.common.unit_conversions import UnitError, parse_number
 
 # Commands import what they need when they run, so that `crane --help` answers at once.
 
@@ -23,6 +24,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+_METAVARS = {"s": "SECONDS", "Hz": "HZ", "m": "M", "kg": "KG", "deg": "DEG", "": "FRACTION"}
 _Function = TypeVar("_Function", bound=Callable[..., None])
 
 
@@ -93,13 +95,10 @@ class OptionBlock:
             for field in fields(cls)
         ]  # fmt: skip
 
-    def given_options(self) -> list[str]:
-        """Names of the options that are given, as "--from"."""
-        return [
-            _option_name(field)
-            for field in fields(self)
-            if getattr(self, field.name) not in (field.default, [], ())
-        ]
+    def given_options(self) -> dict[str, object]:
+        """Values of the options that are given, by names as "--from"."""
+        values = {field: getattr(self, field.name) for field in fields(self)}
+        return {_option_name(x): y for x, y in values.items() if y not in (x.default, [], ())}
 
     def refuse(self, text: str) -> None:
         """Raise an error if any of the options is given.
@@ -110,8 +109,7 @@ class OptionBlock:
         Raises:
             InputError: About the first option that is given.
         """
-        for name in self.given_options():
-            raise InputError(f"{name} {text}")
+        refuse_options(self.given_options(), text)
 
 
 def _in_panel(annotation: Any, panel: str) -> Any:
@@ -144,6 +142,26 @@ def _with_plain_numbers(annotation: Any) -> Any:
     option, parse.__name__ = copy(option), number.__name__
     option.parser = parse
     return Annotated[kind, option]
+
+
+def number_option(unit: str, text: str, *names: str) -> Any:
+    """An option whose value is a number in a unit, or with another one.
+
+    Args:
+        unit: The unit of a plain number.
+        text: Its help.
+        names: Its names, if not that of its parameter.
+    """
+
+    def parse(text: str | float) -> float:
+        try:
+            return parse_number(str(text), (unit,))
+        except UnitError as error:
+            raise typer.BadParameter(f"{text!r}, {error}") from None
+        except ValueError:
+            raise typer.BadParameter(f"{text!r} is not a valid float.") from None
+
+    return typer.Option(*names, metavar=_METAVARS[unit], parser=parse, help=text)
 
 
 def _option_name(field: "Field[Any]") -> str:

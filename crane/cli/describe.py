@@ -6,8 +6,7 @@ from typing import Annotated
 import typer
 
 import crane
-from crane.cli.command import app, command
-from crane.cli.option_units import number_option
+from crane.cli.command import app, command, number_option
 from crane.cli.options import (
     AssemblyOptions,
     MachineName,

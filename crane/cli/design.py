@@ -6,7 +6,6 @@ import typer
 
 import crane
 from crane.cli.command import command
-from crane.cli.option_units import parameter_units
 from crane.cli.options import (
     Frame,
     MachineName,
@@ -18,7 +17,7 @@ from crane.cli.options import (
     Tasks,
     UserMeasures,
 )
-from crane.cli.parsing import parse_grids, parse_ranges
+from crane.cli.parsing import parameter_units, parse_grids, parse_ranges
 from crane.cli.resumable_output import ResumableFolder
 from crane.cli.terminal import progress_bar
 

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import crane
-from crane.cli.command import OptionBlock, command, refuse_options
-from crane.cli.option_units import joint_units, number_option, parameter_units
+from crane.cli.command import OptionBlock, command, number_option, refuse_options
 from crane.cli.options import (
     Bandwidth,
     CentreOfMass,
@@ -33,6 +32,8 @@ from crane.cli.options import (
     Validation,
 )
 from crane.cli.parsing import (
+    joint_units,
+    parameter_units,
     parse_fits,
     parse_names,
     parse_numbers,
@@ -231,15 +232,13 @@ def identify(
     """
     from crane.common.samples import as_number
     from crane.identification.mechanics.cross_validation import format_trials, identify_options
-    from crane.identification.mechanics.write_identified import check_rewritable
 
-    window, terms, priors = parse_window(train), parse_terms(model.term), parse_priors(model.prior)
-    loaded, trials = options.load(machine), parse_trials(tried)
+    window, loaded = parse_window(train), options.load(machine)
+    terms = parse_terms(model.term, turns := {x: loaded.unit(x) == "rad" for x in loaded.joints})
+    priors, trials = parse_priors(model.prior, turns), parse_trials(tried, turns)
     min_speeds = parse_values("--min-speed", min_speed, joint_units(loaded, "/s"))
     if priors is None:
         loaded = loaded.replace(estimation=replace(loaded.estimation, prior={}))
-    if model.feasible:
-        check_rewritable(loaded)
     inside, outside = _split(_read(recording, loaded, reading), window)
     judges: list[crane.Recording | Motion] = [*_usable_motions(loaded, outside, trust)]
     if train is not None and not outside:
@@ -263,7 +262,7 @@ def identify(
                 loaded, inside, trials, progress, **settings
             )
         print(f"{format_trials(tried_settings)}\n")
-        settings = identify_options(tried_settings[0].settings, settings)
+        settings = identify_options(loaded, tried_settings[0].settings, settings)
     with progress_bar("identifying") as progress:
         result = crane.identify(loaded, inside, judges or None, progress=progress, **settings)
     if result.validation is None:

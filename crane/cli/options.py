@@ -9,8 +9,7 @@ from typing import Annotated, Any
 import typer
 
 import crane
-from crane.cli.command import OptionBlock
-from crane.cli.option_units import number_option
+from crane.cli.command import OptionBlock, number_option
 from crane.cli.parsing import parse_arguments, parse_changes, parse_names, parse_values
 from crane.cli.terminal import status
 from crane.common.atomic_output import check_file_is_writable, check_folder_is_writable

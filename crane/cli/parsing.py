@@ -1,20 +1,19 @@
 """Values of options and arguments from their text: NAME=VALUE, ranges, windows, loads, priors."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import crane
-from crane.cli.option_units import UnitsOf
 from crane.common.errors import InputError, check_name
 from crane.common.number_text import parse_float
 from crane.common.unit_conversions import UnitError, is_quantity, parse_number
 
 if TYPE_CHECKING:
     from crane.common.samples import Array
-    from crane.description.specification import ParameterPrior, TermValues
+    from crane.description.estimation_settings import ParameterPrior, TermValues
 
 CONFIGURATION_FORM = "JOINT=VALUE,..., as in q1=0.1,X1=0.02"
 _VALUE_FORM = "JOINT=VALUE, as in X1=0.5"
@@ -26,6 +25,29 @@ _GRID_FORM, _RANGE_FORM = "NAME=start:stop:count", "NAME=low~high"
 _MAX_GRID_VALUES = 10_000  # of one parameter
 _MAX_SLEW_ANGLES = 8  # that a page has room for
 _Value = TypeVar("_Value")
+UnitsOf = Callable[[str], Sequence[str]]  # SI units that a name may have
+
+
+def joint_units(machine: "crane.Machine", by_time: str = "") -> UnitsOf:
+    """SI units of the coordinates of joints, or of their rates: both of what is no joint.
+
+    Args:
+        machine: The machine.
+        by_time: As "/s" for rates, "/s2" for accelerations.
+    """
+
+    def units_of(name: str) -> Sequence[str]:
+        units = [machine.unit(name)] if name in machine.joints else ["m", "rad"]
+        return [f"{unit}{by_time}" for unit in units]
+
+    return units_of
+
+
+def parameter_units(machine: "crane.Machine") -> UnitsOf:
+    """SI unit of each parameter."""
+    from crane.description.machine_parameters import parameter_unit
+
+    return lambda name: (parameter_unit(machine.tree, name),)
 
 
 def parse_names(text: str | None) -> list[str] | None:
@@ -236,28 +258,42 @@ def parse_fits(texts: Sequence[str], units_of: UnitsOf) -> dict[str, object]:
     return _parse_named("--fit", texts, _FIT_FORM, parse)
 
 
-def parse_terms(texts: Sequence[str] | None) -> "dict[str, TermValues | None]":
+def parse_terms(
+    texts: Sequence[str] | None, turns: Mapping[str, bool]
+) -> "dict[str, TermValues | None]":
     """Values of model terms by name; None of terms that are off.
+
+    Args:
+        texts: The texts.
+        turns: Whether each joint turns, for the units of the values.
 
     Raises:
         InputError: A text has another form, or a name is given twice.
     """
+    from crane.description.estimation_settings import estimation_units
 
-    def parse(_: str, values: str | None) -> "TermValues | None":
+    def parse(name: str, values: str | None) -> "TermValues | None":
         if values == "off":
             return None
-        return () if values in (None, "on") else tuple(map(float, values.split(",")))
+        words = [] if values in (None, "on") else str(values).split(",")
+        return tuple(
+            parse_number(x, estimation_units(name, turns, i)) for i, x in enumerate(words)
+        )
 
     return _parse_named("--term", texts, _TERM_FORM, parse)
 
 
-def parse_priors(texts: Sequence[str] | None) -> "dict[str, ParameterPrior] | None":
+def parse_priors(
+    texts: Sequence[str] | None, turns: Mapping[str, bool]
+) -> "dict[str, ParameterPrior] | None":
     """Priors by name, "*" of one without a name; None of the text "none".
+
+    For the arguments see `parse_terms`.
 
     Raises:
         InputError: A text has another form, or a name is given twice.
     """
-    from crane.description.specification import ParameterPrior
+    from crane.description.estimation_settings import ParameterPrior, estimation_units
 
     if texts and list(texts) == ["none"]:
         return None
@@ -266,27 +302,35 @@ def parse_priors(texts: Sequence[str] | None) -> "dict[str, ParameterPrior] | No
         name, equals, value = text.rpartition("=")
         name = name.strip() if equals else "*"
         try:
-            prior = ParameterPrior.parse(value)
+            prior = ParameterPrior.parse(value, estimation_units(name, turns))
+        except UnitError as error:
+            raise InputError(f"--prior {name}: {error}") from None
         except InputError:
             raise InputError(f"--prior is '{text}', write {_PRIOR_FORM}") from None
         if name in priors:
             raise InputError(f"--prior says two things of '{name}', give one")
-        priors[name] = prior if equals else dataclasses.replace(prior, relative=True)
+        priors[name] = prior if equals else dataclasses.replace(prior, relative=True, text="")
     return priors
 
 
-def parse_trials(texts: Sequence[str] | None) -> "dict[str, list[float | ParameterPrior]]":
+def parse_trials(
+    texts: Sequence[str] | None, turns: Mapping[str, bool]
+) -> "dict[str, list[float | ParameterPrior]]":
     """Values for cross-validation by name: bandwidths, or priors of parameters.
+
+    For the arguments see `parse_terms`.
 
     Raises:
         InputError: A text has another form, or a name is given twice.
     """
-    from crane.description.specification import ParameterPrior
+    from crane.description.estimation_settings import ParameterPrior, estimation_units
 
     def parse(name: str, values: str | None) -> "list[float | ParameterPrior]":
         words = (values or "").split(",")
         return [
-            parse_number(x, ("Hz",)) if name == "bandwidth" else ParameterPrior.parse(x)
+            parse_number(x, ("Hz",))
+            if name == "bandwidth"
+            else ParameterPrior.parse(x, estimation_units(name, turns))
             for x in words
         ]
 

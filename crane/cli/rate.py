@@ -10,8 +10,7 @@ from typing import Annotated, Any
 import typer
 
 import crane
-from crane.cli.command import OptionBlock, command, refuse_options
-from crane.cli.option_units import number_option
+from crane.cli.command import OptionBlock, command, number_option, refuse_options
 from crane.cli.options import (
     Bucket,
     Configuration,

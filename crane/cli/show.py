@@ -7,7 +7,6 @@ import typer
 
 import crane
 from crane.cli.command import command, refuse_options
-from crane.cli.option_units import joint_units
 from crane.cli.options import (
     Configuration,
     MachineName,
@@ -16,7 +15,7 @@ from crane.cli.options import (
     ParameterOptions,
     RecordingOptions,
 )
-from crane.cli.parsing import parse_configuration
+from crane.cli.parsing import joint_units, parse_configuration
 from crane.cli.terminal import hide_activity_line
 from crane.common.atomic_output import portable_file_name
 from crane.common.errors import InputError, check_name

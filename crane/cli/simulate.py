@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import crane
-from crane.cli.command import OptionBlock, command, refuse_options
-from crane.cli.option_units import joint_units, number_option, parameter_units
+from crane.cli.command import OptionBlock, command, number_option, refuse_options
 from crane.cli.options import (
     ChangeOptions,
     Configuration,
@@ -27,6 +26,8 @@ from crane.cli.options import (
     Task,
 )
 from crane.cli.parsing import (
+    joint_units,
+    parameter_units,
     parse_configuration,
     parse_grids,
     parse_load,

@@ -3,6 +3,7 @@
 Missing folders are created.
 """
 
+import csv
 import os
 import re
 import shutil
@@ -36,6 +37,22 @@ def replace_file(path: str | Path) -> Iterator[Path]:
             os.replace(temporary_file, path)
     except OSError as error:
         raise writing_error(path, error) from error
+
+
+def write_csv(
+    path: str | Path, rows: Iterable[Iterable[object]], notes: Iterable[str] = ()
+) -> None:
+    """Write rows of cells as CSV, below notes as comments.
+
+    Raises:
+        OutputError: See `replace_file`.
+    """
+    with (
+        replace_file(path) as part,
+        part.open("w", newline="", encoding="utf-8", errors="surrogateescape") as file,
+    ):
+        file.writelines(f"# {note}\n" for note in notes)
+        csv.writer(file, lineterminator="\n").writerows(rows)
 
 
 @contextmanager

@@ -126,6 +126,26 @@ class Checkpoint:
                     folder.rmdir()
 
 
+class NoCheckpoint(Checkpoint):
+    """A checkpoint without a file: it has no rows, and forgets those that it is given."""
+
+    def __init__(self) -> None:
+        self.rows = {}
+
+    def append(self, key: Sequence[object], cells: Sequence[object]) -> None:
+        """See `Checkpoint`."""
+
+    def __exit__(self, kind: type | None, error: BaseException | None, _: object) -> None:
+        """Leave no file."""
+
+
+def open_checkpoint(
+    path: str | Path | None, dependencies: Mapping[str, Any], columns: Iterable[str], key_size: int
+) -> Checkpoint:
+    """A `Checkpoint`, in no file for the path None."""
+    return NoCheckpoint() if path is None else Checkpoint(path, dependencies, columns, key_size)
+
+
 _FIRST_LINE = "# unfinished: the command that began this goes on with --resume\n"
 
 

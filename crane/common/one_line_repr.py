@@ -1,6 +1,6 @@
 """One-line `repr` of objects, and their HTML representation in notebooks."""
 
-from collections.abc import Callable, Sized
+from collections.abc import Callable, Sequence, Sized
 from typing import Any
 
 MAX_LINE_LENGTH = 200  # characters
@@ -44,6 +44,12 @@ def shorten_to_line(text: str) -> str:
     """A text as one line of at most `MAX_LINE_LENGTH` characters."""
     line = "".join(letter if letter.isprintable() else " " for letter in text)
     return line if len(line) <= MAX_LINE_LENGTH else f"{line[: MAX_LINE_LENGTH - 1]}\u2026"
+
+
+def list_first(words: Sequence[str], kind: str, limit: int) -> str:
+    """The first of some words, and how many more of a kind there are: "'a', 'b' and 2 more x"."""
+    more = f" and {len(words) - limit} more {kind}" if len(words) > limit else ""
+    return ", ".join(words[:limit]) + more
 
 
 def format_count(count: int, singular: str, plural: str = "") -> str:

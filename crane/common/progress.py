@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from types import FrameType
 
+Progress = Callable[[float], None]  # called with the finished share, 0 to 1
 REPORT_DELAY = 2.0  # [s] before the first report
 REPORT_INTERVAL = 0.5  # [s] between two reports
 _ACTIVITIES = {
@@ -102,9 +103,13 @@ class ProgressTracker:
 PROGRESS = ProgressTracker()
 
 
-def progress_reporter(progress: Callable[[float], None] | None) -> Callable[[float], None] | None:
+def ignore_progress(share: float) -> None:
+    """In place of a reporter where nobody asks for the finished share."""
+
+
+def progress_reporter(progress: Progress | None) -> Progress:
     """The function by which the caller reports its finished share: given, or the tracker's."""
-    return PROGRESS.start_reporting(sys._getframe(1)) if progress is None else progress
+    return progress or PROGRESS.start_reporting(sys._getframe(1)) or ignore_progress
 
 
 def _is_on_stack(call: FrameType, frame: FrameType | None) -> bool:

@@ -127,6 +127,29 @@ def solve_linear(matrix: Array, right_side: Array) -> Array:
     return np.asarray(np.linalg.solve(matrix, right_side), dtype=np.float64)
 
 
+def independent_rows(rows: Array, tolerance: float) -> list[int]:
+    """Indices of rows (m, k) that do not depend on those before them, up to a share of them."""
+    basis, found = np.zeros((0, rows.shape[1])), list[int]()
+    for i, row in enumerate(rows):
+        rest = row - basis.T @ (basis @ row)
+        rest -= basis.T @ (basis @ rest)  # twice is sufficient (Kahan, Parlett)
+        size = np.linalg.norm(rest)
+        if size > tolerance * np.linalg.norm(row):
+            basis = np.vstack([basis, rest / size])
+            found.append(i)
+    return found
+
+
+def true_runs(mask: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """First indices, and those after the last, of the runs (k, 2) of a mask (N,)."""
+    return np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+
+
+def root_mean_square(x: Array) -> float:
+    """Root of the mean square of all numbers of an array."""
+    return float(np.sqrt(np.mean(np.square(x))))
+
+
 def read_only_copy(array: Array) -> Array:
     """A read-only copy of an array."""
     out = array.copy()

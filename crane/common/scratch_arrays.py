@@ -17,7 +17,7 @@ import numpy as np
 
 from crane.common.samples import Array
 
-_MIN_FILE_ELEMENTS = 1 << 20  # elements, 8 MiB
+MIN_FILE_ELEMENTS = 1 << 20  # elements, 8 MiB
 BLOCK_SIZE = 1 << 16  # samples between two releases
 _memory_maps: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
 
@@ -29,7 +29,7 @@ def empty_array(count: int, columns: int) -> Array:
     which is removed with the array; in memory if the disk is full.
     """
     shape = count, columns
-    if math.prod(shape) >= _MIN_FILE_ELEMENTS:
+    if math.prod(shape) >= MIN_FILE_ELEMENTS:
         with contextlib.suppress(OSError):
             scratch = _map_temporary_file(math.prod(shape) * 8)
             _memory_maps.add(scratch)

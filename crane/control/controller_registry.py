@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import check_name
 from crane.control.control_law import PI, ComputedTorque, Controller
 from crane.control.levers import TipVelocity
 from crane.control.valve_commands import ValveCommand, ValvePD
@@ -34,6 +34,5 @@ def make_controller(
     Raises:
         InputError: The name is unknown.
     """
-    if name not in CONTROLLERS:
-        raise InputError(f"controller '{name}' is unknown, {suggest_names(CONTROLLERS, name)}")
+    check_name(name, CONTROLLERS, f"controller '{name}' is unknown")
     return CONTROLLERS[name](machine, reference)

@@ -8,17 +8,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.codegen import Scalar
-from crane.common.errors import ClosureError, InputError, SimulationError, suggest_names
+from crane.common.errors import ClosureError, InputError, SimulationError, check_name
 from crane.common.one_line_repr import OneLineRepr
-from crane.common.samples import Array, as_number, as_sample
+from crane.common.samples import Array, as_sample
 from crane.control.control_law import ControllerInputs
 from crane.control.valve_commands import (
     SampledCommand,
     ValveCommand,
     ValveSignals,
     lever_signals,
+    opening_per_velocity,
     require_circuit,
 )
+from crane.description.force_elements import as_nonnegative_number
 from crane.description.specification import DEFAULT_RAMP_TIME, Phase
 from crane.machine.machine import Machine
 from crane.motion.kinematics import Kinematics
@@ -80,9 +82,7 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
             for _, _, problem in phase.find_problems(circuit.joints, limits, start_positions):
                 raise InputError(problem)
             start_positions |= phase.until
-        self._ramp = as_number(ramp, "the ramp of the levers", "s")
-        if self._ramp < 0:
-            raise InputError(f"the ramp of the levers is {ramp:g} s, give at least 0")
+        self._ramp = as_nonnegative_number(ramp, "the ramp of the levers", "s")
         self._phases, self._spools = tuple(phases), tuple(circuit.spools.values())
         self._machine, self._joints = machine, circuit.joints
         self._columns = {x: int(machine.column(x)) for x in circuit.joints}
@@ -227,10 +227,9 @@ def joystick(
     circuit = require_circuit(machine)
     last, start = 0.0, None
     if isinstance(points, str):
-        task = machine.tasks.get(points)
-        if task is None or task.space != "joystick":
-            names = [name for name, task in machine.tasks.items() if task.space == "joystick"]
-            raise InputError(f"'{points}' is no task of levers, {suggest_names(names, points)}")
+        tasks = {name: task for name, task in machine.tasks.items() if task.space == "joystick"}
+        check_name(points, tasks, f"'{points}' is no task of levers")
+        task = tasks[points]
         if task.start:
             start = machine.check_limits(
                 [
@@ -244,8 +243,7 @@ def joystick(
         points, last = task.levers, task.duration
     polygons: dict[str, tuple[Array, Array]] = {}
     for joint, polygon in points.items():
-        if joint not in circuit.spools:
-            raise InputError(f"no valve for '{joint}', {suggest_names(circuit.spools, joint)}")
+        check_name(joint, circuit.spools, f"no valve for '{joint}'")
         try:
             table = np.array(polygon, dtype=np.float64)
         except (TypeError, ValueError):
@@ -274,7 +272,6 @@ def joystick(
 
 _DEAD_BAND_SMOOTHING = 1e-3  # opening over which the signal crosses the dead band
 _LIMIT_MARGIN = 1e-3  # share of the stroke within which a joint is at its limit
-_MIN_PRESSURE_DROP = 1e5  # least pressure drop that an edge is assumed to have [Pa]
 
 
 class TipVelocity(SampledCommand):
@@ -353,25 +350,13 @@ class TipVelocity(SampledCommand):
             valve, cylinder = self._circuit.valves[joint], self._circuit.cylinders[joint]
             a, b = pressures[i]
             force = cylinder.area_a * a - cylinder.area_b * b
-            areas, pressure = (cylinder.area_a, cylinder.area_b), a
-            inlet, outlet = valve.c1, valve.c2
-            if v[i] <= 0:
-                areas, pressure, inlet, outlet = areas[::-1], b, valve.c4, valve.c3
-            drop = min(supply.pressure - pressure, valve.margin or np.inf)
-            size = areas[0] * abs(v[i]) / (inlet * np.sqrt(max(drop, _MIN_PRESSURE_DROP)))
-            if force * v[i] < 0:
-                size = min(
-                    size,
-                    areas[1]
-                    * abs(v[i])
-                    / (outlet * np.sqrt(max(abs(force) / areas[1], _MIN_PRESSURE_DROP))),
-                )
-            opening[i] = np.copysign(size, v[i]) if v[i] else 0.0
+            drop = supply.pressure - (a if v[i] > 0 else b)
+            opening[i] = v[i] * opening_per_velocity(valve, cylinder, v[i] > 0, force, drop)
         opening /= max(1.0, np.abs(opening).max())
         openings = dict(zip(self._circuit.joints, opening, strict=True))
-        signals = []
-        for spool in self._circuit.spools.values():
-            y = openings[spool.joint]
-            u = y * (1.0 - spool.overlap) + spool.overlap * np.tanh(y / _DEAD_BAND_SMOOTHING)
-            signals.append(spool.neutral + (spool.full - spool.neutral) * u)
-        return np.array(signals)
+        spools = self._circuit.spools.values()
+        y, overlap, neutral, full = np.array(
+            [(openings[x.joint], x.overlap, x.neutral, x.full) for x in spools]
+        ).T
+        u = y * (1.0 - overlap) + overlap * np.tanh(y / _DEAD_BAND_SMOOTHING)
+        return np.asarray(neutral + (full - neutral) * u)

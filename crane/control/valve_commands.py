@@ -1,6 +1,5 @@
 """Sources of valve signals: given over time, PD control, functions in Python."""
 
-import threading
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol, runtime_checkable
@@ -9,12 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.codegen.symbolic import Scalar, apply_function
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.plausible_ranges import suggested_units_text
 from crane.common.samples import Array, as_number, as_sample
+from crane.common.threads import ThreadLocal
 from crane.control.control_law import ControllerInputs
-from crane.hydraulics.components import Spool, Valve
+from crane.hydraulics.components import Cylinder, Spool, Valve
 from crane.hydraulics.hydraulic_circuit import Hydraulics, PDGains
 from crane.machine.machine import Machine
 from crane.motion.task_trajectories import add_free_joints
@@ -23,6 +23,7 @@ from crane.motion.trajectory import Trajectory
 _MAX_LOG_INTERVAL = 0.02  # largest mean interval between the samples of a log [s]
 _SLOPE_TOLERANCE = 1e-12  # share of a signal: difference of equal slopes over the shortest step
 _TIME_TOLERANCE = 1e-9  # share of a period: difference of equal instants
+MIN_PRESSURE_DROP = 1e5  # least pressure drop that an edge is assumed to have [Pa]
 _DEAD_BAND_SMOOTHING = 0.01  # share of the stroke over which signals cross the dead band
 
 
@@ -93,13 +94,41 @@ def require_circuit(machine: Machine) -> Hydraulics:
     return machine.hydraulics
 
 
-def lever_signals(spool: Valve | Spool, lever: Array) -> Array:
+def lever_signals(spool: Spool, lever: Array) -> Array:
     """Signals of a spool (N,) [V] for lever positions (N,) from -1 to 1, shares of the flow.
 
     The signal jumps over the dead band at zero, as that of the electronics of such machines.
     """
     u = lever * (1.0 - spool.overlap) + spool.overlap * np.sign(lever)
     return np.asarray(spool.neutral + (spool.full - spool.neutral) * u)
+
+
+def opening_per_velocity(
+    valve: Valve, cylinder: Cylinder, is_positive: bool, force: ArrayLike, drop: ArrayLike
+) -> Array:
+    """Opening of a valve per velocity of its cylinder in one direction, positive [s/m], [s/rad].
+
+    The flow through the inlet is Q = c y sqrt(dp), with dp the margin of the compensator or what
+    the supply leaves. Where the load pulls the piston, the outlet sets the velocity.
+
+    Args:
+        valve: The valve.
+        cylinder: Its cylinder.
+        is_positive: Whether chamber A is filled.
+        force: (N,) force of the cylinder [N], [N m].
+        drop: (N,) pressure of the supply less that of the filled chamber [Pa].
+    """
+    edges = valve.c1, cylinder.area_a, valve.c2, cylinder.area_b
+    if not is_positive:
+        force, edges = np.negative(force), (valve.c4, cylinder.area_b, valve.c3, cylinder.area_a)
+    inlet, inlet_area, outlet, outlet_area = edges
+    inlet_drop = np.maximum(np.minimum(drop, valve.margin or np.inf), MIN_PRESSURE_DROP)
+    by_inlet = inlet_area / (inlet * np.sqrt(inlet_drop))
+    load_pressure = np.maximum(
+        np.maximum(np.negative(force), 0.0) / outlet_area, MIN_PRESSURE_DROP
+    )
+    by_outlet = outlet_area / (outlet * np.sqrt(load_pressure))
+    return np.where(np.less(force, 0.0), np.minimum(by_inlet, by_outlet), by_inlet)
 
 
 class ValveSignals(ValveCommand, OneLineRepr):
@@ -146,8 +175,7 @@ class ValveSignals(ValveCommand, OneLineRepr):
                 f"as {{'{example}': [...]}}"
             )
         for name in signals:
-            if name not in circuit.spools:
-                raise InputError(f"no valve for '{name}', {suggest_names(circuit.spools, name)}")
+            check_name(name, circuit.spools, f"no valve for '{name}'")
         columns = []
         for name, spool in circuit.spools.items():
             lever = name if name in signals else spool.joint
@@ -272,18 +300,6 @@ class ValvePD(ValveCommand, OneLineRepr):
         return out
 
 
-class _SampledSignals(threading.local):
-    """Signals (s,) that are held until the next sample, separate in each thread.
-
-    Attributes:
-        signals: The signals of all samples.
-        set_times: Times of the samples [s].
-    """
-
-    def __init__(self, signals: Array):
-        self.signals, self.set_times = [signals], [0.0]
-
-
 class SampledCommand(ValveCommand, OneLineRepr):
     """A Python function that sets the valve signals once per period, as a control unit does.
 
@@ -310,27 +326,26 @@ class SampledCommand(ValveCommand, OneLineRepr):
         self._spool_names = tuple(circuit.spools)
         self._active_columns = machine.closure.active
         self.period = as_number(period, "the period", "s", greater_than=0)
-        self._held_signals = _SampledSignals(
-            np.array([spool.neutral for spool in circuit.spools.values()])
-        )  # a run is in one thread
+        neutral = np.array([spool.neutral for spool in circuit.spools.values()])
+        # times [s] and signals of all samples; a run is in one thread
+        self._samples = ThreadLocal(lambda: ([0.0], [neutral]))
 
     def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
         """See `ValveCommand`."""
         signals = self._function(time, q[self._active_columns].copy(), v_a.copy(), pressures)
         label = f"the signals at t = {time:g} s"
-        held = self._held_signals
+        times, samples = self._samples.value
         # later samples are those of an earlier run
-        count = bisect_left(held.set_times, time - _TIME_TOLERANCE * self.period)
-        held.set_times[count:] = [time]
-        held.signals[count:] = [
-            as_sample(signals, len(self._spool_names), label, self._spool_names)
-        ]
+        count = bisect_left(times, time - _TIME_TOLERANCE * self.period)
+        times[count:] = [time]
+        samples[count:] = [as_sample(signals, len(self._spool_names), label, self._spool_names)]
 
     def references(self, times: Array) -> Array:
         """See `ValveCommand`; all times are between two samples, at which steps end."""
         mid_time = 0.5 * (times[0] + times[-1]) + _TIME_TOLERANCE * self.period
-        i = max(bisect_right(self._held_signals.set_times, mid_time) - 1, 0)
-        return np.tile(self._held_signals.signals[i], (len(times), 1))
+        set_times, samples = self._samples.value
+        i = max(bisect_right(set_times, mid_time) - 1, 0)
+        return np.tile(samples[i], (len(times), 1))
 
     def signals(self, inputs: ControllerInputs) -> Sequence[Scalar]:
         """See `ValveCommand`."""

@@ -1,5 +1,6 @@
 """A hydraulic circuit with its valve commands as a controller of the active forces."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from crane.codegen import Scalar
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.common.samples import Array, as_sample
 from crane.control.control_law import ControlLaw, ControllerInputs
 from crane.control.valve_commands import (
@@ -78,10 +79,7 @@ class ValveDrive(ControlLaw):
         )
         self._initial_pressures: dict[str, tuple[float, float]] = {}
         for joint, pair in (pressures or {}).items():
-            if joint not in hydraulics.joints:
-                raise InputError(
-                    f"no cylinder at '{joint}', {suggest_names(hydraulics.joints, joint)}"
-                )
+            check_name(joint, hydraulics.joints, f"no cylinder at '{joint}'")
             a, b = as_sample(pair, 2, f"pressures of '{joint}'", ("A", "B"))
             if min(a, b) < 0:
                 raise InputError(
@@ -206,29 +204,48 @@ class ValveDrive(ControlLaw):
 
     def channel_values(self, inputs: ControllerInputs) -> list[Scalar]:
         """Values of `channels`."""
-        circuit_values, signals = self._evaluate_circuit(inputs)
-        out: list[Scalar] = []
-        signals_and_positions = iter(zip(signals, circuit_values.spool_positions, strict=True))
-        for valve, sides in zip(
-            self.circuit.hydraulics.valves.values(), circuit_values.chambers, strict=True
-        ):
-            out += [*next(signals_and_positions), *(side.pressure for side in sides)]
-            out += [side.hose_flow for side in sides]
-            if valve.spool_b:
-                out += next(signals_and_positions)
-        out += [circuit_values.supply_pressure, circuit_values.tank_pressure]
+        return [value for *_, value in self._evaluate_channels(inputs)]
+
+    @cached_property
+    def channels(self) -> tuple[tuple[str, str], ...]:
+        """Names and units of the recorded channels."""
+        home = self.machine.home[self.machine.closure.active]
+        inputs = self.inputs_at(0.0, home, 0.0 * home, np.zeros(self.circuit.state_count))
+        return tuple((name, unit) for name, unit, _ in self._evaluate_channels(inputs))
+
+    def _evaluate_channels(self, inputs: ControllerInputs) -> list[tuple[str, str, Scalar]]:
+        """Names, units and values of the recorded channels."""
+        values, signals = self._evaluate_circuit(inputs)
+        circuit, out = self.circuit.hydraulics, list[tuple[str, str, Scalar]]()
+        pairs = iter(zip(signals, values.spool_positions, strict=True))
+        for (joint, valve), chambers in zip(circuit.valves.items(), values.chambers, strict=True):
+            first, *second = (
+                [(f"voltage_{name}", "V", signal), (f"spool_{name}", "", u)]
+                for name, (signal, u) in zip(valve.spools, pairs, strict=False)
+            )
+            out += first
+            sides = list(zip("ab", chambers, strict=True))
+            out += [(f"pressure_{joint}_{side}", "Pa", x.pressure) for side, x in sides]
+            out += [(f"flow_{joint}_{side}", "m3/s", x.hose_flow) for side, x in sides]
+            out += itertools.chain(*second)
+        out.append(("pressure_supply", "Pa", values.supply_pressure))
+        out.append(("pressure_tank", "Pa", values.tank_pressure))
         out += [
-            value
-            for name, value in zip(self.circuit.state_units, inputs.state, strict=False)
+            (name, unit, value)
+            for (name, unit), value in zip(
+                self.circuit.state_units.items(), inputs.state, strict=False
+            )
             if name.startswith(_RECORDED_STATE_PREFIXES)
         ]
-        out += [circuit_values.pressures[name] for name in self._further_nodes]
-        for pump in circuit_values.pumps.values():
-            out += [pump.share, pump.shaft_power]
-        if self.circuit.hydraulics.engine is not None and circuit_values.pumps:
-            out.append(circuit_values.engine_speed_ratio * self.circuit.hydraulics.engine.speed)
-        m = len(self.delays)
-        return [*out, *inputs.reference[m : m + len(self.command.channels)]]
+        nodes = (*circuit.supplies, *circuit.lines, *circuit.accumulators)
+        out += [(f"pressure_{name}", "Pa", values.pressures[name]) for name in nodes]
+        for name, pump in values.pumps.items():
+            out += [(f"share_{name}", "", pump.share), (f"shaft_{name}", "W", pump.shaft_power)]
+        if circuit.engine is not None and values.pumps:
+            speed = values.engine_speed_ratio * circuit.engine.speed
+            out.append(("engine_speed", "rad/s", speed))
+        of_command = zip(self.command.channels, inputs.reference[len(self.delays) :], strict=False)
+        return [*out, *((name, unit, value) for (name, unit), value in of_command)]
 
     def _evaluate_circuit(
         self, inputs: ControllerInputs
@@ -248,32 +265,3 @@ class ValveDrive(ControlLaw):
             inputs.reference[-2:] if self.command.has_measured_pressures else [],
         )
         return circuit_values, signals
-
-    @cached_property
-    def channels(self) -> tuple[tuple[str, str], ...]:
-        """Names and units of the recorded channels."""
-        channels: list[tuple[str, str]] = []
-        for joint in self.circuit.joints:
-            channels += [(f"voltage_{joint}", "V"), (f"spool_{joint}", "")]
-            channels += [(f"pressure_{joint}_{side}", "Pa") for side in "ab"]
-            channels += [(f"flow_{joint}_{side}", "m3/s") for side in "ab"]
-            if self.circuit.hydraulics.valves[joint].spool_b:
-                channels += [(f"voltage_{joint}_b", "V"), (f"spool_{joint}_b", "")]
-        channels += [("pressure_supply", "Pa"), ("pressure_tank", "Pa")]
-        channels += [
-            (name, unit)
-            for name, unit in self.circuit.state_units.items()
-            if name.startswith(_RECORDED_STATE_PREFIXES)
-        ]
-        channels += [(f"pressure_{name}", "Pa") for name in self._further_nodes]
-        for name in self.circuit.pumps:
-            channels += [(f"share_{name}", ""), (f"shaft_{name}", "W")]
-        if self.circuit.hydraulics.engine is not None and self.circuit.pumps:
-            channels.append(("engine_speed", "rad/s"))
-        return (*channels, *self.command.channels)
-
-    @property
-    def _further_nodes(self) -> list[str]:
-        """Nodes except for tank, main pump and chambers."""
-        circuit = self.circuit.hydraulics
-        return [*circuit.supplies, *circuit.lines, *circuit.accumulators]

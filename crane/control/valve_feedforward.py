@@ -9,9 +9,13 @@ from crane.codegen.symbolic import Scalar, add_vectors, apply_function
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_number
 from crane.control.control_law import ControllerInputs
-from crane.control.valve_commands import ValvePD, require_circuit
+from crane.control.valve_commands import (
+    MIN_PRESSURE_DROP,
+    ValvePD,
+    opening_per_velocity,
+    require_circuit,
+)
 from crane.dynamics.dynamics import Dynamics
-from crane.hydraulics.components import Cylinder, Valve
 from crane.hydraulics.flow_equations import LAMINAR_PRESSURE_DROP
 from crane.hydraulics.hydraulic_circuit import Hydraulics, PDGains
 from crane.machine.machine import Machine
@@ -19,47 +23,10 @@ from crane.motion.sway import Sway, suppress_sway
 from crane.motion.task_trajectories import add_free_joints
 from crane.motion.trajectory import Trajectory, retime
 
-_MIN_PRESSURE_DROP = 1e5  # least pressure drop that an edge is assumed to have [Pa]
 _PRESSURE_DIFFERENCE = 1e3  # pressure step of difference quotients [Pa]
 _SAMPLES_PER_SECOND = 100  # samples of the flows of a trajectory
 _SHARE_TOLERANCE = 1e-3  # share of the shortest time
 _MAX_ITERATIONS = 30
-
-
-def openings_per_velocity(
-    valve: Valve, cylinder: Cylinder, supply: float, force: Array
-) -> tuple[Array, Array]:
-    """Opening of a valve per velocity, in the positive and in the negative direction.
-
-    The flow through the inlet is Q = c y sqrt(dp), with dp the margin of the compensator or what
-    the supply leaves. Where the load pulls the piston, the outlet sets the velocity.
-
-    Args:
-        valve: The valve.
-        cylinder: Its cylinder.
-        supply: Pressure of the supply [Pa].
-        force: (N,) force of the cylinder [N], [N m].
-
-    Returns:
-        Two arrays (N,) [s/m], [s/rad], both positive.
-    """
-
-    def opening(
-        force: Array, inlet: float, inlet_area: float, outlet: float, outlet_area: float
-    ) -> Array:
-        drop = np.minimum(supply - np.maximum(force, 0.0) / inlet_area, valve.margin or np.inf)
-        by_inlet = inlet_area / (inlet * np.sqrt(np.maximum(drop, _MIN_PRESSURE_DROP)))
-        load_pressure = np.maximum(np.maximum(-force, 0.0) / outlet_area, _MIN_PRESSURE_DROP)
-        return np.where(
-            force < 0,
-            np.minimum(by_inlet, outlet_area / (outlet * np.sqrt(load_pressure))),
-            by_inlet,
-        )
-
-    return (
-        opening(force, valve.c1, cylinder.area_a, valve.c2, cylinder.area_b),
-        opening(-force, valve.c4, cylinder.area_b, valve.c3, cylinder.area_a),
-    )
 
 
 def check_invertible(circuit: Hydraulics) -> None:
@@ -133,8 +100,8 @@ def required_openings(
         p_a = (f + area_b * p_b) / area_a
         demand = force_rate[i] + (area_a**2 / ca + area_b**2 / cb) * w
         out = demand > 0
-        fed_a = c1 * np.sqrt(np.clip(pump - p_a, _MIN_PRESSURE_DROP, margin))
-        fed_b = c4 * np.sqrt(np.clip(pump - p_b, _MIN_PRESSURE_DROP, margin))
+        fed_a = c1 * np.sqrt(np.clip(pump - p_a, MIN_PRESSURE_DROP, margin))
+        fed_b = c4 * np.sqrt(np.clip(pump - p_b, MIN_PRESSURE_DROP, margin))
         q_a = np.where(out, fed_a, c3 * np.sqrt(np.maximum(p_a - tank, LAMINAR_PRESSURE_DROP)))
         q_b = np.where(out, c2 * np.sqrt(np.maximum(p_b - tank, LAMINAR_PRESSURE_DROP)), fed_b)
         y = demand / (area_a * q_a / ca + area_b * q_b / cb)
@@ -233,7 +200,7 @@ class ValveFeedforward(ValvePD):
     """Valve command by feedforward of the openings, and feedback of position and sway.
 
     With y the openings that the trajectory requires (`required_openings`), tau = 2 zeta / omega
-    the lag of the spool, and g the opening per velocity (`openings_per_velocity`) under the forces
+    the lag of the spool, and g the opening per velocity (`opening_per_velocity`) under the forces
     of the trajectory,
 
         w = y + tau y' + K_p (q_ref - q) + K_d (q_ref' - q') + g(v) K theta,
@@ -282,7 +249,8 @@ class ValveFeedforward(ValvePD):
         super().__init__(machine, reference, gains)
         circuit = require_circuit(machine)
         check_invertible(circuit)
-        self.planned_trajectory, self._free_indices = reference, np.flatnonzero(~machine.is_driven)
+        self.planned_trajectory = reference
+        self._free_indices = np.setdiff1d(np.flatnonzero(~machine.is_driven), machine.held)
         valves = circuit.valves.values()
         lags = [2.0 * x.damping / x.bandwidth if x.bandwidth else 0.0 for x in valves]
         self._damps_sway = damping > 0
@@ -309,13 +277,16 @@ class ValveFeedforward(ValvePD):
             opening, self._opening_times, axis=0
         )
         if self._damps_sway:
-            pairs = [
-                openings_per_velocity(
-                    x, circuit.cylinders[x.joint], circuit.supply.pressure, forces[:, i]
-                )
-                for i, x in enumerate(valves)
-            ]
-            columns = [x for pair in zip(*pairs, strict=True) for x in pair]
+            pump, columns = circuit.supply.pressure, []
+            for is_positive, x, force in (
+                (sign, *pair)
+                for sign in (True, False)
+                for pair in zip(valves, forces.T, strict=True)
+            ):
+                cylinder = circuit.cylinders[x.joint]
+                load, area = (force, cylinder.area_a) if is_positive else (-force, cylinder.area_b)
+                drop = pump - np.maximum(load, 0.0) / area
+                columns.append(opening_per_velocity(x, cylinder, is_positive, force, drop))
             self._gain_table = np.column_stack(
                 columns + self._sway_feedback_gains(machine, q_a, damping)
             )
@@ -337,13 +308,14 @@ class ValveFeedforward(ValvePD):
     def references(self, times: Array) -> Array:
         """See `ValveCommand`."""
         q, v = self.planned_trajectory.position(times), self.planned_trajectory.velocity(times)
-        last = self._knot_times[-1]
-        opening = _interpolate_even(times, last, self._opening_table)
-        opening[(times < 0) | (times > last)] = 0.0
-        columns = [q[:, self._active_indices], v[:, self._active_indices], opening]
+        opening = [
+            np.interp(times, self._opening_times, x, 0.0, 0.0) for x in self._opening_table.T
+        ]
+        columns = [*q[:, self._active_indices].T, *v[:, self._active_indices].T, *opening]
         if self._damps_sway:
-            columns += [_interpolate_even(times, last, self._gain_table), q[:, self._free_indices]]
-        return np.hstack(columns)
+            columns += [np.interp(times, self._knot_times, x) for x in self._gain_table.T]
+            columns += [*q[:, self._free_indices].T]
+        return np.column_stack(columns)
 
     def signals(self, inputs: ControllerInputs) -> Sequence[Scalar]:
         """See `ValveCommand`."""
@@ -390,11 +362,3 @@ class ValveFeedforward(ValvePD):
                 (mean + (0.5 * (positive_openings[i] - negative_openings[i])) * direction) * speed
             )
         return openings
-
-
-def _interpolate_even(times: Array, end_time: float, table: Array) -> Array:
-    """Rows (N, c), linear between those of a table at equal intervals from 0 to the end time."""
-    position = np.clip(times / end_time, 0.0, 1.0) * (len(table) - 1)
-    before = np.minimum(position.astype(int), len(table) - 2)
-    share = (position - before)[:, None]
-    return (1.0 - share) * table[before] + share * table[before + 1]

@@ -99,7 +99,8 @@ class NumberListKey(NumberKey):
 
     Attributes:
         size: See above.
-        column_units: SI units of the numbers in turn, where they differ.
+        column_units: SI units of the numbers in turn, where they differ; "m, rad" of one that
+            depends on the joint.
         is_polynomial: Whether it is of coefficients of powers of the time, in the unit by s, s2..
     """
 
@@ -109,9 +110,10 @@ class NumberListKey(NumberKey):
 
     def si_units(self, turns: bool | None, position: Sequence[int] = ()) -> tuple[str, ...]:
         """See `NumberKey`."""
-        column = position[-1]
+        column = position[-1] if position else 0
         if self.column_units:
-            return (self.column_units[column % len(self.column_units)],)
+            units = self.column_units[column % len(self.column_units)].split(", ")
+            return tuple(units) if turns is None or len(units) == 1 else (units[turns],)
         by_time = f"/s{column if column > 1 else ''}" if self.is_polynomial and column else ""
         return tuple(f"{unit}{by_time}" for unit in super().si_units(turns))
 

@@ -269,16 +269,19 @@ CONTROL = section_schema(
     PIGains,
 )
 _PATTERN = "joint or pattern"
+_TERM_UNITS = ("s, m, rad, m/s, rad/s",)
 IDENTIFICATION = section_schema(
     "'identification'",
     {
         "terms": MapKey(
             "[model terms](identification.md#model-terms-and-priors) added to the default ones, "
-            "or `off` to remove one",
-            VariantKey("", (FlagKey(), NumberKey(), NumberListKey())), "term",
+            "or `off` to remove one; their numbers, e.g. 0.1 mm or [0.3 s, 2 deg/s]",
+            VariantKey(
+                "", (FlagKey(), NumberKey(), TextKey(), NumberListKey(column_units=_TERM_UNITS))
+            ), "term",
         ),
         "prior": MapKey(
-            "priors of parameters, e.g. 50, 10 %, 609 +- 60",
+            "priors of parameters, e.g. 50, 10 %, 609 +- 60, 0.6 +- 0.1 kN",
             VariantKey("", (NumberKey(), TextKey())), "parameter",
         ),
         "bandwidth": NumberKey(

@@ -161,6 +161,9 @@ def _expand(xacro: Any, request: dict[str, Any]) -> dict[str, Any]:
         found["wrong"] = "its macros or files use themselves without end"
     except Exception as error:  # xacro and expressions raise anything
         found["wrong"] = " ".join(str(error).split())[:300] or type(error).__name__
+        if not request["trust"]:  # few variables are known
+            hint = r"the \1 is not read, give --trust-xacro"
+            found["wrong"] = re.sub(r".*(environment variable '\w*') is .*", hint, found["wrong"])
     if "wrong" in found and missing:
         found |= {"package": missing[0]}
     stack = [name for name in (getattr(xacro, "filestack", None) or []) if name]

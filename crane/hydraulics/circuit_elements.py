@@ -1,6 +1,7 @@
 """Pumps, engine, lines, accumulators and elements of a circuit, and checks of parameters."""
 
 import itertools
+from collections.abc import Collection
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
@@ -11,24 +12,11 @@ from crane.common.samples import as_number
 _MIN_POSITIVE = 1e-50  # least value of a positive parameter: one over its square is finite
 
 
-class ComponentParameterError(InputError):
-    """An invalid parameter of a component.
+class CircuitParameterError(InputError):
+    """An invalid parameter of a component, or one that does not fit the rest of the circuit.
 
     Args:
-        key: Name of the parameter.
-        message: See `CraneError`.
-    """
-
-    def __init__(self, key: str, message: str):
-        super().__init__(message)
-        self.key = key
-
-
-class CircuitPathError(InputError):
-    """A component that does not fit the rest of the circuit.
-
-    Args:
-        path: Keys that lead to the component in the machine file.
+        path: Keys that lead to the parameter in the machine file, from where its value is read.
         message: See `CraneError`.
     """
 
@@ -49,7 +37,7 @@ def check_parameters(component: object, label: str) -> None:
     default, values of at least 0.
 
     Raises:
-        ComponentParameterError: A parameter is not finite, or negative or zero where it must not.
+        CircuitParameterError: A parameter is not finite, or negative or zero where it must not.
     """
     for entry in fields(component):  # type: ignore[arg-type]
         if entry.type not in (float, "float"):
@@ -61,8 +49,8 @@ def check_parameters(component: object, label: str) -> None:
         requirement = "must be positive" if positive else "must not be < 0"
         if value > 0:
             requirement = f"must be at least {_MIN_POSITIVE:g}"
-        raise ComponentParameterError(
-            entry.name, f"{entry.name} of {label} is {value:g}, it {requirement}"
+        raise CircuitParameterError(
+            (entry.name,), f"{entry.name} of {label} is {value:g}, it {requirement}"
         )
 
 
@@ -73,11 +61,29 @@ def check_conditions(*conditions: tuple[bool, str, str]) -> None:
         conditions: A condition, the name of the parameter that violates it, and the message.
 
     Raises:
-        ComponentParameterError: One of them holds.
+        CircuitParameterError: One of them holds.
     """
     for holds, key, message in conditions:
         if holds:
-            raise ComponentParameterError(key, message)
+            raise CircuitParameterError((key,), message)
+
+
+def check_reference(
+    path: tuple[str, ...], name: str, names: Collection[str], problem: str
+) -> None:
+    """Check that what a component names is there.
+
+    Args:
+        path: See `CircuitParameterError`.
+        name: The name.
+        names: Those that are there.
+        problem: What is wrong if it is not; the names that are meant are appended.
+
+    Raises:
+        CircuitParameterError: It is not.
+    """
+    if name not in names:
+        raise CircuitParameterError(path, f"{problem}, {suggest_names(names, name)}")
 
 
 def positive_field(default: Any = MISSING) -> Any:
@@ -274,29 +280,25 @@ def check_summed_pumps(supplies: dict[str, Supply]) -> None:
     """Check that the pumps in `summed` exist and have a power limit.
 
     Raises:
-        CircuitPathError: One does not.
+        CircuitParameterError: One does not.
     """
     limited = [name for name, supply in supplies.items() if supply.power]
     for name, other in ((name, x) for name, supply in supplies.items() for x in supply.summed):
-        if other not in limited:
-            raise CircuitPathError(
-                (*_supply_path(name), "summed"),
-                f"'summed' of '{name}' names '{other}', give pumps with a power, "
-                f"{suggest_names(limited, other)}",
-            )
+        problem = f"'summed' of '{name}' names '{other}', give pumps with a power"
+        check_reference((*_supply_path(name), "summed"), other, limited, problem)
 
 
 def check_pump_pressures(supplies: dict[str, Supply]) -> None:
     """Check that the pressures of all pumps are above that of the tank.
 
     Raises:
-        CircuitPathError: One is not.
+        CircuitParameterError: One is not.
     """
     tank = supplies[MAIN_PUMP].tank
     for name, key in itertools.product(supplies, ("pressure", "relief")):
         pressure = getattr(supplies[name], key)
         if 0 < pressure <= tank:
-            raise CircuitPathError(
+            raise CircuitParameterError(
                 (*_supply_path(name), key),
                 f"{key} of '{name}' is {pressure:g} Pa, not above the tank's {tank:g} Pa, give a "
                 "higher one",

@@ -198,12 +198,12 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Spool:
-    """The second spool of a valve, which controls chamber B; parameters as those of `Valve`.
+    """A spool of a valve: the second one, which controls chamber B, or the `Valve` itself.
 
     Attributes:
         joint: Joint of the cylinder.
         neutral: Signal of the middle position [V].
-        full: Signal of u = 1, which drains chamber B [V].
+        full: Signal of u = 1 [V], at which a second spool drains chamber B.
         dead_band: Share of the spool stroke without flow; negative: an underlap, the share over
             which inlet and outlet of a chamber are both open, on either side of the middle.
         bandwidth: Natural frequency of the spool [rad/s]; 0 for a spool without inertia.
@@ -224,9 +224,37 @@ class Spool:
     delay: float = 0.0
 
     def __post_init__(self) -> None:
-        label = f"the second spool of '{self.joint}'"
+        self._check(f"the second spool of '{self.joint}'")
+
+    def _check(self, label: str) -> None:
         check_parameters(self, label)
-        _check_spool(self, label)
+        dead_band = self.dead_band
+        is_percent = 1 <= abs(dead_band) < 100
+        hint = f": looks like percent, write {dead_band / 100:g}" if is_percent else ""
+        check_conditions(
+            (
+                self.hysteresis >= 0.5,
+                "hysteresis",
+                f"hysteresis of {label} is {self.hysteresis:g}, give a share of the stroke, "
+                "below 0.5",
+            ),
+            (
+                self.full == self.neutral,
+                "full",
+                f"full and neutral of {label} are both {self.full:g}, give two",
+            ),
+            (
+                abs(dead_band) >= 1,
+                "dead_band",
+                f"dead_band of {label} is {dead_band:g}, it must be "
+                f"{'below 1' if dead_band > 0 else 'above -1'}{hint}",
+            ),
+            (
+                self.rate > 0 and not self.bandwidth,
+                "rate",
+                f"{label} has a rate but no bandwidth, give both",
+            ),
+        )
 
     @property
     def overlap(self) -> float:
@@ -234,8 +262,8 @@ class Spool:
         return max(self.dead_band, 0.0)
 
 
-@dataclass(frozen=True)
-class Valve:
+@dataclass(frozen=True, kw_only=True)
+class Valve(Spool):
     """A proportional directional valve of one cylinder.
 
     The signal U [V] sets the target u = (U - neutral) / (full - neutral), from -1 to 1, that the
@@ -267,21 +295,12 @@ class Valve:
     y > 0.
 
     Attributes:
-        joint: Joint of the cylinder.
+        joint: Joint of the cylinder; this and the parameters of the spool are those of `Spool`.
         c1: Coefficient of the edge from the supply to A [m3/(s Pa^0.5)].
         c2: From B to the tank.
         c3: From A to the tank.
         c4: From the supply to B.
         margin: Pressure drop that the compensator keeps [Pa]; 0 without compensation.
-        neutral: Signal of the middle position [V].
-        full: Signal of u = 1 [V].
-        dead_band: Share of the spool stroke without flow; negative: an underlap, the share over
-            which inlet and outlet of a chamber are both open, on either side of the middle.
-        bandwidth: Natural frequency of the spool [rad/s]; 0 for a spool without inertia.
-        damping: Damping ratio of the spool.
-        rate: Largest speed of the spool, in strokes (of u from 0 to 1) per second; 0 for no limit.
-        hysteresis: Width of the play between signal and spool, as a share of the stroke.
-        delay: Dead time of the electric stage [s].
         centre: Coefficient of the open centre in neutral [m3/(s Pa^0.5)]; 0 for a closed centre.
         regeneration: Coefficient of the check valve from B to A [m3/(s Pa^0.5)]; 0 for none.
         float_from: |u| beyond which the negative position floats; 0 for none.
@@ -300,20 +319,11 @@ class Valve:
         spool_b: Second spool, of chamber B; None for a valve with one spool.
     """
 
-    joint: str
     c1: float = positive_field()
     c2: float = positive_field()
     c3: float = positive_field()
     c4: float = positive_field()
     margin: float = 0.0
-    neutral: float = signed_field(0.0)
-    full: float = signed_field(1.0)
-    dead_band: float = signed_field(0.0)
-    bandwidth: float = 0.0
-    damping: float = positive_field(1.0)
-    rate: float = 0.0
-    hysteresis: float = 0.0
-    delay: float = 0.0
     centre: float = 0.0
     regeneration: float = 0.0
     float_from: float = 0.0
@@ -329,7 +339,7 @@ class Valve:
 
     def __post_init__(self) -> None:
         label = f"the valve of '{self.joint}'"
-        check_parameters(self, label)
+        self._check(label)
         check_conditions(
             (
                 self.priority and not self.margin,
@@ -347,9 +357,6 @@ class Valve:
                 f"{label} floats from {self.float_from:g} with the coefficient "
                 f"{self.float_coefficient:g}, give both, from below 1",
             ),
-        )
-        _check_spool(self, label)
-        check_conditions(
             *(
                 (
                     self.spool_b is not None and getattr(self, key) > 0,
@@ -357,7 +364,7 @@ class Valve:
                     f"{label} has two spools and '{key}', which goes with one, remove it",
                 )
                 for key in ("centre", "regeneration", "float_from")
-            )
+            ),
         )
 
     @property
@@ -367,52 +374,12 @@ class Valve:
         return curves or any(spool.dead_band < 0 for spool in self.spools.values())
 
     @property
-    def spools(self) -> "dict[str, Valve | Spool]":
+    def spools(self) -> dict[str, Spool]:
         """Its spools by the names of their signals."""
         return {self.joint: self} | ({f"{self.joint}_b": self.spool_b} if self.spool_b else {})
-
-    @property
-    def overlap(self) -> float:
-        """The dead band that a signal has to pass; 0 of a spool with underlap."""
-        return max(self.dead_band, 0.0)
 
     def opening(self, u: float) -> float:
         """Opening y at a spool position u, of the edges that it opens."""
         return math.copysign(
             min(max((abs(u) - self.dead_band) / (1.0 - self.dead_band), 0.0), 1.0), u
         )
-
-
-def _check_spool(spool: Spool | Valve, label: str) -> None:
-    """Check the parameters of a spool.
-
-    Raises:
-        ComponentParameterError: One is invalid.
-    """
-    dead_band = spool.dead_band
-    is_percent = 1 <= abs(dead_band) < 100
-    hint = f": looks like percent, write {dead_band / 100:g}" if is_percent else ""
-    check_conditions(
-        (
-            spool.hysteresis >= 0.5,
-            "hysteresis",
-            f"hysteresis of {label} is {spool.hysteresis:g}, give a share of the stroke, "
-            "below 0.5",
-        ),
-        (
-            spool.full == spool.neutral,
-            "full",
-            f"full and neutral of {label} are both {spool.full:g}, give two",
-        ),
-        (
-            abs(dead_band) >= 1,
-            "dead_band",
-            f"dead_band of {label} is {dead_band:g}, it must be "
-            f"{'below 1' if dead_band > 0 else 'above -1'}{hint}",
-        ),
-        (
-            spool.rate > 0 and not spool.bandwidth,
-            "rate",
-            f"{label} has a rate but no bandwidth, give both",
-        ),
-    )

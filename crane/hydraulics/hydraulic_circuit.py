@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
-from crane.common.errors import suggest_names
 from crane.common.plausible_ranges import suggested_units_text
 from crane.hydraulics.circuit_elements import (
     MAIN_PUMP,
@@ -11,12 +10,13 @@ from crane.hydraulics.circuit_elements import (
     Accumulator,
     CircuitElement,
     CircuitLine,
-    CircuitPathError,
+    CircuitParameterError,
     Engine,
     Supply,
     check_conditions,
     check_parameters,
     check_pump_pressures,
+    check_reference,
     check_summed_pumps,
     positive_field,
 )
@@ -84,7 +84,7 @@ class Hydraulics:
         elements: Elements between nodes, by name.
 
     Raises:
-        CircuitPathError: Components that do not fit together.
+        CircuitParameterError: Components that do not fit together.
     """
 
     supply: Supply
@@ -108,36 +108,31 @@ class Hydraulics:
         for section in ("supplies", "lines", "accumulators"):
             repeated = [x for x in getattr(self, section) if channels.count(x) > 1]
             if repeated:
-                raise CircuitPathError(
+                raise CircuitParameterError(
                     (section, repeated[0]),
                     f"two nodes are called '{repeated[0]}', give them names",
                 )
         return_nodes = [x for x in self.node_names if x not in self._chamber_nodes]
         for joint, valve in self.valves.items():
             path, label = ("valves", joint), f"valve of '{joint}'"
-            if valve.supply not in self.pumps:
-                hint = suggest_names(self.pumps, valve.supply)
-                raise CircuitPathError(
-                    (*path, "supply"), f"{label} is fed by '{valve.supply}', {hint}"
-                )
+            fed = f"{label} is fed by '{valve.supply}'"
+            check_reference((*path, "supply"), valve.supply, self.pumps, fed)
             if valve.spool_b and f"{joint}_b" in self.valves:
-                raise CircuitPathError(
+                raise CircuitParameterError(
                     (*path, "spool_b"),
                     f"the second spool of '{joint}' is called as the joint '{joint}_b', give that "
                     "another name",
                 )
-            _check_node(return_nodes, label, valve.return_a, (*path, "return_a"))
-            _check_node(return_nodes, label, valve.return_b, (*path, "return_b"))
+            for key in ("return_a", "return_b"):
+                node = getattr(valve, key)
+                check_reference((*path, key), node, return_nodes, f"{label} leads to '{node}'")
         for name, element in self.elements.items():
             path, label = ("elements", name), f"element '{name}'"
-            _check_node(self.node_names, label, element.source, (*path, "from"))
-            _check_node(self.node_names, label, element.target, (*path, "to"))
-            unknown = [x for x in element.joints if x not in self.valves]
-            if unknown:
-                raise CircuitPathError(
-                    (*path, "joints"),
-                    f"{label} is opened by '{unknown[0]}', "
-                    f"{suggest_names(self.valves, unknown[0])}",
+            for key, node in (("from", element.source), ("to", element.target)):
+                check_reference((*path, key), node, self.node_names, f"{label} leads to '{node}'")
+            for joint in element.joints:
+                check_reference(
+                    (*path, "joints"), joint, self.valves, f"{label} is opened by '{joint}'"
                 )
 
     @property
@@ -160,7 +155,7 @@ class Hydraulics:
         return tuple(self.cylinders)
 
     @property
-    def spools(self) -> dict[str, Valve | Spool]:
+    def spools(self) -> dict[str, Spool]:
         """Spools by the names of their signals: JOINT, and JOINT_b for a second spool."""
         return {name: x for valve in self.valves.values() for name, x in valve.spools.items()}
 
@@ -201,16 +196,11 @@ class Hydraulics:
         )
 
 
-def _check_node(nodes: list[str], label: str, name: str, path: tuple[str, ...]) -> None:
-    if name not in nodes:
-        raise CircuitPathError(path, f"{label} leads to '{name}', {suggest_names(nodes, name)}")
-
-
 def check_tank_pressure(supply: Supply, oil: Oil) -> None:
     """Check that the oil does not boil in the tank.
 
     Raises:
-        ComponentParameterError: The pressure of the tank is not above the vapour pressure.
+        CircuitParameterError: The pressure of the tank is not above the vapour pressure.
     """
     hint = ": pressures count from a vacuum, write 1e5 for an open tank"
     check_conditions(
@@ -227,7 +217,7 @@ def check_relief_pressure(supply: Supply, cylinder: Cylinder) -> None:
     """Check that the relief valves of a cylinder can close.
 
     Raises:
-        ComponentParameterError: Their pressure is not above that of the tank.
+        CircuitParameterError: Their pressure is not above that of the tank.
     """
     check_conditions(
         (

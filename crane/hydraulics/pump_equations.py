@@ -177,18 +177,11 @@ def unstable_frequency_range(supply: Supply, bulk_modulus: float) -> tuple[float
         + a * squared_frequency * sensing_time
     )
     linear_coefficient = 1.0 + (a * a - 2.0 * squared_frequency) * sensing_time**2
-    if not sensing_time:
-        return (0.0, math.sqrt(-constant_term) / (2.0 * math.pi)) if constant_term < 0 else None
-    discriminant = linear_coefficient * linear_coefficient - 4.0 * sensing_time**2 * constant_term
-    if discriminant <= 0:
+    roots = np.roots([sensing_time**2, linear_coefficient, constant_term])
+    if np.iscomplex(roots).any() or roots.max() <= 0:
         return None
-    low, high = (
-        (-linear_coefficient + sign * math.sqrt(discriminant)) / (2.0 * sensing_time**2)
-        for sign in (-1.0, 1.0)
-    )
-    if high <= 0:
-        return None
-    return math.sqrt(max(low, 0.0)) / (2.0 * math.pi), math.sqrt(high) / (2.0 * math.pi)
+    low = max(roots.min(), 0.0) if sensing_time else 0.0
+    return math.sqrt(low) / (2.0 * math.pi), math.sqrt(roots.max()) / (2.0 * math.pi)
 
 
 def least_sensing_ratio(supply: Supply, bulk_modulus: float) -> float:

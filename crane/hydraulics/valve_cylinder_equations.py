@@ -352,7 +352,7 @@ class ValveCylinderEquations:
 
 def spool_equations(
     name: str,
-    spool: Valve | Spool,
+    spool: Spool,
     constants: Mapping[str, Scalar],
     states: Mapping[str, Scalar],
     signal: Scalar,
@@ -414,7 +414,7 @@ def cylinder_constants(cylinder: Cylinder, valve: Valve, stroke: float) -> dict[
     return named | {"counterbalance": counterbalance}
 
 
-def spool_constants(spool: Valve | Spool) -> dict[str, Scalar]:
+def spool_constants(spool: Spool) -> dict[str, Scalar]:
     """Constants of a spool."""
     return {
         "neutral": spool.neutral,

@@ -40,22 +40,33 @@ class Sway(OneLineRepr):
 
         M_ff theta'' + (M_fd + M_ff E) q_d'' + G theta + ... = 0.
 
+    Held coordinates of idle motions (`Machine.held`) are none of these joints: they keep their
+    values. Changes of ball joints and floating bases are small motions along and about the axes
+    of the child.
+
     Args:
         machine: The machine, with free joints.
+
+    Attributes:
+        machine: The machine.
+        free_indices: Indices of the free joints f among the active ones.
 
     Raises:
         InputError: The machine has none.
     """
 
     def __init__(self, machine: Machine):
-        if not machine.free:
-            raise InputError(f"nothing sways on '{machine.name}': it has no free joints")
+        self.free_indices = np.setdiff1d(np.flatnonzero(~machine.is_driven), machine.held)
+        if not len(self.free_indices):
+            raise InputError(
+                f"nothing sways on '{machine.name}': it has no free joints that move an inertia"
+            )
         self.machine = machine
-        self._driven = machine.is_driven
+        self._names = ", ".join(machine.active[i] for i in self.free_indices)
         self._dynamics = Dynamics(machine)
         units = machine.closure.units[machine.closure.active]
         self._difference_steps = _DIFFERENCE_STEP * units
-        laws = (machine.friction.get(joint) for joint in machine.free)
+        laws = (machine.friction.get(machine.active[i]) for i in self.free_indices)
         self._viscous = np.array([0.0 if law is None else law.viscous for law in laws])
         span = machine.upper - machine.lower
         self._stroke_lengths = np.where(np.isfinite(span), span, units)
@@ -75,7 +86,7 @@ class Sway(OneLineRepr):
             InputError: There is no stable equilibrium nearby.
         """
         q_a = np.array(q_a, dtype=np.float64)
-        free = ~self._driven
+        free = self.free_indices
         for _ in range(_MAX_ITERATIONS):
             gravity_force = self._dynamics.gravity(q_a)[..., free]
             stiffness = self.stiffness(q_a)[..., free]
@@ -83,16 +94,17 @@ class Sway(OneLineRepr):
             if not np.isfinite(determinants).all() or not (determinants > 0).all():
                 break
             newton_step = np.linalg.solve(stiffness, gravity_force[..., None])[..., 0]
-            q_a[..., free] -= np.clip(newton_step, -0.5, 0.5)
+            directions = self._coordinate_rates(q_a)[..., free]
+            q_a -= np.einsum("...ij,...j->...i", directions, np.clip(newton_step, -0.5, 0.5))
             if np.abs(newton_step).max() < _EQUILIBRIUM_TOLERANCE**0.5 * 1e-3:
                 return q_a
         raise InputError(
-            f"what {', '.join(self.machine.free)} carry has no stable equilibrium nearby: choose "
+            f"what {self._names} carry has no stable equilibrium nearby: choose "
             "a configuration, and gravity, in which it hangs"
         )
 
     def stiffness(self, q_a: Array) -> Array:
-        """Gravitational stiffness of the free joints, dg_f/dq_A.
+        """Gravitational stiffness of the free joints, dg_f/dq_A, by small motions of joints.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
@@ -100,15 +112,24 @@ class Sway(OneLineRepr):
         Returns:
             (f, n) or (N, f, n) for the f free joints.
         """
-        columns = []
+        columns, directions = [], self._coordinate_rates(q_a)
         for i, step in enumerate(self._difference_steps):
-            perturbation = np.zeros(len(self._difference_steps))
-            perturbation[i] = step
+            perturbation = step * directions[..., i]
             gravity = self._dynamics.gravity
             columns.append(
                 (gravity(q_a + perturbation) - gravity(q_a - perturbation)) / (2.0 * step)
             )
-        return np.stack(columns, axis=-1)[..., ~self._driven, :]
+        return np.stack(columns, axis=-1)[..., self.free_indices, :]
+
+    def _coordinate_rates(self, q_a: Array) -> Array:
+        """Derivatives (n, n) or (N, n, n) of q_A by active velocities; 1 without ball joints."""
+        closure, active = self.machine.closure, self.machine.closure.active
+        if not self.machine.coordinates.is_rotation_vector[active].any():
+            return np.broadcast_to(np.eye(len(active)), (*q_a.shape, len(active)))
+        q = closure.solve(np.atleast_2d(q_a))
+        rates = np.array([self.machine.coordinates.rate_matrix(one) for one in q])
+        found = (rates @ closure.gamma(q))[:, active]
+        return np.asarray(found.reshape(*q_a.shape, len(active)))
 
     def modes(self, q_a: ArrayLike) -> tuple[Array, Array]:
         """Modes of the sway with locked drives: (G - omega^2 M_ff) phi = 0.
@@ -132,7 +153,7 @@ class Sway(OneLineRepr):
 
     def _modal_analysis(self, q_a: Array) -> tuple[Array, Array, Array]:
         """Frequencies (f,), mode shapes (f, f) of unit modal mass, and M_ff."""
-        free = ~self._driven
+        free = self.free_indices
         mass = self._dynamics.mass_matrix(q_a)[np.ix_(free, free)]
         stiffness = self.stiffness(q_a)[:, free]
         from scipy.linalg import eigh  # slow to import
@@ -140,8 +161,7 @@ class Sway(OneLineRepr):
         squares, shapes = eigh((stiffness + stiffness.T) / 2, mass)
         if squares[0] <= 0:
             raise InputError(
-                f"what {', '.join(self.machine.free)} carry does not hang, choose another "
-                "configuration"
+                f"what {self._names} carry does not hang, choose another configuration"
             )
         return np.sqrt(squares), shapes, mass
 
@@ -162,7 +182,7 @@ class Sway(OneLineRepr):
         Raises:
             InputError: The drives cannot move the load in a direction of sway.
         """
-        d, f = np.flatnonzero(self._driven), np.flatnonzero(~self._driven)
+        d, f = np.flatnonzero(self.machine.is_driven), self.free_indices
         mass = self._dynamics.mass_matrix(q_a)[:, f]
         stiffness = self.stiffness(q_a)
         hanging_derivatives = -np.linalg.solve(stiffness[:, :, f], stiffness[:, :, d])
@@ -172,7 +192,7 @@ class Sway(OneLineRepr):
         equations = [coupled_mass / free_mass_diagonal]
         right_sides = [-mass[:, :, f] / free_mass_diagonal]
         if len(d) > len(f):
-            suspension = self.machine.tree.joints[self.machine.free[0]].parent
+            suspension = self.machine.tree.joints[self.machine.active[f[0]]].parent
             equations.append(Kinematics(self.machine, suspension).jacobian(q_a)[:, 2:3, d])
             right_sides.append(np.zeros((len(q_a), 1, len(f))))
         stroke_lengths = self._stroke_lengths[d]
@@ -180,7 +200,7 @@ class Sway(OneLineRepr):
         if (np.linalg.svd(matrix[:, : len(f)], compute_uv=False)[:, -1] < 1e-3).any():
             raise InputError(
                 f"the drives of '{self.machine.name}' cannot move what hangs on "
-                f"{', '.join(self.machine.free)} in every direction of sway: use an input shaper"
+                f"{self._names} in every direction of sway: use an input shaper"
             )
         return stroke_lengths[:, None] * (
             np.linalg.pinv(matrix) @ np.concatenate(right_sides, axis=1)
@@ -188,7 +208,7 @@ class Sway(OneLineRepr):
 
     def free_joint_forces(self, q_a: Array, v_a: Array, a_a: Array) -> Array:
         """Forces (N, f) of the free joints for a motion, without dry friction."""
-        free = ~self._driven
+        free = self.free_indices
         return self._dynamics.inverse(q_a, v_a, a_a)[:, free] + self._viscous * v_a[:, free]
 
 
@@ -272,7 +292,7 @@ def _flatness_based_motion(sway_model: Sway, reference: Trajectory, time: Array)
     from scipy.interpolate import BSpline  # slow to import
 
     duration, smoothing = reference.duration, _SMOOTHING_SHARE * reference.duration
-    driven = sway_model.machine.is_driven
+    driven, free = sway_model.machine.is_driven, sway_model.free_indices
     hanging_configurations = sway_model.hanging_equilibrium(
         _smooth_reference(retime(reference, duration - smoothing), time, smoothing)
     )
@@ -282,16 +302,16 @@ def _flatness_based_motion(sway_model: Sway, reference: Trajectory, time: Array)
     knots = np.concatenate([np.full(5, 0.0), knots, np.full(5, duration)])
     # without those that have values or derivatives at an end
     splines = BSpline.design_matrix(time, knots, 5).toarray()[:, 3:-3]
-    free_stiffness = sway_model.stiffness(hanging_configurations)[:, :, ~driven]
+    free_stiffness = sway_model.stiffness(hanging_configurations)[:, :, free]
     spline_projection = splines @ np.linalg.pinv(splines)
-    theta = np.zeros((len(time), int((~driven).sum())))
+    theta = np.zeros((len(time), len(free)))
     previous_correction = np.inf
     for _ in range(_MAX_ITERATIONS):
         q_a = hanging_configurations.copy()
         q_a[:, driven] += np.einsum("nkf,nf->nk", pivoting_motions, theta)
         try:
             q_a = sway_model.hanging_equilibrium(q_a)
-            q_a[:, ~driven] += theta
+            q_a[:, free] += theta
             free_joint_forces = sway_model.free_joint_forces(q_a, *_spline_derivatives(time, q_a))
         except ClosureError:  # beyond the reach of the machine
             break

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.common.samples import Array
+from crane.common.samples import Array, true_runs
 from crane.common.scratch_arrays import release_pages
 from crane.description.sensors import VELOCITY_SUFFIX
 from crane.recordings.recording import REFERENCE_PREFIX, Recording
@@ -161,7 +161,7 @@ def _moving_mean(values: Array, width: int) -> Array:
     total = np.concatenate([[0.0], np.cumsum(values - values.mean())])
     at = np.arange(len(values))
     low, high = np.maximum(at - width // 2, 0), np.minimum(at - width // 2 + width, len(values))
-    return np.asarray((total[high] - total[low]) / (high - low) + values.mean())
+    return (total[high] - total[low]) / (high - low) + values.mean()
 
 
 def _oscillation_spans(
@@ -200,11 +200,10 @@ def _oscillation_spans(
     good = binary_closing(np.pad(good, count), np.ones(count + 1, dtype=bool))[
         count:-count
     ]  # single jolts
-    marks = np.flatnonzero(np.diff(good.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
     last_period = count - 2 * order
     return [
         (int(edges[a]), int(edges[b - 1 + count]), float(np.median(periods[a : b + last_period])))
-        for a, b in marks.tolist()
+        for a, b in true_runs(good).tolist()
     ]
 
 
@@ -223,7 +222,7 @@ def _peak_to_peak(values: Array, first: int, last: int, period: float) -> Array:
     high, low = (x.reduceat(values[:last], starts) for x in (np.maximum, np.minimum))
     means = np.add.reduceat(values[:last], starts) / np.diff(starts, append=last)
     drift = np.abs(np.gradient(means))
-    return np.asarray(np.maximum(high - low - drift, 0.0))
+    return np.maximum(high - low - drift, 0.0)
 
 
 def _reversal_count(command: Array) -> int:

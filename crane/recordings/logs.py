@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from crane.common.errors import RecordingError, suggest_names
+from crane.common.number_text import parse_expression
 from crane.common.package_search import read_plain_file
 from crane.recordings import table_reader, timeseries
 from crane.recordings.timeseries import TIME, Table
@@ -135,8 +136,8 @@ def missing_names(expression: str, arrays: Container[str]) -> list[str]:
 def expression_names(expression: str) -> list[str]:
     """Names of log columns in an expression; empty if it cannot be parsed."""
     try:
-        nodes = list(ast.walk(ast.parse(expression, mode="eval")))
-    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        nodes = list(ast.walk(parse_expression(expression)))
+    except ValueError:
         return []
     if any(isinstance(node, ast.Call | ast.Attribute) for node in nodes):
         return []
@@ -174,10 +175,10 @@ def read_log_columns(path: Path) -> tuple[dict[str, str], list[LogColumn]]:
 def _evaluate_expression(expression: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
     """Value () or samples (N,) of an expression."""
     try:
-        tree = ast.parse(expression, mode="eval")
+        tree = parse_expression(expression)
         with np.errstate(all="ignore"):  # non-finite values are reported with their name later
-            value = np.asarray(_evaluate_node(tree.body, arrays), dtype=np.float64)
-    except (SyntaxError, ValueError, OverflowError, RecursionError, MemoryError):
+            value = np.asarray(_evaluate_node(tree, arrays), dtype=np.float64)
+    except (ValueError, OverflowError, RecursionError):
         raise RecordingError(
             f"'{expression}' cannot be computed, combine columns by + - * / and numbers"
         ) from None
@@ -205,7 +206,7 @@ def _evaluate_node(node: ast.expr, arrays: Mapping[str, np.ndarray]) -> np.ndarr
             raise RecordingError(
                 f"'{ast.unparse(node)}' is not there, give numbers from 0 to {whole.shape[-1] - 1}"
             )
-        return np.asarray(whole[..., at.value])
+        return whole[..., at.value]
     if isinstance(node, ast.Name) or isinstance(node, ast.Constant) and type(node.value) is str:
         name = node.id if isinstance(node, ast.Name) else str(node.value)
         if name in arrays:

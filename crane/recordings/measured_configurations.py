@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from crane.common.errors import ClosureError, MechanismError, RecordingError
-from crane.common.samples import Array
+from crane.common.samples import Array, independent_rows
 from crane.description.kinematic_tree import path_to_root
 from crane.description.sensors import INCLINATION_PREFIX, VELOCITY_SUFFIX, VELOCITY_UNITS
 from crane.machine.machine import Machine
@@ -79,18 +79,10 @@ def independent_joints(
     rows before it.
     """
     gamma = machine.closure.gamma(machine.home) * _stroke_ranges(machine)
-    basis = np.zeros((0, len(machine.active)))
-    found = []
     measured = [x for x in names if x in machine.joints and x not in first]
-    for joint in (*first, *sorted(measured, key=lambda x: x not in machine.active)):
-        row = gamma[machine.column(joint)]
-        rest = row - basis.T @ (basis @ row)
-        rest -= basis.T @ (basis @ rest)  # a second time, against rounding errors
-        size = np.linalg.norm(rest)
-        if size > _MIN_INDEPENDENT_SHARE * np.linalg.norm(row):
-            basis = np.vstack([basis, rest / size])
-            found.append(joint)
-    return tuple(found)
+    joints = [*first, *sorted(measured, key=lambda x: x not in machine.active)]
+    rows = gamma[[machine.column(joint) for joint in joints]]
+    return tuple(joints[i] for i in independent_rows(rows, _MIN_INDEPENDENT_SHARE))
 
 
 def _stroke_ranges(machine: Machine) -> Array:

@@ -22,6 +22,7 @@ import pinocchio as pin
 
 from crane.common.errors import CraneWarning, DescriptionError, InputError, RecordingError
 from crane.common.samples import Array
+from crane.common.scratch_arrays import stack_columns
 from crane.description.machine_lookup import find_machine_file, without_changes
 from crane.description.sensors import PRESSURE_PREFIX, SENSOR_PREFIX, Sensor
 from crane.formats.machine_loading import load_from_expression
@@ -231,7 +232,10 @@ def _remove_free_forces(machine: Machine, table: Table) -> Table:
             raise RecordingError(free_force_message(joint, table.values[:, i]))
     kept_columns = [i for i in range(len(table.units)) if i not in free_columns]
     units = {name: unit for i, (name, unit) in enumerate(table.units.items()) if i in kept_columns}
-    return Table(units, table.values[:, kept_columns], notes)
+    columns = (table.values[:, i] for i in kept_columns)
+    return Table(
+        units, stack_columns(columns, len(units)) if free_columns else table.values, notes
+    )
 
 
 def is_measured(table: Table) -> bool:

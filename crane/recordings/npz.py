@@ -148,19 +148,16 @@ def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, values: Array)
     """Fill an array (N,) with the numbers of an entry."""
     name = _entry_name(entry)
     with archive.open(entry) as file:
-        _read_column(name, file, _read_header(name, file)[2], values)
-
-
-def _read_column(name: str, file: IO[bytes], dtype: np.dtype, column: Array) -> None:
-    for start in range(0, len(column), _BLOCK_NUMBERS):
-        part = column[start : start + _BLOCK_NUMBERS]
-        data = file.read(len(part) * dtype.itemsize)
-        if len(data) != len(part) * dtype.itemsize:
-            raise RecordingError(f"'{name}' is cut short, save the file again")
-        with np.errstate(over="ignore", invalid="ignore"):  # reported when values are checked
-            part[:] = np.frombuffer(data, dtype)
-    if file.read(1):
-        raise RecordingError(f"'{name}' holds more than it declares, save the file again")
+        _, _, dtype = _read_header(name, file)
+        for start in range(0, len(values), _BLOCK_NUMBERS):
+            part = values[start : start + _BLOCK_NUMBERS]
+            data = file.read(len(part) * dtype.itemsize)
+            if len(data) != len(part) * dtype.itemsize:
+                raise RecordingError(f"'{name}' is cut short, save the file again")
+            with np.errstate(over="ignore", invalid="ignore"):  # reported when values are checked
+                part[:] = np.frombuffer(data, dtype)
+        if file.read(1):
+            raise RecordingError(f"'{name}' holds more than it declares, save the file again")
 
 
 def _entry_name(entry: zipfile.ZipInfo) -> str:

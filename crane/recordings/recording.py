@@ -148,7 +148,7 @@ class Recording(Result):
                 f"channels {quoted_list(self.channels)} hold an active joint, "
                 f"rename those that end in {VELOCITY_SUFFIX} and {FORCE_SUFFIX}"
             )
-        for name, unit in self._column_units().items():
+        for name, unit in self.column_units().items():
             timeseries.check_column_name(name, unit)
         for name in ("machine", "task", "controller", "machine_name", "stopped", "start"):
             text = getattr(self, name)
@@ -192,7 +192,7 @@ class Recording(Result):
     def _driven_joints(self) -> list[str]:
         return [x for x in self.joints if x not in self.free]
 
-    def _column_units(self) -> dict[str, str]:
+    def column_units(self) -> dict[str, str]:
         """Units of all columns by name.
 
         Raises:
@@ -253,10 +253,25 @@ class Recording(Result):
 
     def at(self, mask: np.ndarray) -> "Recording":
         """The samples that a mask (N,) selects."""
-        return self if mask.all() else replace(
-            self, time=self.time[mask], q=self.q[mask], v=self.v[mask], tau=self.tau[mask],
-            channels={name: values[mask] for name, values in self.channels.items()},
-        )  # fmt: skip
+        masked = {} if mask.all() else {name: x[mask] for name, x in self.columns().items()}
+        return self.with_columns(masked) if masked else self
+
+    def with_columns(self, columns: Mapping[str, Array]) -> "Recording":
+        """The recording with other values (M,) of its columns; channels without any are left out.
+
+        Args:
+            columns: Columns by name, those of the time and the joints, and some of the channels.
+        """
+        none = np.zeros_like(columns[TIME])
+        q, v, tau = (
+            np.column_stack([columns.get(x + suffix, none) for x in self.joints])
+            for suffix in ("", VELOCITY_SUFFIX, FORCE_SUFFIX)
+        )
+        channels = {name: columns[name] for name in self.channels if name in columns}
+        units = {name: self.channel_units[name] for name in channels}
+        return replace(
+            self, time=columns[TIME], q=q, v=v, tau=tau, channels=channels, channel_units=units
+        )
 
     def with_noise(self, deviations: Mapping[str, float], seed: int = 0) -> "Recording":
         """Add white, normally distributed noise to columns.
@@ -273,36 +288,22 @@ class Recording(Result):
             InputError: A column does not exist, or a deviation is negative or no number.
         """
         columns, rng = self.columns(), np.random.default_rng(as_seed(seed))
-        del columns[TIME]
+        names = [name for name in columns if name != TIME]
         for name, deviation in deviations.items():
-            check_name(name, columns, f"noise of the column '{name}'")
+            check_name(name, names, f"noise of the column '{name}'")
             if as_number(deviation, f"the noise of '{name}'", "") < 0:
                 raise InputError(
                     f"the noise of '{name}' is {deviation:g}, it must not be negative"
                 )
-        for name in [name for name in columns if name in deviations]:  # in the order of columns
+        for name in [name for name in names if name in deviations]:  # in the order of columns
             columns[name] = columns[name] + deviations[name] * rng.normal(size=len(self.time))
         for joint in self.joints:
             if joint + VELOCITY_SUFFIX not in deviations:
                 columns[joint + VELOCITY_SUFFIX] = time_derivative(columns[joint], self.time)
-        none = np.zeros_like(self.time)
-        q, v, tau = (
-            np.column_stack([columns.get(x + suffix, none) for x in self.joints])
-            for suffix in ("", VELOCITY_SUFFIX, FORCE_SUFFIX)
-        )
-        channels = {
-            name: columns[name]
-            for name in self.channels
-            if name in deviations or not name.endswith((VELOCITY_SUFFIX, _ACCELERATION_SUFFIX))
-        }
-        return replace(
-            self,
-            q=q,
-            v=v,
-            tau=tau,
-            channels=channels,
-            channel_units={name: self.channel_units[name] for name in channels},
-        )
+        rates = {x for x in self.channels if x.endswith((VELOCITY_SUFFIX, _ACCELERATION_SUFFIX))}
+        for name in rates - deviations.keys():
+            del columns[name]
+        return self.with_columns(columns)
 
     def error(self, joint: str) -> Array:
         """Tracking error (N,) of a joint [rad], [m]: reference minus coordinate.
@@ -342,7 +343,7 @@ class Recording(Result):
             OutputError: The file cannot be written.
         """
         columns = list(self.columns().values())
-        timeseries.write_columns(path, self._column_units(), columns, self._notes())
+        timeseries.write_columns(path, self.column_units(), columns, self._notes())
 
     def to_npz(self, path: str | Path) -> None:
         """Write the recording as npz, smaller than a CSV and faster to read.
@@ -351,7 +352,7 @@ class Recording(Result):
             OutputError: The file cannot be written.
         """
         columns = list(self.columns().values())
-        timeseries.write_npz(path, self._column_units(), columns, self._notes())
+        timeseries.write_npz(path, self.column_units(), columns, self._notes())
 
     def _notes(self) -> dict[str, str]:
         is_name_of_file = self.machine_name == Path(without_changes(self.machine)).stem

@@ -6,6 +6,7 @@ with the note `# sensors: ideal`, as a simulation writes it, contain quantities 
 changed.
 """
 
+import fnmatch
 import math
 import re
 import warnings
@@ -22,6 +23,7 @@ from crane.common.errors import (
     check_name,
     suggest_names,
 )
+from crane.common.samples import as_number
 from crane.common.unit_conversions import UnitError, parse_number
 from crane.description.sensors import (
     PRESSURE_PREFIX,
@@ -38,7 +40,11 @@ from crane.description.sensors import (
 from crane.machine.machine import Machine
 from crane.recordings import logs, table_reader
 from crane.recordings.angle_unwrapping import unwrap_table
-from crane.recordings.recording import IDEAL_SENSORS, SENSORS_NOTE
+from crane.recordings.recording import (
+    IDEAL_SENSORS,
+    SENSORS_NOTE,
+    Recording,
+)
 from crane.recordings.timeseries import Table, located_errors, table_column
 
 _ALIKE = 0.7  # similarity from which a name counts as a misspelling
@@ -267,3 +273,37 @@ def select_time_span(table: Table, span: TimeSpan, path: str | Path) -> Table:
         return table
     first, last = np.flatnonzero(is_inside)[[0, -1]]
     return Table(table.units, table.values[first : last + 1], table.notes)
+
+
+def shift_columns(recording: Recording, delays: Mapping[str, float]) -> Recording:
+    """Take delays d out of columns y: x(t) = y(t + d), linear between samples.
+
+    Args:
+        recording: The recording.
+        delays: Delays [s] by column or pattern, such as `{"*_force": 0.03}`; negative for columns
+            that are ahead of the others. A rate or force that was computed from another column
+            is shifted by its own name.
+
+    Returns:
+        The recording over the time that all columns cover.
+
+    Raises:
+        RecordingError: A pattern matches no column, or no time is left.
+    """
+    names = [name for name in recording if name != TIME]
+    columns, time, shifts = recording.columns(), recording.time, dict.fromkeys(names, 0.0)
+    for pattern, delay in delays.items():
+        matches = fnmatch.filter(names, pattern)
+        if not matches:
+            raise RecordingError(
+                f"no column to shift is named '{pattern}', {suggest_names(names, pattern)}"
+            )
+        shifts |= dict.fromkeys(matches, as_number(delay, f"the shift of '{pattern}'", "s"))
+    for name, delay in shifts.items():
+        if delay:
+            columns[name] = np.interp(time + delay, time, columns[name])
+    first, last = time[0] - min(shifts.values()), time[-1] - max(shifts.values())
+    is_covered = (time >= max(first, time[0])) & (time <= min(last, time[-1]))
+    if not is_covered.any():
+        raise RecordingError("nothing is left of a recording that is shorter than its shift")
+    return recording.with_columns({name: x[is_covered] for name, x in columns.items()})

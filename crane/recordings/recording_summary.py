@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from crane.common.samples import Array
+from crane.common.samples import Array, true_runs
 from crane.common.scratch_arrays import compute_in_blocks, release_pages
 from crane.common.units import display_unit, format_number, format_quantity
 from crane.description.machine_lookup import without_changes
@@ -145,8 +145,9 @@ def tipping_message(recording: Recording) -> str:
 def _lift_time(time: Array, force: Array) -> float | None:
     """Time [s] at which a support with contact force (N,) lifts, None if it does not."""
     is_lifted = (force <= 0) & np.maximum.accumulate(force > 0)
-    edges = np.flatnonzero(np.diff(is_lifted.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
-    starts = (a for a, b in edges.tolist() if time[b - 1] - time[a] > _MIN_LIFT_DURATION)
+    starts = (
+        a for a, b in true_runs(is_lifted).tolist() if time[b - 1] - time[a] > _MIN_LIFT_DURATION
+    )
     return next((float(time[first]) for first in starts), None)
 
 

@@ -70,7 +70,7 @@ def body_rates(vectors: Array, time: Array) -> Array:
     # half of the step back and half of it forward, both seen from the sample
     back = (rotations[before].inv() * rotations).as_rotvec()
     forward = (rotations.inv() * rotations[after]).as_rotvec()
-    return np.asarray((back + forward) / (time[after] - time[before])[:, None])
+    return (back + forward) / (time[after] - time[before])[:, None]
 
 
 def continuous_rotations(vectors: Array) -> Array:

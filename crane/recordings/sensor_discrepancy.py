@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from crane.common.errors import ClosureError, CraneWarning, MechanismError
-from crane.common.samples import Array
+from crane.common.samples import Array, root_mean_square
+from crane.common.scratch_arrays import release_pages
 from crane.description.sensors import (
     INCLINATION_PREFIX,
     SENSOR_PREFIX,
@@ -125,6 +126,7 @@ class _RedundantSensor:
         self.unit = str(quantity_unit(configurations.machine.tree, self.quantity))
         from scipy.integrate import cumulative_trapezoid
 
+        release_pages()
         reading, random_walk = table_column(configurations.table, name), 0.0
         if self.is_rate:
             time = table_column(configurations.table, TIME)
@@ -252,7 +254,7 @@ class _RedundantSensor:
         rate_columns = [np.ones_like(self.time)] if self.is_rate else []
         A = np.column_stack([*columns, *rate_columns])
         values: Array = np.asarray(np.linalg.lstsq(A, discrepancy, rcond=None)[0])
-        return values, float(np.sqrt(np.mean((discrepancy - A @ values) ** 2)))
+        return values, root_mean_square(discrepancy - A @ values)
 
     @property
     def _zero_column(self) -> Array:
@@ -300,7 +302,7 @@ class _RedundantSensor:
                         + self.expected
                         - self._configurations.expected_reading(self.name, q)
                     )
-                    residual_rms = float(np.sqrt(np.mean(discrepancy**2)))
+                    residual_rms = root_mean_square(discrepancy)
                     derivative = -self._configurations.directional_derivative(
                         self.name, q, self._configurations.machine.closure.gamma(q)[:, :, i]
                     )

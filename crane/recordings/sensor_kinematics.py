@@ -90,7 +90,7 @@ def pin_derivatives(machine: Machine, q: Array) -> dict[str, Array]:
 
 def _loop_pins(machine: Machine) -> dict[str, list[tuple[int, float, str]]]:
     """By frame: its loops, its side (-1, 1) in each of them, and the link that carries it."""
-    parent_joints = {joint.child: joint for joint in machine.tree.joints.values()}
+    parent_joints = machine.tree.parent_joints
     moving_subtrees = machine.tree.joints_by_parent()
     found: dict[str, list[tuple[int, float, str]]] = {}
     for i, loop in enumerate(machine.closure.equations.loops):

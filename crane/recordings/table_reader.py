@@ -12,6 +12,7 @@ import os
 import stat
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -76,7 +77,8 @@ def read_csv(path: str | Path) -> Table:
                 f"{MAX_NUMBERS} numbers"
             )
         _check_last_line(path, notes)
-        values = _read_values(path, line, lines, units)
+        rows = partial(_text_rows, path, _UTF8_ENCODING, line)
+        values = _read_values(rows, line, lines, list(units), ",", units[TIME])
         _check_sample_count(values, notes)
         return _convert_to_si(
             Table(units, values, {key: x for key, x in notes.items() if key != SAMPLE_COUNT_NOTE})
@@ -112,24 +114,21 @@ def read_log_arrays(path: Path) -> dict[str, np.ndarray]:
         check_regular_file(path)
         if path.suffix.lower() == ".npz":
             return read_arrays(path)
-        _count_lines(path)
+        lines = _count_lines(path)
         encoding = _detect_encoding(path)
         notes, heading, line = _read_header(path, encoding)
         _check_last_line(path, notes, encoding)
         separator = max(",;\t", key=heading.count)
         try:
             names = [cell.strip() for cell in next(csv.reader([heading], delimiter=separator))]
-            values = _read_log_values(
-                lambda: _log_rows(path, encoding, line, separator), line, separator, names
-            )
-        except (ValueError, csv.Error) as error:  # text among the numbers
-            reason = str(error).rstrip(".")
-            raise RecordingError(f"no table of numbers ({reason}), correct it") from None
+        except csv.Error as error:
+            raise RecordingError(f"no table of numbers ({error}), correct it") from None
+        text_rows = partial(_text_rows, path, encoding, line)
+        rows: Callable[[], Iterator[str]] = text_rows
+        if separator != "," and not any("." in x for x in text_rows()):  # decimal commas
+            rows = lambda: (x.replace(",", ".") for x in text_rows())  # noqa: E731
+        values = _read_values(rows, line, lines, names, separator)
         _check_sample_count(values, notes)
-        if values.shape[1] != len(names) or len(set(names)) < len(names):
-            raise RecordingError(
-                f"{len(set(names))} different names head {values.shape[1]} columns, name each"
-            )
         return dict(zip(names, values.T, strict=True))
 
 
@@ -234,16 +233,10 @@ def _detect_encoding(path: Path) -> str:
     return _UTF8_ENCODING
 
 
-def _log_rows(path: Path, encoding: str, header: int, separator: str) -> Iterator[str]:
-    """Lines of a log below its header row, with decimal points."""
-
-    def lines() -> Iterator[str]:
-        with path.open(encoding=encoding) as file:
-            yield from itertools.islice(file, header, None)
-
-    if separator == "," or any("." in line for line in lines()):
-        return lines()
-    return (line.replace(",", ".") for line in lines())
+def _text_rows(path: Path, encoding: str, header: int) -> Iterator[str]:
+    """Lines of a file below its header row."""
+    with path.open(encoding=encoding, errors=_PATH_ERRORS) as file:
+        yield from itertools.islice(file, header, None)
 
 
 def _read_header(path: Path, encoding: str = _UTF8_ENCODING) -> tuple[dict[str, str], str, int]:
@@ -319,70 +312,55 @@ def _shortened(cell: str) -> str:
     return cell if len(cell) < 60 else cell[:60] + "..."
 
 
-def _read_values(path: Path, header: int, lines: int, units: Mapping[str, str]) -> Array:
-    """Read numbers (N, columns) below the header row, line `header` of `lines`."""
-    values, count = scratch_arrays.empty_array(lines - header, len(units)), 0
+def _read_values(
+    rows: Callable[[], Iterator[str]],
+    header: int,
+    lines: int,
+    names: Sequence[str],
+    separator: str,
+    time_unit: str | None = None,
+) -> Array:
+    """Read numbers (N, columns) below the header row, line `header` of `lines`.
+
+    Args:
+        rows: Returns the lines below the header row.
+        header: Number of the header row.
+        lines: Number of lines of the file, at least.
+        names: Names of the columns.
+        separator: Between cells.
+        time_unit: Unit of the time of a recording, whose times increase and whose numbers are
+            finite; None for a log.
+    """
+    values, count, remaining = scratch_arrays.empty_array(lines - header, len(names)), 0, rows()
+    raise_fault = partial(_raise_first_fault, rows, header, names, separator, time_unit)
     try:
-        # numpy warns of blank lines
-        with (
-            path.open(encoding="utf-8", errors=_PATH_ERRORS) as file,
-            warnings.catch_warnings(action="ignore"),
-        ):
-            for _ in itertools.islice(file, header):
-                pass
-            for line in file:
-                block = itertools.chain([line], itertools.islice(file, BLOCK_ROWS - 1))
-                rows = np.loadtxt(block, delimiter=",", comments=None, ndmin=2)
-                if not rows.size:
+        with warnings.catch_warnings(action="ignore"):  # numpy warns of blank lines
+            for line in remaining:
+                block = itertools.chain([line], itertools.islice(remaining, BLOCK_ROWS - 1))
+                part = np.loadtxt(block, delimiter=separator, comments=None, ndmin=2)
+                if not part.size:
                     continue
-                if rows.shape[1] != len(units) or not np.isfinite(rows).all():
-                    _raise_first_fault(path, header, units)
-                values[count : count + len(rows)] = rows
-                count += len(rows)
+                if part.shape[1] != len(set(names)):
+                    raise_fault()
+                    raise RecordingError(
+                        f"{len(set(names))} different names head {part.shape[1]} columns, name "
+                        "each"
+                    )
+                if time_unit is not None and not np.isfinite(part).all():
+                    raise_fault()
+                values[count : count + len(part)] = part
+                count += len(part)
                 scratch_arrays.release_pages()
     except ValueError as error:
-        _raise_first_fault(path, header, units)
-        reason = " ".join(str(error).split())[:120]
-        raise RecordingError(f"{reason}, correct the file") from None
+        raise_fault()
+        reason = " ".join(str(error).split())[:120].rstrip(".")
+        raise RecordingError(f"no table of numbers ({reason}), correct it") from None
     if not count:
         raise RecordingError("has a header and no samples, write one row per sample")
     values = values[:count]
-    if (np.diff(values[:, list(units).index(TIME)]) <= 0).any():
-        _raise_first_fault(path, header, units)
+    if time_unit is not None and (np.diff(values[:, names.index(TIME)]) <= 0).any():
+        raise_fault()
     return values
-
-
-def _read_log_values(
-    rows: Callable[[], Iterator[str]], header: int, separator: str, names: Sequence[str]
-) -> Array:
-    """Read numbers (N, columns) of the rows of a log, below its header row, line `header`.
-
-    Raises:
-        RecordingError: There are none, or a cell is not a number.
-        ValueError: Rows have different numbers of cells.
-    """
-    try:
-        with warnings.catch_warnings(action="ignore"):  # numpy warns of a file without samples
-            values = np.loadtxt(rows(), delimiter=separator, comments=None, ndmin=2)
-    except ValueError:
-        _raise_invalid_cell(rows(), header, separator, names)
-        raise
-    if not values.size:
-        raise RecordingError("has a header and no samples, write one row per sample")
-    return values
-
-
-def _raise_invalid_cell(
-    rows: Iterator[str], header: int, separator: str, names: Sequence[str]
-) -> None:
-    for line, text in enumerate(rows, start=header + 1):
-        cells = text.rstrip("\n").split(separator) if text.strip() else []
-        for name, cell in zip(names, cells, strict=False):
-            if _parse_number(cell) is None:
-                raise RecordingError(
-                    f"line {line}, column '{name}': '{_shortened(cell)}' is not a number, correct "
-                    f"or remove the line"
-                )
 
 
 def _parse_number(cell: str) -> float | None:
@@ -392,29 +370,34 @@ def _parse_number(cell: str) -> float | None:
         return None
 
 
-def _raise_first_fault(path: Path, header: int, units: Mapping[str, str]) -> None:
-    names, last = list(units), -np.inf
-    with path.open(encoding=_UTF8_ENCODING, errors=_PATH_ERRORS) as file:
-        for line, text in enumerate(file, start=1):
-            if line <= header or not text.strip():
-                continue
-            text.encode()  # only notes may hold paths that are no text
-            cells = text.rstrip("\n").split(",")
-            if len(cells) != len(names):
+def _raise_first_fault(
+    rows: Callable[[], Iterator[str]],
+    header: int,
+    names: Sequence[str],
+    separator: str,
+    time_unit: str | None,
+) -> None:
+    is_recording, last = time_unit is not None, -np.inf
+    for line, text in enumerate(rows(), start=header + 1):
+        if not text.strip():
+            continue
+        text.encode()  # only notes may hold paths that are no text
+        cells = text.rstrip("\n").split(separator)
+        if is_recording and len(cells) != len(names):
+            raise RecordingError(
+                f"line {line} has {len(cells)} cells, give {len(names)} as in the header"
+            )
+        for name, cell in zip(names, cells, strict=False):
+            value = _parse_number(cell)
+            if value is None or (is_recording and not np.isfinite(value)):
                 raise RecordingError(
-                    f"line {line} has {len(cells)} cells, give {len(names)} as in the header"
+                    f"line {line}, column '{name}': '{_shortened(cell)}' is not a "
+                    f"{'finite ' * is_recording}number, correct or remove the line"
                 )
-            for name, cell in zip(names, cells, strict=True):
-                value = _parse_number(cell)
-                if value is None or not np.isfinite(value):
-                    raise RecordingError(
-                        f"line {line}, column '{name}': '{_shortened(cell)}' is not a finite "
-                        f"number, correct or remove the line"
-                    )
-            now = float(cells[names.index(TIME)])
-            if now <= last:
-                raise RecordingError(
-                    f"line {line}: time goes from {last} to {now} {units[TIME]}, "
-                    f"give strictly increasing times"
-                )
-            last = now
+        now = float(cells[names.index(TIME)]) if is_recording else np.inf
+        if is_recording and now <= last:
+            raise RecordingError(
+                f"line {line}: time goes from {last} to {now} {time_unit}, "
+                f"give strictly increasing times"
+            )
+        last = now

@@ -196,9 +196,10 @@ def check_columns_present(required: Iterable[Sequence[str]], present: Collection
 
 def time_derivative(x: Array, time: Array) -> Array:
     """Central differences (N,) of x (N,); zero if time does not increase."""
+    scratch_arrays.release_pages()
     if len(x) < 2 or not (np.diff(time) > 0).all():
         return np.zeros_like(x)
-    return np.asarray(np.gradient(x, time))
+    return np.gradient(x, time)
 
 
 def check_finite(columns: Mapping[str, Array]) -> None:

@@ -7,8 +7,8 @@ from .linear.linearization import linearize as linearize
 from .recorded_run import InterruptedRun as InterruptedRun
 from .recording_replay import Comparison as Comparison
 from .recording_replay import replay as replay
-from .sensitivity.motion_gradient import Gradient as Gradient
-from .sensitivity.motion_gradient import gradient as gradient
+from .sensitivity.motion_sensitivities import Gradient as Gradient
 from .sensitivity.motion_sensitivities import Sensitivities as Sensitivities
+from .sensitivity.motion_sensitivities import gradient as gradient
 from .sensitivity.motion_sensitivities import sensitivities as sensitivities
 from .simulation_run import simulate as simulate

@@ -1,8 +1,8 @@
 """Batches of simulations in threads: variants of a machine, initial states, payloads."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed, wait
 from dataclasses import dataclass
 
 import numpy as np
@@ -137,30 +137,20 @@ def simulate_batch(
 
     results: dict[int, _Result] = {}
     failures: dict[int, str] = {}
-    # the first one compiles the machine code of the others
-    indices = list(range(len(machines)))
     with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
-        for i, future in _completed_runs(pool, run, (indices[:1], indices[1:])):
+        futures = {pool.submit(run, 0): 0}
+        wait(futures)  # the first one compiles the machine code of the others
+        futures |= {pool.submit(run, i): i for i in range(1, len(machines))}
+        for future in as_completed(futures):
             error = future.exception()
             if isinstance(error, CraneError):
-                failures[i] = str(error)
+                failures[futures[future]] = str(error)
             else:
-                results[i] = future.result()
-            if progress is not None:
-                progress((len(results) + len(failures)) / len(machines))
+                results[futures[future]] = future.result()
+            progress((len(results) + len(failures)) / len(machines))
     if not results:
         raise InputError(f"all {len(machines)} simulations failed, the first: {failures[0]}")
     return _stack_results(results, failures, len(machines))
-
-
-def _completed_runs(
-    pool: ThreadPoolExecutor, run: Callable[[int], _Result], groups: Sequence[Sequence[int]]
-) -> Iterator[tuple[int, Future[_Result]]]:
-    """Runs in the order of their completion, one group after another."""
-    for group in groups:
-        futures = {pool.submit(run, i): i for i in group}
-        for future in as_completed(futures):
-            yield futures[future], future
 
 
 def _stack_results(results: dict[int, _Result], failures: dict[int, str], count: int) -> Batch:

@@ -27,7 +27,7 @@ from crane.dynamics.quantity_evaluator import QUANTITY_ARGUMENTS
 from crane.formats.machine_loading import load
 from crane.hydraulics.circuit_states import BALANCE_UNITS
 from crane.machine.machine import Machine
-from crane.simulation.integration.charts import Chart, state_layout
+from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.machine_formulas import controller_settings, trace_machine
 
 _KINEMATIC_QUANTITIES = ("loops", "gamma", "tip")  # what depends on q alone
@@ -168,14 +168,11 @@ def _simulation_quantity(machine: Machine) -> tuple[dict[str, int], list[Any], F
         )
     # the signals are a command's references
     drive = ValveDrive(machine, ValveSignals(machine, [0.0], {}))
-    chart, layout = (
-        Chart.from_dynamics(Dynamics(machine)),
-        state_layout(machine, drive.circuit.state_count),
-    )
+    chart = Chart.from_dynamics(Dynamics(machine), drive, drive.circuit.state_count)
     tape, m = Tape(), len(drive.circuit.spools)
     # zeros among the settings are features that the circuit does not have
     settings = controller_settings(drive, tape, 2, True)
-    formulas = trace_machine(chart, drive, tape, layout, 4, tape.load_vector(3, 0, m), settings)
+    formulas = trace_machine(chart, tape, 4, tape.load_vector(3, 0, m), settings)
     rates, stiff_state_count = formulas.controller_rate, drive.circuit.stiff_state_count
     accelerations = formulas.accelerations(with_joints_at_rest=False)
     numbers = (

@@ -1,14 +1,14 @@
 """Recording of a simulation: its channels, and readings of ideal sensors."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
 
-from crane.codegen import Layout, LayoutView
+from crane.codegen import LayoutView
 from crane.common import scratch_arrays
-from crane.common.errors import CraneError, RecordingError, format_one_line, suggest_names
+from crane.common.errors import CraneError, RecordingError, check_name, format_one_line
 from crane.common.one_line_repr import shorten_to_line
 from crane.common.samples import MAX_QUANTITY, Array
 from crane.control.control_law import Controller, ZeroForce, controller_reference
@@ -34,6 +34,7 @@ from crane.motion.trajectory import Trajectory
 from crane.recordings.recording import Recording
 from crane.recordings.sensor_kinematics import ideal_readings
 from crane.recordings.timeseries import TIME, Table, accepted_units, check_unit
+from crane.simulation.integration.charts import Chart
 
 ChannelColumn = tuple[str, Array, str]  # name, values, unit
 
@@ -44,7 +45,7 @@ class IntegrationResult(NamedTuple):
     Attributes:
         time: (N,) instants [s].
         array: (N, .) rows at these instants.
-        layout: Layout of a row, see `row_layout`.
+        chart: The machine in the coordinates of the user.
         notes: Notes for the user about the motion.
         start_text: Note about an initial state that differs from home.
         stop: The exception that stopped it, or None.
@@ -52,7 +53,7 @@ class IntegrationResult(NamedTuple):
 
     time: Array
     array: Array
-    layout: Layout
+    chart: Chart
     notes: Iterable[str]
     start_text: str = ""
     stop: BaseException | None = None
@@ -60,7 +61,7 @@ class IntegrationResult(NamedTuple):
     @property
     def rows(self) -> LayoutView:
         """The parts of the rows, (N, .) each."""
-        return self.layout.view(self.array)
+        return self.chart.row_layout.view(self.array)
 
     def first_instants(self, count: int, stop: BaseException | None) -> "IntegrationResult":
         """The first instants of the result, with the exception that stopped it there."""
@@ -80,7 +81,12 @@ class InterruptedRun(KeyboardInterrupt):
 
 
 def stop_with_recording(
-    machine: Machine, control: Controller, run: IntegrationResult, task: str, end_time: float
+    machine: Machine,
+    control: Controller,
+    run: IntegrationResult,
+    stop: BaseException,
+    task: str,
+    end_time: float,
 ) -> BaseException:
     """The exception that stopped a run, with the recording up to there as its `recording`.
 
@@ -88,10 +94,10 @@ def stop_with_recording(
         machine: The machine.
         control: Its controller.
         run: Result of the integration.
+        stop: The exception.
         task: Name of the motion.
         end_time: Intended end [s].
     """
-    assert (stop := run.stop) is not None
     if not len(run.time):
         return stop
     largest_values = scratch_arrays.compute_in_blocks(
@@ -277,33 +283,23 @@ def _point_columns(name: str, positions: Array) -> Iterator[ChannelColumn]:
 _INPUT_PREFIXES = (VALVE_SIGNAL_PREFIX, SUPPLY_PRESSURE, TANK_PRESSURE)
 
 
-def simulated_columns(machine: Machine, table: Table) -> list[str]:
+def simulated_columns(
+    machine: Machine, table: Table, recording: Recording | None = None
+) -> list[str]:
     """Columns of a measured table that a simulation of its inputs has.
 
     Joints, their velocities and forces, pressures, channels of the circuit, the tip, and
     inclinations of links, `inclination_LINK` and `inclination_LINK_velocity`.
 
+    Args:
+        machine: The machine.
+        table: The measured table.
+        recording: Recording of the simulation; None where there is none yet.
+
     Raises:
         RecordingError: A column has the unit of another quantity, or belongs to no link.
     """
-    return _select_columns(machine, table, simulated_units(machine))
-
-
-def recorded_columns(machine: Machine, table: Table, recording: Recording) -> list[str]:
-    """Columns of a measured table that the recording of a simulation has.
-
-    Raises:
-        RecordingError: As for `simulated_columns`.
-    """
-    units = recording.units | recording.channel_units
-    units |= {x + VELOCITY_SUFFIX: VELOCITY_UNITS[unit] for x, unit in recording.units.items()}
-    driven = (x for x in recording.joints if x not in recording.free)
-    units |= {x + FORCE_SUFFIX: FORCE_UNITS[recording.units[x]] for x in driven}
-    return _select_columns(machine, table, units)
-
-
-def _select_columns(machine: Machine, table: Table, units: Mapping[str, str]) -> list[str]:
-    """Columns, without the inputs, whose names have units, or that are inclinations."""
+    units = simulated_units(machine) if recording is None else recording.column_units()
     columns = []
     for name, unit in table.units.items():
         if name == TIME:
@@ -313,10 +309,8 @@ def _select_columns(machine: Machine, table: Table, units: Mapping[str, str]) ->
             wanted = quantity_unit(machine.tree, name)
             if wanted is None:
                 link = name.removeprefix(INCLINATION_PREFIX).removesuffix(VELOCITY_SUFFIX)
-                links = machine.tree.links
-                raise RecordingError(
-                    f"column '{name}' is of no link, {suggest_names(links, link)}"
-                )
+                problem = f"column '{name}' is of no link"
+                check_name(link, machine.tree.links, problem, RecordingError)
         if wanted is not None:
             check_unit(name, unit, accepted_units(wanted))
             if not name.startswith(_INPUT_PREFIXES):
@@ -342,13 +336,13 @@ def read_simulation(machine: Machine, recording: Recording, names: list[str]) ->
     Args:
         machine: The simulated machine.
         recording: Its recording.
-        names: See `simulated_columns`.
+        names: See `simulated_columns`; also velocities of passive joints.
     """
     columns = recording.columns()
-    if inclinations := [name for name in names if name.startswith(INCLINATION_PREFIX)]:
+    if derived := [name for name in names if name not in columns]:
         q = np.column_stack([columns[joint] for joint in machine.joints])
         order = [recording.joints.index(joint) for joint in machine.active]
         v = np.einsum("nij,nj->ni", machine.closure.gamma(q), recording.v[:, order])
-        columns |= ideal_readings(machine, q, v, inclinations)
+        columns |= ideal_readings(machine, q, v, derived)
     values = [columns[name] for name in names]
     return np.column_stack(values) if values else np.empty((len(recording.time), 0))

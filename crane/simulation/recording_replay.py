@@ -10,8 +10,8 @@ import numpy as np
 from crane.common.errors import (
     CraneWarning,
     RecordingError,
+    check_name,
     prefix_location,
-    suggest_names,
 )
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.progress import progress_reporter
@@ -36,7 +36,7 @@ from crane.recordings.recording import VELOCITY_SUFFIX, Recording
 from crane.recordings.recording_reader import FULL_TIME_SPAN, TimeSpan, read_quantities
 from crane.recordings.sensor_discrepancy import warn_discrepancies
 from crane.recordings.timeseries import TIME, Table, table_column, time_derivative
-from crane.simulation.recorded_run import read_simulation, recorded_columns
+from crane.simulation.recorded_run import read_simulation, simulated_columns
 from crane.simulation.simulation_run import Progress, simulate
 
 _START_FIT_DURATION = 0.1  # interval of the fit of the initial state [s]
@@ -160,7 +160,7 @@ def replay(
             label=Path(path).stem,
             progress=progress,
         )
-        names = recorded_columns(machine, table, recording)
+        names = simulated_columns(machine, table, recording)
     except RecordingError as error:
         raise RecordingError(prefix_location(str(path), error)) from None
     inside = time <= recording.time[-1] * (1 + 1e-12)
@@ -259,8 +259,7 @@ def _spool_signals(machine: Machine, spools: Sequence[str], table: Table) -> dic
         spool = name.removeprefix(VALVE_SIGNAL_PREFIX)
         if spool in machine.locked_joints or spool.removesuffix("_b") in machine.locked_joints:
             continue  # the valve of a locked joint has no effect
-        if spool not in spools:
-            raise RecordingError(f"column '{name}' is of no valve, {suggest_names(spools, spool)}")
+        check_name(spool, spools, f"column '{name}' is of no valve", RecordingError)
         signals[spool] = table_column(table, name, "V")
     if not signals:
         names = ", ".join(f"'{VALVE_SIGNAL_PREFIX}{joint} [V]'" for joint in spools)
@@ -314,13 +313,16 @@ def _initial_motion(
     first = min(float(time[x.argmax()]) if x.any() else np.inf for x in has_moved)
     fit_duration = max(_START_FIT_DURATION, float(time[min(_MIN_FIT_SAMPLES, len(time)) - 1]))
     steady = time <= max(min(first, _MAX_REST_DURATION), fit_duration)
-    states = []
-    for i, joint in enumerate(machine.active):
-        has_velocity = joint + VELOCITY_SUFFIX in table.units or joint not in table.units
-        states.append(
-            _start_of_joint(time, q_a[:, i], v_a[:, i] if has_velocity else None, steady)
-        )
-    return np.array([x for x, _ in states]), np.array([v for _, v in states])
+    has_velocities = [
+        joint + VELOCITY_SUFFIX in table.units or joint not in table.units
+        for joint in machine.active
+    ]
+    states = [
+        _start_of_joint(time, x, v if has_velocity else None, steady)
+        for x, v, has_velocity in zip(q_a.T, v_a.T, has_velocities, strict=True)
+    ]
+    q_start, v_start = np.array(states).reshape(-1, 2).T
+    return q_start, v_start
 
 
 def _start_of_joint(
@@ -374,9 +376,5 @@ def _value_at_first_sample(time: Array, x: Array, order: int) -> float:
 
 def _fit_parabola(time: Array, x: Array, order: int) -> tuple[float, float]:
     """Value or rate of a parabola at the first instant, and its standard deviation."""
-    A = np.vander(time - time[0], 3)
-    values, *_ = np.linalg.lstsq(A, x, rcond=None)
-    std = np.sqrt(
-        (float(np.sum((x - A @ values) ** 2)) / (len(x) - 3)) * np.diag(np.linalg.pinv(A.T @ A))
-    )
-    return float(values[2 - order]), float(std[2 - order])
+    values, covariance = np.polyfit(time - time[0], x, 2, cov=True)
+    return float(values[2 - order]), float(np.sqrt(covariance[2 - order, 2 - order]))

@@ -1,15 +1,18 @@
-"""Checks of a run: passed limits, energy imbalance, chattering friction."""
+"""Checks of a run: passed limits, energy imbalance, chattering friction, closed valves."""
 
 import numpy as np
 
 from crane.codegen import LayoutView
+from crane.common.one_line_repr import list_first
 from crane.common.samples import MAX_COORDINATE, Array
 from crane.common.scratch_arrays import release_pages
 from crane.description.ground_contact import Contact
 from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.dynamics.joint_forces import JointForces
+from crane.hydraulics.components import CounterbalanceValve, Valve
 from crane.machine.machine import Machine
 from crane.motion.limit_violations import limit_tolerances
+from crane.recordings.recording import Recording
 from crane.simulation.integration.error_controlled_stepper import characteristic_energy
 from crane.simulation.integration.rosenbrock import ROSENBROCK_TOLERANCE
 
@@ -23,6 +26,10 @@ _SMOOTHING_RANGE = 3.0  # velocity, in smoothing velocities, below which frictio
 _MAX_DISSIPATION_ERROR = 0.2  # share of the dissipation of a step
 _MIN_CHATTER_SAMPLES, _MIN_CHATTER_SHARE = 3, 1e-3  # accepted number and share of samples
 _BLOCK_SAMPLES = 20000  # samples of a block
+_MIN_CLOSED_TIME = 0.3  # least time of an open spool under a closed counterbalance valve [s]
+_MIN_SETTLED_SHARE = 0.99  # of the pilot pressure, reached in the first three quarters of it
+_MIN_CLOSED_TIME = 0.3  # least time of an open spool under a closed counterbalance valve [s]
+_MIN_SETTLED_SHARE = 0.99  # of the pilot pressure, reached in the first three quarters of it
 
 
 def run_warnings(
@@ -95,7 +102,7 @@ def passed_limits_text(machine: Machine, time: Array, q: Array) -> str:
         key=lambda i: -largest_excess[i] / min(upper[i] - lower[i], MAX_COORDINATE * units[i])
     )
     words = []
-    for i in passed_columns[:_MAX_NAMED_JOINTS]:
+    for i in passed_columns:
         joint, first = machine.joints[i], int(np.argmax(beyond(int(i)) > slack[i]))
         limit = lower[i] if q[first, i] < lower[i] else upper[i]
         unit = machine.unit(joint)
@@ -103,15 +110,10 @@ def passed_limits_text(machine: Machine, time: Array, q: Array) -> str:
             f"'{joint}' passes its limit {limit:.4g} {unit} at t = {time[first]:.4g} s, by up to "
             f"{largest_excess[i]:.3g} {unit}"
         )
-    more = (
-        f" and {len(passed_columns) - _MAX_NAMED_JOINTS} more joints"
-        if len(passed_columns) > _MAX_NAMED_JOINTS
-        else ""
-    )
     one = len(passed_columns) == 1
     return (
-        f"{', '.join(words)}{more}: nothing stops {'it' if one else 'them'} there, give "
-        f"{'it an end stop' if one else 'them end stops'}"
+        f"{list_first(words, 'joints', _MAX_NAMED_JOINTS)}: nothing stops "
+        f"{'it' if one else 'them'} there, give {'it an end stop' if one else 'them end stops'}"
     )
 
 
@@ -295,13 +297,8 @@ def friction_chatter_text(machine: Machine, time: Array, rows: LayoutView, step:
     if count <= max(_MIN_CHATTER_SAMPLES, _MIN_CHATTER_SHARE * len(time)):
         return ""
     joints = [f"'{machine.joints[i]}'" for i in sorted(names)]
-    more = (
-        f" and {len(joints) - _MAX_NAMED_JOINTS} more joints"
-        if len(joints) > _MAX_NAMED_JOINTS
-        else ""
-    )
     return (
-        f"friction of {', '.join(joints[:_MAX_NAMED_JOINTS])}{more} chatters in {count} of "
+        f"friction of {list_first(joints, 'joints', _MAX_NAMED_JOINTS)} chatters in {count} of "
         f"{len(time)} samples, first at t = {time[first]:.4g} s: steps of {step:g} s do not "
         "follow its smoothing, leave that out, so that it sticks, or shorten the step"
     )
@@ -325,4 +322,52 @@ def energy_imbalance_text(
         f"work, energy and dissipation differ by {gap:.2g} J of "
         f"{_energy_throughput(rows):.2g} J, so the "
         f"step of {step:g} s is too long: shorten it, or let method DOP853 choose it"
+    )
+
+
+def closed_counterbalance_text(machine: Machine, recording: Recording) -> str:
+    """Warning about counterbalance valves that stay closed under open spools; empty without any.
+
+    Such a joint stands still: the pilot pressure does not suffice at the pressure of the load.
+    """
+    circuit = machine.hydraulics
+    if circuit is None or f"spool_{circuit.joints[0]}" not in recording.channels:
+        return ""
+    texts = [
+        _closed_valve_text(circuit.valves[joint], holding, side, recording)
+        for joint, cylinder in circuit.cylinders.items()
+        for side, holding in enumerate((cylinder.counterbalance_a, cylinder.counterbalance_b))
+        if holding is not None
+    ]
+    return "; ".join(filter(None, texts))
+
+
+def _closed_valve_text(
+    valve: Valve, holding: CounterbalanceValve, side: int, recording: Recording
+) -> str:
+    """Warning about the counterbalance valve of chamber A, side 0, or B, side 1; empty if none."""
+    name, spool = list(valve.spools.items())[-1 if side else 0]
+    stroke = recording[f"spool_{name}"] * (1.0 if side else -1.0)  # that drains the chamber
+    is_open = stroke > spool.overlap
+    if (curve := valve.curves.get("c2" if side else "c3")) is not None:
+        is_open &= np.interp(stroke, *np.transpose(curve.points)) > 0
+    load_pressure, pilot_pressure = (
+        recording[f"pressure_{valve.joint}_{x}"][is_open] for x in ("ba" if side else "ab")
+    )
+    count = len(pilot_pressure)
+    needed = (holding.pressure - load_pressure) / holding.pilot_ratio
+    if (
+        count * np.diff(recording.time[:2]).sum() < _MIN_CLOSED_TIME
+        or (pilot_pressure > needed).any()
+        or pilot_pressure[: 3 * count // 4].max() < _MIN_SETTLED_SHARE * pilot_pressure.max()
+    ):
+        return ""
+    nearest = int((pilot_pressure - needed).argmax())
+    return (
+        f"the counterbalance valve of chamber {'AB'[side]} of '{valve.joint}' stays closed under "
+        f"an open spool: nearest to opening, at t = {recording.time[is_open][nearest]:.4g} s, its "
+        f"load pressure is {1e-5 * load_pressure[nearest]:.4g} bar, for which it needs a pilot "
+        f"pressure of {1e-5 * needed[nearest]:.4g} bar and has "
+        f"{1e-5 * pilot_pressure[nearest]:.4g} bar: raise 'pilot_ratio' or the supply pressure, "
+        "or lower 'pressure'"
     )

@@ -16,10 +16,10 @@ from crane.common.errors import (
     CraneWarning,
     InputError,
     SimulationError,
+    check_name,
     is_one_line,
-    suggest_names,
 )
-from crane.common.progress import progress_reporter
+from crane.common.progress import ignore_progress, progress_reporter
 from crane.common.samples import as_number
 from crane.common.threads import single_threaded_blas
 from crane.control.control_law import (
@@ -37,7 +37,7 @@ from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import tipping_message
 from crane.simulation.integration.chart_switching import ChartSwitchingIntegrator
-from crane.simulation.integration.charts import Chart, row_layout
+from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.error_controlled_stepper import (
     DormandPrinceStepper,
     ErrorControlledStepper,
@@ -54,6 +54,7 @@ from crane.simulation.integration.scipy_integrator import SCIPY_METHODS, ScipyIn
 from crane.simulation.recorded_run import IntegrationResult, record_run, stop_with_recording
 from crane.simulation.run_checks import (
     buried_contact_text,
+    closed_counterbalance_text,
     find_invalid_motion,
     passed_limits_text,
     run_warnings,
@@ -70,9 +71,8 @@ from crane.simulation.simulation_setup import (
 
 _MIN_TOLERANCE, _MAX_TOLERANCE = 1e-13, 1e-2
 
-StepperFactory = Callable[..., ErrorControlledStepper]
 Progress = Callable[[float], None]
-_COMPILED_METHODS: dict[str, StepperFactory] = {
+_COMPILED_METHODS: dict[str, Callable[..., ErrorControlledStepper]] = {
     "DOP853": DormandPrinceStepper,
     "Radau": RadauStepper,
     "rosenbrock": RosenbrockStepper,
@@ -184,11 +184,12 @@ def simulate(
         interrupted = isinstance(run.stop, KeyboardInterrupt) and len(run.time)
         if interrupted and (text := passed_limits_text(machine, run.time, run.rows.q)):
             warnings.warn(text, CraneWarning, stacklevel=2)
-        raise stop_with_recording(machine, control, run, label, steps * step)
+        raise stop_with_recording(machine, control, run, run.stop, label, steps * step)
     recording = record_run(machine, control, run.time, run.rows, label, start_text=run.start_text)
     every_step, is_exact = has_fixed_steps(dynamics, control, method), formulation == "exact"
     texts = run_warnings(machine, run.time, run.rows, step, every_step, is_exact)
-    for text in filter(None, [*texts, tipping_message(recording)]):
+    texts += [tipping_message(recording), closed_counterbalance_text(machine, recording)]
+    for text in filter(None, texts):
         warnings.warn(text, CraneWarning, stacklevel=2)
     return recording
 
@@ -200,9 +201,9 @@ def integrate(
     step_count: int,
     step: float,
     method: str | None = None,
-    progress: Progress | None = None,
+    progress: Progress = ignore_progress,
     tolerance: float | None = None,
-    chart: Chart | None = None,
+    records_transitions: bool = False,
     ends_with_command: bool = False,
 ) -> IntegrationResult:
     """Integrate a run without computing its channels; see `simulate`.
@@ -216,7 +217,7 @@ def integrate(
         method: See `simulate`.
         progress: See `simulate`.
         tolerance: See `simulate`.
-        chart: The machine in the coordinates of the user; its stick-slip modes record transitions.
+        records_transitions: Whether the stick-slip modes of the chart record their transitions.
         ends_with_command: Whether the run ends with the command of the valves.
 
     Returns:
@@ -246,14 +247,13 @@ def integrate(
     contact_states = np.zeros(state_count(machine.external_forces))
     energies = np.zeros(2 + len(machine.external_forces))
     state = np.concatenate([configuration, v_a, contact_states, controller_state, energies])
-    count = len(controller_state)
-    make_integrator = integrator_factory(dynamics, control, count, method, tolerance)
-    chart = chart or Chart.from_dynamics(dynamics)
-    integrator = ChartSwitchingIntegrator(chart, control, count, make_integrator)
-    layout = row_layout(machine, control, count)
+    chart = Chart.from_dynamics(dynamics, control, len(controller_state))
+    if records_transitions:
+        chart.stick_slip.transitions = []
+    integrator = ChartSwitchingIntegrator(chart, integrator_factory(chart, method, tolerance))
     times = step * np.arange(step_count + 1, dtype=np.float64)
     # stored by columns, so that channels are views
-    rows = scratch_arrays.empty_array(step_count + 1, layout.size)
+    rows = scratch_arrays.empty_array(step_count + 1, chart.row_layout.size)
     released_until = 0  # instants whose memory pages are released
 
     def report(done: int) -> None:
@@ -261,8 +261,7 @@ def integrate(
         if not released_until <= done < released_until + scratch_arrays.BLOCK_SIZE:
             released_until = done
             scratch_arrays.release_pages()
-        if progress is not None:
-            progress(done / (step_count + 1))
+        progress(done / (step_count + 1))
         if (
             ends_with_command
             and done
@@ -270,7 +269,7 @@ def integrate(
         ):
             raise _CommandFinishedError
 
-    run = IntegrationResult(times, rows, layout, integrator.notes, start_text)
+    run = IntegrationResult(times, rows, chart, integrator.notes, start_text)
     try:
         with single_threaded_blas(machine.model.nv):
             integrator.run(times[:-1], state, step, rows, report)
@@ -279,7 +278,7 @@ def integrate(
         run = run.first_instants(integrator.done, None)
     except IntegrationHaltError as halt:
         finer_step, done = integrator.find_finer_step(times[:-1], rows, step), integrator.done
-        q_a = layout.view(rows[:done]).q[:, machine.closure.active]
+        q_a = chart.row_layout.view(rows[:done]).q[:, machine.closure.active]
         stop = explain_halt(
             machine, halt, times[:done], q_a, controller_reference(control, machine), finer_step
         )
@@ -288,8 +287,7 @@ def integrate(
         return run.first_instants(integrator.done, stop)
     else:
         run = run._replace(notes=[*run.notes, *chart.stick_slip.notes])
-        if progress is not None:
-            progress(1.0)
+        progress(1.0)
     is_exact = dynamics.formulation == "exact"
     invalid_motion = find_invalid_motion(machine, run.time, run.rows, step, is_exact)
     if invalid_motion is not None:
@@ -311,32 +309,23 @@ def _default_method(dynamics: Dynamics, control: Controller) -> str:
 
 
 def integrator_factory(
-    dynamics: Dynamics,
-    control: Controller,
-    controller_state_count: int,
-    requested_method: str | None,
-    tolerance: float | None,
+    chart: Chart, requested_method: str | None, tolerance: float | None
 ) -> Callable[[Chart], StickSlipIntegrator]:
     """Function that creates the integrator of a method in a chart.
 
     Args:
-        dynamics: Dynamics of the machine.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
+        chart: The machine in the coordinates of the user.
         requested_method: See `simulate`.
         tolerance: See `simulate`.
 
     Raises:
         InputError: The method is unknown or does not support the machine.
     """
-    valves, method = (
-        isinstance(control, ValveDrive),
-        requested_method or _default_method(dynamics, control),
-    )
-    if method not in ("rk4", "rosenbrock", *SCIPY_METHODS):
-        hint = suggest_names(("rk4", "rosenbrock", *SCIPY_METHODS), method)
-        raise InputError(f"method '{method}' is unknown, {hint}")
-    if isinstance(control, ValveDrive) and control.period and method != "rosenbrock":
+    dynamics, control = chart.dynamics, chart.control
+    drive = control if isinstance(control, ValveDrive) else None
+    method = requested_method or _default_method(dynamics, control)
+    check_name(method, ("rk4", "rosenbrock", *SCIPY_METHODS), f"method '{method}' is unknown")
+    if drive is not None and drive.period and method != "rosenbrock":
         raise InputError(
             f"method '{method}' does not call the valves' program, leave the method out"
         )
@@ -355,27 +344,22 @@ def integrator_factory(
                 f"{_MAX_TOLERANCE:g}"
             )
     if method == "rk4":
-        return lambda chart: FixedStepIntegrator(chart, control, controller_state_count)
-    stepper_factory = (
-        _COMPILED_METHODS.get(method) if not valves or method == "rosenbrock" else None
-    )
+        return FixedStepIntegrator
+    stepper_factory = None
+    if drive is None or method == "rosenbrock":
+        stepper_factory = _COMPILED_METHODS.get(method)
 
     def make(chart: Chart) -> StickSlipIntegrator:
         """A compiled integrator, or one of scipy where the formulas cannot be compiled."""
-        compiled = stepper_factory is not None and chart.dynamics.backend == "compiled"
-        if compiled and isinstance(control, ControlLaw):
-            assert stepper_factory is not None
+        compiled = chart.dynamics.backend == "compiled"
+        if compiled and stepper_factory is not None and isinstance(control, ControlLaw):
             with suppress(FormulaTooLongError):
-                return ErrorControlledIntegrator(
-                    chart, control, controller_state_count, partial(stepper_factory, **options)
-                )
-        if isinstance(control, ValveDrive) and control.period:
+                return ErrorControlledIntegrator(chart, partial(stepper_factory, **options))
+        if drive is not None and drive.period:
             raise InputError("a program with a period runs on the compiled backend alone")
-        if requested_method is None and not valves:
-            return FixedStepIntegrator(chart, control, controller_state_count)
-        if chart.machine.coordinates.rotation_columns:
-            raise InputError("scipy's methods do not limit rotation vectors to pi, take rk4")
+        if requested_method is None and drive is None:
+            return FixedStepIntegrator(chart)
         name = "BDF" if method == "rosenbrock" else method
-        return ScipyIntegrator(chart, control, controller_state_count, name, **options)
+        return ScipyIntegrator(chart, name, **options)
 
     return make

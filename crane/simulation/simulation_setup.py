@@ -245,6 +245,7 @@ class StaticEquilibrium:
         self.columns = np.flatnonzero(
             np.array([name in machine.free for name in machine.active], dtype=bool) & (moves > 0)
         )
+        self.columns = np.setdiff1d(self.columns, machine.held)
         closure = machine.closure
         self._units = closure.units[closure.active][self.columns]
         self._inverse_time_squared = 1.0 / closure.characteristic_time**2

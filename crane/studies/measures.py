@@ -15,6 +15,7 @@ from crane.machine.machine import Machine
 from crane.motion.kinematics import Kinematics
 from crane.motion.task_trajectories import task_trajectory
 from crane.motion.workspaces.workspace_extremes import maximize_on_branch
+from crane.motion.workspaces.workspace_patch import last_closed_configuration
 from crane.recordings.recording import FORCE_UNITS
 from crane.simulation.simulation_run import simulate
 
@@ -22,7 +23,6 @@ _SAMPLES_PER_SECOND = 200  # of a task
 _LEVER_TASK_STEP = 5e-3  # between samples of a task of levers [s]
 _COUPLED_GRID_SIZE = 1000  # configurations of the grid over strokes that move passive joints
 _MAX_CONFIGURATIONS = 5000  # of this grid and of all other strokes
-_CONTINUATION_STEPS = 16  # between neighbours of the grid
 _RANDOM_CONFIGURATIONS = 8  # configurations that decide whether a stroke moves the tip
 _MOTION_TOLERANCE = 1e-9  # derivative of the tip position at rest [m/m], [m/rad]
 _REACH_START_COUNT = 12  # configurations of the grid from which the reach is searched
@@ -173,7 +173,7 @@ def resolution_notes(machine: Machine, measures: Sequence[str]) -> tuple[str, ..
 def _coupled_strokes(machine: Machine) -> NDArray[np.bool_]:
     """Return which driven joints (n,) move passive joints."""
     gamma = machine.closure.gamma(machine.home)[machine.closure.passive]
-    return np.asarray((np.abs(gamma).max(axis=0, initial=0.0) > 0) & machine.is_driven)
+    return (np.abs(gamma).max(axis=0, initial=0.0) > 0) & machine.is_driven
 
 
 def _values_per_stroke(is_coupled: NDArray[np.bool_]) -> int:
@@ -222,8 +222,8 @@ def _closed_configurations(machine: Machine, axes: list[Array]) -> Array:
     while pending:
         cell, neighbour_configuration = pending.pop(0)
         q_a = np.array([axis[k] for axis, k in zip(axes, cell, strict=True)])
-        configuration = _close_from_neighbour(machine, neighbour_configuration, q_a)
-        if configuration is None:
+        configuration, is_closed = last_closed_configuration(machine, neighbour_configuration, q_a)
+        if not is_closed:
             continue
         configurations[cell] = configuration
         new_cells = [
@@ -234,26 +234,6 @@ def _closed_configurations(machine: Machine, axes: list[Array]) -> Array:
     return np.array([configurations[cell] for cell in sorted(configurations)]).reshape(
         -1, len(machine.home)
     )
-
-
-def _close_from_neighbour(machine: Machine, q: Array, target: Array) -> Array | None:
-    """Return the closed configuration at a target near q (nq,); None if the loops open."""
-    closure = machine.closure
-    if closure.is_compiled:  # the slow search for open loops would take most of the time
-        compiled_closure = closure.compiled_closure
-        cursor, start = compiled_closure.new_cursor(), q[closure.active]
-        compiled_closure.start_cursor_at(cursor, q)
-        targets = start + np.linspace(0, 1, _CONTINUATION_STEPS + 1)[1:, None] * (target - start)
-        out = np.empty((_CONTINUATION_STEPS, len(q)))
-        return (
-            out[-1]
-            if compiled_closure.follow_targets(cursor, targets, out) == _CONTINUATION_STEPS
-            else None
-        )
-    try:
-        return closure.solve(target, initial_guess=q)
-    except ClosureError:
-        return None
 
 
 def _stroke_end(

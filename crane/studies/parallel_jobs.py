@@ -189,7 +189,7 @@ def compute_jobs(
     processes: int,
     scheduler: str | None,
     report: Callable[[int], object],
-    kept: StoredResults[R] | None = None,
+    kept: StoredResults[R],
 ) -> list[R]:
     """Return the results of jobs.
 
@@ -201,13 +201,12 @@ def compute_jobs(
         report: Called with the number of finished jobs after each.
         kept: Results that need not be computed, to which each new one is added.
     """
-    results = {} if kept is None else kept.results()
+    results = kept.results()
     missing = {index: job for index, job in enumerate(jobs) if index not in results}
     with closing(_finished_jobs(function, missing, processes, scheduler)) as finished:
         for index, result in finished:
             results[index] = result
-            if kept is not None:
-                kept.add(index, result)
+            kept.add(index, result)
             report(len(results))
     return [results[index] for index in range(len(jobs))]
 

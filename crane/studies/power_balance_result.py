@@ -1,6 +1,6 @@
 """Results of power balances: powers of one run by part, and a comparison of several runs."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -111,14 +111,12 @@ class PowerBalance(Result):
     @property
     def shaft_power(self) -> Array:
         """(N,) power of all shafts [W]."""
-        return self._total_power(name for name in self.powers if part_kind(name) == SHAFT_POWER)
+        return self._total_power(SHAFT_POWER)
 
     @property
     def residual(self) -> Array:
         """(N,) power of the shafts minus all others [W]: rounding errors."""
-        return self.shaft_power - self._total_power(
-            name for name in self.powers if part_kind(name) != SHAFT_POWER
-        )
+        return self.shaft_power - sum(map(self._total_power, ("lost", LOAD, "stored")))
 
     @property
     def energies(self) -> dict[str, float]:
@@ -128,10 +126,10 @@ class PowerBalance(Result):
     @property
     def totals(self) -> dict[str, float]:
         """Energy of shafts, losses, loads and storage over the recording [J]."""
-        totals_by_kind = dict.fromkeys((SHAFT_POWER, "lost", LOAD, "stored"), 0.0)
-        for name, energy in self.energies.items():
-            totals_by_kind[part_total(name)] += energy
-        return totals_by_kind
+        return {
+            total: self.integrate_energy(self._total_power(total))
+            for total in (SHAFT_POWER, "lost", LOAD, "stored")
+        }
 
     @property
     def fuel_volume(self) -> float | None:
@@ -176,14 +174,13 @@ class PowerBalance(Result):
             self._table_cells(f"{part_owner(x)}: {part_kind(x)}", self.powers[x])
             for x in listed_parts
         ]
-        for total_kind, label in {
+        for total, label in {
             SHAFT_POWER: "all shafts",
             "lost": "all losses",
             LOAD: "all loads",
             "stored": "all that is stored",
         }.items():
-            total = self._total_power(x for x in self.powers if part_total(x) == total_kind)
-            rows.append(self._table_cells(f"**{label}**", total))
+            rows.append(self._table_cells(f"**{label}**", self._total_power(total)))
         if self.engine_power is not None:
             rows.append(self._table_cells("**engine**", self.engine_power))
         text = "".join(f"| {' | '.join(row)} |\n" for row in rows)
@@ -200,8 +197,10 @@ class PowerBalance(Result):
             )
         return text
 
-    def _total_power(self, names: Iterable[str]) -> Array:
-        return sum((self.powers[name] for name in names), np.zeros_like(self.time))
+    def _total_power(self, total: str) -> Array:
+        """Return the power (N,) of all parts of a total, see `part_total`."""
+        parts = (power for name, power in self.powers.items() if part_total(name) == total)
+        return sum(parts, np.zeros_like(self.time))
 
     def _table_cells(self, label: str, power: Array) -> tuple[str, ...]:
         energy, shaft_energy = (

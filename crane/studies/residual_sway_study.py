@@ -1,6 +1,6 @@
 """Residual sway of a motion, by sway suppression method and payload."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from crane.common.errors import InputError
 from crane.common.one_line_repr import OneLineRepr, format_count
-from crane.common.progress import progress_reporter
+from crane.common.progress import Progress, progress_reporter
 from crane.common.samples import Array, as_number
 from crane.common.units import format_table
 from crane.control.valve_feedforward import ValveFeedforward, fastest_trajectory
@@ -93,7 +93,7 @@ def sway_study(
     payloads: Sequence[float] = (0.0, 100.0, 200.0, 300.0, 400.0, 500.0),
     damping: float = DEFAULT_DAMPING_RATIO,
     changes: Mapping[str, float | str] | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress | None = None,
 ) -> SwayStudy:
     """Compute the residual sway of a task, with and without each sway suppression method.
 
@@ -146,8 +146,7 @@ def sway_study(
                         1.0 - residual / reference_result[1],
                     )
                 )
-                if progress is not None:
-                    progress(len(rows) / total_count)
+                progress(len(rows) / total_count)
     return SwayStudy(task, tuple(rows))
 
 
@@ -158,9 +157,8 @@ def _residual_sway(machine: Machine, control: ValveFeedforward, duration: float)
         machine, control, initial=(start, np.zeros_like(start)), duration=end_time, step=_STEP
     )
     configurations_after: Array = run.q[run.time >= duration]
-    free = ~machine.is_driven
-    sway_angles = (
-        configurations_after[:, free]
-        - Sway(machine).hanging_equilibrium(configurations_after)[:, free]
-    )
+    sway = Sway(machine)
+    sway_angles = (configurations_after - sway.hanging_equilibrium(configurations_after))[
+        :, sway.free_indices
+    ]
     return float(np.linalg.norm(sway_angles, axis=1).max())

@@ -1,13 +1,12 @@
 """Result of a study: a table of measures by variant."""
 
-import csv
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from crane.common.atomic_output import replace_file
+from crane.common.atomic_output import write_csv
 from crane.common.errors import InputError, check_name
 from crane.common.result import Result
 from crane.common.samples import Array
@@ -97,16 +96,10 @@ class Study(Result):
         Raises:
             OutputError: The file cannot be written.
         """
-        with (
-            replace_file(path) as part,
-            part.open("w", newline="", encoding="utf-8", errors="surrogateescape") as file,
-        ):
-            file.write(f"# machine: {self.machine_reference}\n")
-            file.writelines(f"# note: {note}\n" for note in self.resolution_notes)
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(study_headings(self.columns, self.units))
-            for row in self.rows:
-                writer.writerow(["" if value != value else value for value in row.values()])
+        notes = (f"note: {note}" for note in self.resolution_notes)
+        rows = [["" if x != x else x for x in row.values()] for row in self.rows]
+        heads = study_headings(self.columns, self.units)
+        write_csv(path, [heads, *rows], [f"machine: {self.machine_reference}", *notes])
 
     def to_text(self, max_rows: int = 10) -> str:
         """Return the best rows by the first measure as text; the best one is marked.

@@ -3,7 +3,7 @@
 import itertools
 import math
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.checkpoint import Checkpoint
+from crane.common.checkpoint import open_checkpoint
 from crane.common.errors import (
     CraneError,
     CraneWarning,
@@ -20,7 +20,7 @@ from crane.common.errors import (
     check_name,
     prefix_location,
 )
-from crane.common.progress import progress_reporter
+from crane.common.progress import Progress, progress_reporter
 from crane.common.samples import Array, as_count, as_samples, as_seed
 from crane.description.machine_parameters import parameter_unit
 from crane.dynamics.dynamics import Dynamics
@@ -49,6 +49,7 @@ from crane.studies.optimization.variant_measures import (
     VariantEvaluation,
     check_unique_names,
     load_positions,
+    unique_names,
 )
 from crane.studies.parallel_jobs import (
     StoredResults,
@@ -107,7 +108,7 @@ def study(
     processes: int = 1,
     scheduler: str | None = None,
     checkpoint: str | Path | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Study:
     """Measure variants of a machine: a grid of parameter values, or random draws.
 
@@ -149,7 +150,7 @@ def study(
     seed = as_seed(seed)
     base_machine, name = machine_from_files(machine)
     values, grid_shape = _variant_values(vary, draws, seed)
-    tasks = _unique_names("task", base_machine.tasks, tasks)
+    tasks = unique_names("task", base_machine.tasks, tasks)
     has_lever_tasks = any(base_machine.tasks[task].space == "joystick" for task in tasks)
     task_measure_units = task_measures(base_machine) if tasks else {}
     available = task_measure_units | stroke_measures(base_machine)
@@ -159,7 +160,7 @@ def study(
     for text in require:
         parse_requirement(text)
     named_measures = [x for x in measures or () if x not in expressions]
-    selected_measures = _unique_names(
+    selected_measures = unique_names(
         "measure", available, named_measures or (None if not expressions else ())
     )
     with_circuit = bool(has_lever_tasks or expressions or require)
@@ -192,7 +193,7 @@ def study(
     ) as kept:  # fmt: skip
         rows = compute_jobs(
             measure_variant, jobs, processes, scheduler,
-            lambda done: progress and progress(done / len(jobs)), kept,
+            lambda done: progress(done / len(jobs)), kept,
         )  # fmt: skip
         reasons = tuple(reason for _, reason in rows)
         if all(reasons):
@@ -216,11 +217,8 @@ def _kept_rows(
     settings: tuple[StudyJob, Array, object],
     columns: Sequence[str],
     units: Mapping[str, str],
-) -> "Iterator[StoredResults[_VariantRow] | None]":
+) -> Iterator[StoredResults[_VariantRow]]:
     """Context of the rows of a study in a checkpoint, if there is one; see `Study.to_csv`."""
-    if checkpoint is None:
-        yield None
-        return
     values = settings[1]
     count = values.shape[1]
 
@@ -231,7 +229,7 @@ def _kept_rows(
         named_cells = zip(columns[count:], cells[:-1], strict=True)
         return {name: float(cell) for name, cell in named_cells if cell}, cells[-1]
 
-    with Checkpoint(
+    with open_checkpoint(
         checkpoint,
         {"machine data": MachineVariants(machine).spec, "settings": settings},
         study_headings(columns, units),
@@ -306,10 +304,9 @@ def _evaluate_expressions(machine: Machine, study_job: StudyJob) -> dict[str, fl
     functions = load_user_measures(study_job.options.user_measures)
     options = replace(study_job.options, user_measures=functions)
     evaluation = VariantEvaluation(
-        MachineVariants(machine), (), np.zeros(0), np.zeros(0), options,
-        load_positions(expressions),
-    )  # fmt: skip
-    values = [evaluation.evaluate(x) for x in expressions]
+        MachineVariants(machine), {}, options, load_positions(expressions)
+    )
+    values = [evaluation.evaluate(x).value for x in expressions]
     for text, value in zip(
         study_job.requirements, values[len(study_job.expressions) :], strict=True
     ):
@@ -340,15 +337,6 @@ def _variant_values(
             raise InputError(f"'{name}' is drawn between two values, give the lower and the upper")
     lower, upper = np.array(axes).T
     return np.random.default_rng(seed).uniform(lower, upper, (count, len(axes))), ()
-
-
-def _unique_names(
-    label: str, available: Mapping[str, object], requested: Sequence[str] | None
-) -> tuple[str, ...]:
-    """Return the requested names without repetitions; all by default."""
-    for name in requested or ():
-        check_name(name, available, f"{label} '{name}' is unknown")
-    return tuple(dict.fromkeys(available if requested is None else requested))
 
 
 def _parameter_units(machine: Machine, vary: Mapping[str, object], with_circuit: bool) -> dict:

@@ -25,7 +25,7 @@ from crane.motion.limit_violations import limit_violation_message
 from crane.motion.task_trajectories import add_free_joints
 from crane.motion.trajectory import Trajectory
 from crane.recordings.recording import FORCE_UNITS, VELOCITY_UNITS, Recording
-from crane.simulation.integration.charts import Chart, row_layout
+from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.integrators import FixedStepIntegrator
 from crane.simulation.integration.python_stepper import IntegrationHaltError, explain_halt
 from rig.plant import Tolerances, drawn
@@ -214,11 +214,12 @@ class Rig:
         plant, dynamics = self.plant, Dynamics(self.plant)
         n, nq, active = len(plant.active), plant.model.nq, plant.closure.active
         held, substeps = _Held(plant), _substeps(dynamics, reference, step)
-        h, steps = step / substeps, FixedStepIntegrator(Chart.from_dynamics(dynamics), held, 0)
+        chart, h = Chart.from_dynamics(dynamics, held, 0), step / substeps
+        steps = FixedStepIntegrator(chart)
         steps.set_chart_limits(np.array([np.inf, -np.inf]))  # the rig stays away from dead centres
         state = np.concatenate([plant.closure.solve(reference[0]), np.zeros(n + 2)])
-        now = steps.python_stepper.state_layout.view(state)
-        rows = np.empty((substeps, row_layout(plant, held, 0).size))
+        now = chart.state_layout.view(state)
+        rows = np.empty((substeps, chart.row_layout.size))
         integral = self.machine.expand_driven(control.start(reference[0]), "the integral")
         measured, command, force = (np.empty_like(reference) for _ in range(3))
         postures, v = np.empty((len(reference), nq)), np.empty_like(reference)

@@ -118,7 +118,8 @@ class _SchemaDefinitions:
         bounds: dict[str, Any] = {} if key.minimum is None else {"minimum": key.minimum}
         if key.is_positive or (key.zero_error and key.minimum == 0):
             bounds = {"exclusiveMinimum": 0}
-        units = tuple(dict.fromkeys(getattr(key, "column_units", ()) or key.si_units(None, (0,))))
+        columns = ", ".join(getattr(key, "column_units", ()))
+        units = tuple(dict.fromkeys(columns.split(", ") if columns else key.si_units(None, (0,))))
         name = "_or_".join(unit or "ratio" for unit in units)
         name = "number_" + re.sub(r"\W", "_", name.replace("/", "_per_"))
         if name not in self.schemas:

@@ -8,11 +8,17 @@ from typing import Any, TypeVar
 
 from crane.common.errors import DescriptionError, InputError, suggest_names
 from crane.common.package_search import load_options
-from crane.common.unit_conversions import accepted_units, unit_size
+from crane.common.unit_conversions import accepted_units, is_quantity, unit_size
+from crane.description.estimation_settings import (
+    EstimationSettings,
+    ParameterPrior,
+    TermValues,
+    estimation_units,
+)
 from crane.description.external_forces import ExternalForce
 from crane.description.findings import UnknownNames, error_recovery, report_error
 from crane.description.ground_contact import Contact
-from crane.description.key_types import NumberKey
+from crane.description.key_types import NumberKey, NumberListKey
 from crane.description.kinematic_tree import with_rotor_inertias
 from crane.description.machine_lookup import find_machine_file
 from crane.description.machine_schema import MACHINE, SENSOR
@@ -29,14 +35,11 @@ from crane.description.specification import (
     ATTITUDE_COORDINATES,
     TIP_COORDINATES,
     Chain,
-    EstimationSettings,
     LoopSpec,
     MachineSpec,
-    ParameterPrior,
     PayloadSpec,
     PIGains,
     Task,
-    TermValues,
     source_locations,
 )
 from crane.formats.machine_file.circuit_section import (
@@ -328,15 +331,20 @@ def _read_term(section: YamlSection, name: str) -> TermValues | None:
     value = section.raw_value(name)
     if (is_wanted := as_boolean(value)) is not None:
         return () if is_wanted else None
-    if isinstance(value, str) and not math.isfinite(as_float(value)):
+    if isinstance(value, str) and not (is_quantity(value) or math.isfinite(as_float(value))):
         label = f"'{name}' of {section.title} is '{value}'"
         raise section.error_at(name, f"{label}, give on, off, a number or a list of numbers")
+    count = len(value) if isinstance(value, list) else 1
+    units = (", ".join(estimation_units(name, section.turns, i)) for i in range(count))
+    section.schema = dataclasses.replace(
+        section.schema, others=NumberListKey(column_units=tuple(units))
+    )
     return section.numbers(name) if isinstance(value, list) else (section.number(name),)
 
 
 def _read_prior(section: YamlSection, name: str) -> ParameterPrior:
     try:
-        return ParameterPrior.parse(section.raw_value(name))
+        return ParameterPrior.parse(section.raw_value(name), estimation_units(name, section.turns))
     except InputError as error:
         raise section.error_at(name, f"'{name}' of 'prior': {error}") from None
 

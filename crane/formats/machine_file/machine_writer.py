@@ -1,6 +1,6 @@
 """A machine file with a URDF per sub-chain."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -71,18 +71,9 @@ def write_machine(
         InputError: A coupling holds a single joint.
         OutputError: The folder cannot be written, or holds what the machine was read from.
     """
-    file = f"{portable_file_name(machine.name)}.yaml"
     draft = MachineDraft(machine)
     draft.add_notes(notes or {})
-    originals = {machine.path, *(chain.urdf for chain in machine.chains)}
-    for relative_path in draft.file_paths(file):
-        if (target := (Path(folder) / relative_path).resolve()) in originals:
-            raise OutputError(
-                f"{target}: is what '{machine.name}' was read from, choose another folder"
-            )
-    with replace_folder(folder, overwrite) as temporary_folder:
-        draft.write(temporary_folder, file)
-    return Path(folder) / file
+    return draft.write_folder(folder, overwrite)
 
 
 class MachineDraft:
@@ -211,6 +202,34 @@ class MachineDraft:
             *[chain["urdf"] for chain in self.data["chains"]],
             *([self.data["payload"]["urdf"]] if self._payload_file else []),
         ]
+
+    def write_folder(
+        self,
+        folder: str | Path,
+        overwrite: bool = True,
+        check: Callable[[Path], object] = lambda file: None,
+    ) -> Path:
+        """Write all into a folder of the user's, see `write_machine`.
+
+        Args:
+            folder: The folder.
+            overwrite: Whether files that are there are replaced.
+            check: Called with the written machine file before files that are there are replaced.
+
+        Returns:
+            The machine file.
+        """
+        machine, file = self._machine, f"{portable_file_name(self._machine.name)}.yaml"
+        originals = {machine.path, *(chain.urdf for chain in machine.chains)}
+        for relative_path in self.file_paths(file):
+            if (target := (Path(folder) / relative_path).resolve()) in originals:
+                raise OutputError(
+                    f"{target}: is what '{machine.name}' was read from, choose another folder"
+                )
+        with replace_folder(folder, overwrite) as temporary_folder:
+            self.write(temporary_folder, file)
+            check(temporary_folder / file)
+        return Path(folder) / file
 
     def write(self, folder: Path, file: str) -> None:
         """Write all into a folder, the machine file by this name."""

@@ -11,7 +11,7 @@ from crane.description.machine_lookup import bundled_machines
 from crane.description.machine_schema import ALL_ITEM, EXTENDS_KEY
 from crane.formats.machine_file.yaml_text import LocatedMapping, format_value, parse_yaml_file
 from crane.formats.machine_file.yaml_values import YamlValues
-from crane.hydraulics.circuit_elements import CircuitPathError, ComponentParameterError
+from crane.hydraulics.circuit_elements import CircuitParameterError
 
 Item = TypeVar("Item")
 
@@ -93,9 +93,7 @@ class YamlSection(YamlValues):
         """
         try:
             return function(*arguments, **values)
-        except ComponentParameterError as error:
-            raise self.error_at(error.key, str(error)) from None
-        except CircuitPathError as error:
+        except CircuitParameterError as error:
             section, (*path, key) = self, error.path
             for name in path:
                 section = section.section(name) or section

@@ -1,16 +1,15 @@
 """Calibration of machines: parameters fitted to recordings through the simulation."""
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from crane.common.checkpoint import Checkpoint
+from crane.common.checkpoint import open_checkpoint
 from crane.common.errors import CraneError, InputError, RecordingError, check_name, prefix_location
-from crane.common.progress import progress_reporter
+from crane.common.progress import Progress, progress_reporter
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
 from crane.description.machine_parameters import parameter_unit
@@ -24,7 +23,6 @@ from crane.description.sensors import (
     sensor_parameters,
     with_sensor_parameters,
 )
-from crane.description.specification import MachineSpec
 from crane.formats.machine_loading import MachineVariants, load
 from crane.identification.calibration.calibration_problem import CalibrationProblem
 from crane.identification.calibration.calibration_result import (
@@ -38,9 +36,12 @@ from crane.identification.calibration.calibration_statistics import (
     score_tests,
     select_parameters,
 )
-from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt, Progress
+from crane.identification.calibration.levenberg_marquardt import (
+    LOG_COLUMNS,
+    LevenbergMarquardt,
+    SearchLog,
+)
 from crane.identification.calibration.recording_case import RecordingCase, recording_case
-from crane.identification.calibration.search_log import LOG_COLUMNS, SearchLog
 from crane.identification.calibration.unknowns import Unknown, build_unknowns, candidate_parameters
 from crane.machine.machine import Machine
 from crane.recordings.logs import read_log_columns
@@ -158,12 +159,14 @@ def calibrate(
         if not used_names & {x.name, *dict(x.members)}
     ]
     problem, excluded = CalibrationProblem(machine, unknowns, cases), list[str]()
-    initial_residuals = [
-        problem.residuals(case, np.zeros(problem.unknown_count)) for case in problem.cases
-    ]
-    with _search_log(
-        checkpoint, machine, variants.spec, (unknowns, extras, automatic), cases
-    ) as log:
+    start = np.zeros(problem.unknown_count)
+    initial_residuals = [problem.residuals(case, start) for case in problem.cases]
+    dependencies = {
+        "machine data": (variants.spec, machine.locked_joints),
+        "recordings": [x.contents for x in cases], "settings": (unknowns, extras, automatic),
+    }  # fmt: skip
+    with open_checkpoint(checkpoint, dependencies, LOG_COLUMNS, 1) as table:
+        log = SearchLog(table)
         search = LevenbergMarquardt(problem, progress, log)
         if automatic:
             problem, search, excluded = select_parameters(
@@ -184,28 +187,6 @@ def calibrate(
         score_tests=tuple(tests),
         unobserved_parameters=tuple(excluded),
     )
-
-
-@contextmanager
-def _search_log(
-    checkpoint: str | Path | None,
-    machine: Machine,
-    spec: MachineSpec,
-    settings: tuple[object, ...],
-    cases: Sequence[RecordingCase],
-) -> Iterator[SearchLog]:
-    """Context of the states of the searches, in a checkpoint if there is one."""
-    if checkpoint is None:
-        yield SearchLog(None)
-        return
-    data = [
-        (x.table.units, x.table.values, x.sensors, x.train_mask, x.known_sensors) for x in cases
-    ]
-    dependencies = {
-        "machine data": (spec, machine.locked_joints), "recordings": data, "settings": settings
-    }  # fmt: skip
-    with Checkpoint(checkpoint, dependencies, LOG_COLUMNS, 1) as table:
-        yield SearchLog(table)
 
 
 def _read_cases(

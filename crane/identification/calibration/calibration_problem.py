@@ -255,8 +255,9 @@ class CalibrationProblem:
 
         with warnings.catch_warnings(action="ignore"):
             motion = SimulatedMotion(dynamics, drive, initial, steps, step)
-            constants = simulation_constants_of(dynamics, drive, initial, links, motion.time)
-            setup = (friction_smoothing, constants, links, motion.time, machine)
+            q = machine.closure.solve(initial[0], initial_guess=machine.home)
+            constants = simulation_constants_of(dynamics, drive, initial, links, motion.time, q)
+            setup = (friction_smoothing, constants, links, motion.time, machine, q)
             every = [self._setup_derivative(case, z, i, *setup) for i in simulated_unknowns]
             integrator = VariationalIntegrator(
                 motion,
@@ -296,6 +297,7 @@ class CalibrationProblem:
         links: Sequence[str],
         times: Array,
         machine: Machine,
+        start: Array,
     ) -> SimulationConstants:
         """Derivative of the simulation constants by an unknown.
 
@@ -317,7 +319,7 @@ class CalibrationProblem:
                 inputs = self._inputs_with_start(case, perturbed)
                 initial = initial_motion(other, inputs.initial)
                 dynamics, drive = Dynamics(other), inputs.valve_drive(other)
-                found = simulation_constants_of(dynamics, drive, initial, links, times)
+                found = simulation_constants_of(dynamics, drive, initial, links, times, start)
             except CraneError:
                 if last:
                     raise

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from crane.common.one_line_repr import OneLineRepr, format_count
 from crane.common.result import Result
-from crane.common.samples import Array
+from crane.common.samples import Array, root_mean_square
 from crane.common.units import display_unit
 from crane.description.sensors import PRESSURE_PREFIX, VELOCITY_SUFFIX, VELOCITY_UNITS
 from crane.identification.calibration.calibration_statistics import (
@@ -134,7 +134,7 @@ class CalibrationChannel(OneLineRepr):
         """Root mean square of simulated minus measured over training or held-out data."""
         mask = self.train_mask if training else np.logical_not(self.train_mask)
         residual = (simulated - self.measured)[mask]
-        return float(np.sqrt(np.mean(residual**2))) if len(residual) else float("nan")
+        return root_mean_square(residual) if len(residual) else float("nan")
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crane.common.errors import CraneError, InputError
+from crane.common.progress import Progress
 from crane.common.samples import Array
 from crane.identification.calibration.calibration_problem import CalibrationProblem
-from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt, Progress
-from crane.identification.calibration.search_log import SearchLog
+from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt, SearchLog
 from crane.identification.calibration.unknowns import Unknown
 
 _LOWER_MINIMUM_SHARE = 5e-2  # relative difference of the cost of a lower minimum
@@ -286,7 +286,7 @@ def score_tests(
 
 
 def select_parameters(
-    problem: CalibrationProblem, progress: Progress | None, log: SearchLog
+    problem: CalibrationProblem, progress: Progress, log: SearchLog
 ) -> tuple[CalibrationProblem, LevenbergMarquardt, list[str]]:
     """Fit all parameters with their priors, and remove those without an effect.
 

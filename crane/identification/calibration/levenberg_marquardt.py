@@ -1,21 +1,25 @@
-"""Levenberg-Marquardt method of a calibration, within bounds and with channel scales."""
+"""Levenberg-Marquardt method of a calibration, within bounds and with channel scales.
+
+Its states are kept, so that an interrupted search goes on from the last one.
+"""
 
 import warnings
-from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import correlate
 
+from crane.common.checkpoint import Checkpoint
 from crane.common.errors import CraneError
-from crane.common.samples import Array
+from crane.common.progress import Progress
+from crane.common.samples import Array, root_mean_square
 from crane.dynamics.joint_forces import find_stick_slip_columns
 from crane.identification.calibration.calibration_problem import (
     DERIVATIVE_TOLERANCE,
     CalibrationProblem,
 )
 from crane.identification.calibration.recording_case import RecordingCase, noise_std
-from crane.identification.calibration.search_log import SearchLog, SearchState
-
-Progress = Callable[[float], None]
 
 _MAX_WEIGHT_ROUNDS = 3  # rounds of channel scales
 _SCALE_TOLERANCE = 0.05  # relative change of channel scales that ends them
@@ -37,6 +41,71 @@ _DAMPING_INCREASE, _DAMPING_DECREASE, _MAX_DAMPING = 10.0, 0.2, 1e8  # of the da
 _PART_DURATION = 2.0  # [s] of the parts of the initial search
 _COARSE_DERIVATIVE_TOLERANCE = 1e-2  # relative error of derivatives far from the minimum
 _BLOCK_COUNT_RANGE = 8, 40  # range of the number of blocks of a covariance
+LOG_COLUMNS = (
+    "search", "iteration", "cost", "damping", "ended", "all iterations", "simulations", "unknowns",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SearchState:
+    """State of a search after an iteration.
+
+    Attributes:
+        z: (p,) scaled unknowns.
+        cost: Cost there.
+        damping: Damping of the next step.
+        iteration: Number of iterations.
+        has_ended: Whether this is the minimum.
+        total_iterations: Number of iterations of all searches so far.
+        simulations: Number of simulations so far.
+    """
+
+    z: Array
+    cost: float
+    damping: float
+    iteration: int = 0
+    has_ended: bool = False
+    total_iterations: int = 0
+    simulations: int = 0
+
+
+class SearchLog:
+    """States of successive searches of a calibration.
+
+    A search depends on nothing but the searches before it and its last state, so that it goes on
+    from there as it would have.
+
+    Args:
+        checkpoint: Where states are kept; None if they are not.
+    """
+
+    def __init__(self, checkpoint: Checkpoint):
+        self._checkpoint, self._number = checkpoint, 0
+
+    def begin(self) -> SearchState | None:
+        """Begin the next search; returns its last state if one is kept."""
+        self._number += 1
+        with suppress(KeyError, ValueError):  # none, or damaged: it is searched again
+            *numbers, unknowns = self._checkpoint.rows[(str(self._number),)]
+            iteration, cost, damping, has_ended, total, simulations = map(float, numbers)
+            return SearchState(
+                np.array([float(x) for x in unknowns.split()]), cost, damping, int(iteration),
+                bool(has_ended), int(total), int(simulations),
+            )  # fmt: skip
+        return None
+
+    def add(self, state: SearchState) -> None:
+        """Keep a state of the present search.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        cells = (
+            state.iteration, repr(float(state.cost)), repr(float(state.damping)),
+            int(state.has_ended), state.total_iterations, state.simulations,
+            " ".join(map(repr, state.z.tolist())),
+        )  # fmt: skip
+        self._checkpoint.append((str(self._number),), cells)
 
 
 class LevenbergMarquardt:
@@ -54,7 +123,7 @@ class LevenbergMarquardt:
     def __init__(
         self,
         problem: CalibrationProblem,
-        progress: Progress | None,
+        progress: Progress,
         log: SearchLog,
         iteration_count: int = 0,
     ):
@@ -119,8 +188,7 @@ class LevenbergMarquardt:
                 break
         problem.slopes = _COVARIANCE_SMOOTHING
         self._linearize(z)
-        if self._progress is not None:
-            self._progress(1.0)
+        self._progress(1.0)
         return z
 
     def _updated_channel_scales(self, z: Array) -> dict[str, float]:
@@ -132,7 +200,7 @@ class LevenbergMarquardt:
                 residuals.setdefault(name, []).append(x)
         scales = {}
         for name, parts in residuals.items():
-            rms = max(float(np.sqrt(np.mean(np.concatenate(parts) ** 2))), _MIN_SCALE)
+            rms = max(root_mean_square(np.concatenate(parts)), _MIN_SCALE)
             least, most = self._scale_bounds[name]
             scales[name] = min(max(least, rms), most)
         return scales
@@ -215,14 +283,11 @@ class LevenbergMarquardt:
 
     def _cost(self, z: Array) -> float:
         """Half the sum of squares, infinite if the simulation fails."""
-        total = float(np.sum((self.prior * z) ** 2))
-        for case in self.training_cases:
-            try:
-                residual = self.problem.residuals(case, z, training_only=True)
-            except CraneError:
-                return np.inf
-            total += float(np.sum((residual * self.channel_weights(case)) ** 2))
-        return 0.5 * total
+        try:
+            residuals = self.weighted_residuals(z)
+        except CraneError:
+            return np.inf
+        return 0.5 * float(residuals @ residuals + np.sum((self.prior * z) ** 2))
 
     def _linearize(self, z: Array) -> None:
         rows, weighted, blocks = [], [], []
@@ -266,8 +331,7 @@ class LevenbergMarquardt:
             trial = self._step(z, hessian, gradient, damping)
             trial_cost = self._cost(trial)
             self._iteration_count += 1
-            if self._progress is not None:
-                self._progress(1.0 - 0.97**self._iteration_count)
+            self._progress(1.0 - 0.97**self._iteration_count)
             if trial_cost < cost:
                 z, cost, damping = trial, trial_cost, max(damping * _DAMPING_DECREASE, 1e-9)
                 break
@@ -342,8 +406,6 @@ def _correlation_time(x: Array) -> float:
     power = float(x @ x)
     if not power:
         return 0.0
-    size = 1 << (2 * len(x) - 1).bit_length()
-    spectrum = np.fft.rfft(x, size)
-    correlation = np.fft.irfft(spectrum * spectrum.conj(), size)[: len(x)] / power
+    correlation = correlate(x, x, method="fft")[len(x) - 1 :] / power
     negative = np.flatnonzero(correlation < 0.05)
     return float(correlation[: negative[0] if len(negative) else len(x)].sum())

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crane.common.errors import InputError
-from crane.common.samples import Array
+from crane.common.samples import Array, root_mean_square
 from crane.description.sensors import VALVE_SIGNAL_PREFIX, Sensor
 from crane.machine.machine import Machine
 from crane.recordings.recording_reader import FULL_TIME_SPAN, TimeSpan, correct_readings
@@ -49,6 +49,12 @@ class RecordingCase:
     table: Table
     start_std: Array
     first_start_index: int = 0
+
+    @property
+    def contents(self) -> tuple[object, ...]:
+        """What its residuals depend on besides the machine."""
+        table = self.table
+        return table.units, table.values, self.sensors, self.train_mask, self.known_sensors
 
     def split_training(self, machine: Machine, part_duration: float) -> list["RecordingCase"]:
         """Split the training data into parts of a duration [s] that start at measured states.
@@ -153,7 +159,5 @@ def noise_std(x: Array) -> float:
     zero because readings have few digits.
     """
     differences = np.diff(x, 3)
-    size = float(np.median(np.abs(differences))) / _NORMAL_MEDIAN or float(
-        np.sqrt(np.mean(differences**2))
-    )
+    size = float(np.median(np.abs(differences))) / _NORMAL_MEDIAN or root_mean_square(differences)
     return size / np.sqrt(20.0)

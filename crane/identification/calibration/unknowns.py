@@ -246,7 +246,7 @@ def _sensor_candidates(name: str, parameters: Mapping[str, float]) -> Iterator[U
 
 
 def _spool_candidates(
-    spool: Valve | Spool,
+    spool: Spool,
     parameters: Mapping[str, float],
     directions: set[int],
     orifice_slice: slice,

@@ -12,7 +12,7 @@ import numpy as np
 
 from crane.common.errors import InputError
 from crane.common.one_line_repr import OneLineRepr
-from crane.common.samples import Array
+from crane.common.samples import Array, root_mean_square, solve_linear
 from crane.identification.estimation.noise_model import (
     Jackknife,
     NoiseModel,
@@ -148,7 +148,7 @@ class RegressionProblem:
         if not np.isfinite(self.plain).all():
             self._raise_not_finite()
         # lower bound of the noise, for convergence if equations hold to rounding
-        self.min_noise = _ROUNDING_SHARE * max(_rms(y), np.finfo(float).tiny)
+        self.min_noise = _ROUNDING_SHARE * max(root_mean_square(y), np.finfo(float).tiny)
 
     def _raise_not_finite(self) -> None:
         order = np.arange(len(self.y)) if self._order is None else self._order
@@ -228,7 +228,7 @@ class RegressionProblem:
                 f"{values[0] / max(values[-1], 1e-300):.1g}), take base parameters, or a prior "
                 "with finite deviations of those that do"
             )
-        return np.asarray(np.linalg.solve(A, stacked_factor[:size, -1]), dtype=np.float64), R, A
+        return solve_linear(A, stacked_factor[:size, -1]), R, A
 
     def evaluate_estimate(self, theta: Array, e: Array, s: Array, threshold: float) -> Estimate:
         """Estimate with the covariance A^-1 (sum of Q^T noise) A^-T for correlated noise.
@@ -249,9 +249,9 @@ class RegressionProblem:
         clipped, unclipped = np.clip(e, -limit, limit), np.abs(e) <= limit
         del limit
         count, inflated = len(e), math.sqrt(len(e) / max(len(e) - len(theta), 1))
-        noise = inflated * np.array([_rms(clipped[rows]) for rows in self.group_rows])
+        noise = inflated * np.array([root_mean_square(clipped[rows]) for rows in self.group_rows])
         for group_indices in self.group_rows:
-            if 0 < (group_rms := _rms(clipped[group_indices])) < self.min_noise:
+            if 0 < (group_rms := root_mean_square(clipped[group_indices])) < self.min_noise:
                 clipped[group_indices] *= self.min_noise / group_rms
         clipped /= s[self.groups]
         noises = [NoiseModel.fit(clipped[rows], self.samples[rows]) for rows in self.group_rows]
@@ -330,10 +330,6 @@ class RegressionProblem:
             last = int(at[0])
         skip_instants(max(noise.memory_length for noise in noises))
         return middle
-
-
-def _rms(e: Array) -> float:
-    return math.sqrt(np.mean(np.square(e)))
 
 
 def condition_numbers(W: Array) -> tuple[float, float]:

@@ -1,7 +1,7 @@
 """Regressors that are read in blocks of rows, and their triangular factors."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from typing import Protocol
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from crane.common.samples import Array
 _BLOCK_ROWS = 8192  # rows of a block
 
 
-class Regressor(Protocol):
+class Regressor(ABC):
     """Regressor W (m, p) in blocks of rows with increasing instants.
 
     Attributes:
@@ -19,14 +19,16 @@ class Regressor(Protocol):
 
     shape: tuple[int, int]
 
+    @abstractmethod
     def blocks(self, backwards: bool = False) -> Iterator[tuple[slice, Array]]:
         """Row slices and blocks of W; no instant is in two blocks. Optionally in reverse order."""
 
     def triangular_factors(self, y: Array, groups: np.ndarray) -> Array:
         """See `triangular_factors`."""
+        return triangular_factors(self, y, groups)
 
 
-class StoredRegressor:
+class StoredRegressor(Regressor):
     """Regressor that is stored as one array.
 
     Args:
@@ -46,10 +48,6 @@ class StoredRegressor:
         """See `Regressor`."""
         for span in reversed(self._row_slices) if backwards else self._row_slices:
             yield span, self._W[span]
-
-    def triangular_factors(self, y: Array, groups: np.ndarray) -> Array:
-        """See `triangular_factors`."""
-        return triangular_factors(self, y, groups)
 
 
 def triangular_factors(

@@ -6,6 +6,7 @@ import numpy as np
 
 from crane.codegen import Scalar
 from crane.common.errors import CraneError, InputError
+from crane.common.progress import Progress
 from crane.common.samples import Array
 from crane.control.control_law import ControllerInputs
 from crane.control.valve_commands import ValveCommand, require_circuit
@@ -27,7 +28,6 @@ _IDLE_SHARE = 0.25  # of all pulses that are omitted
 _MIN_OPENING, _MIN_SLOT_SHARE = 0.05, 0.25  # least opening, and least share of a slot
 _MAX_LAST_OPENING = 0.15  # largest opening in the last slot, whose small flow damps oscillations
 _REFERENCE_OPENING = 0.5  # opening of the reference signals
-Progress = Callable[[float], None]
 
 
 class PulseSignals(ValveCommand):
@@ -137,7 +137,7 @@ class PulseSignals(ValveCommand):
         ramps = self._rate * np.clip(np.minimum(since, last - since), 0.0, None)
         u = np.copysign(np.minimum(np.abs(top), ramps), top)
         # a second spool gets the signal of the first one, as in `ValveSignals`
-        return np.asarray(self._neutral + self._signal_ranges * u)[:, self._valve_indices]
+        return (self._neutral + self._signal_ranges * u)[:, self._valve_indices]
 
     def signals(self, inputs: ControllerInputs) -> Sequence[Scalar]:
         """See `ValveCommand`."""
@@ -242,7 +242,7 @@ class ExchangeAlgorithm:
                 )
 
     def run(
-        self, trials: int, rng: np.random.Generator, progress: Progress | None
+        self, trials: int, rng: np.random.Generator, progress: Progress
     ) -> tuple[Recording, Recording]:
         """Runs of the reference signals and of the best of a number of trials.
 
@@ -259,8 +259,7 @@ class ExchangeAlgorithm:
                 trial_plan = self._exchange_slot(plan, trial_plan, rng)
             if (found := self._improved_run(trial_plan, lowest_cost)) is not None:
                 plan, (best, lowest_cost) = trial_plan, found
-            if progress is not None:
-                progress((trial + 1) / trials)
+            progress((trial + 1) / trials)
         if best is None:
             raise InputError(
                 f"none of {trials} random signals keeps '{self._information.machine.name}' "

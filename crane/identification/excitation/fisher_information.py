@@ -145,12 +145,12 @@ def information_measures(
 
 
 def _negative_logdet(singular_values: Array) -> Array:
-    return np.asarray(-np.log1p(singular_values**2).sum(axis=-1))
+    return -np.log1p(singular_values**2).sum(axis=-1)
 
 
 def _log_condition(singular_values: Array) -> Array:
     with np.errstate(divide="ignore"):
-        return np.asarray(np.log(singular_values[..., 0]) - np.log(singular_values[..., -1]))
+        return np.log(singular_values[..., 0]) - np.log(singular_values[..., -1])
 
 
 CRITERIA: Mapping[str, Callable[[Array], Array]] = {

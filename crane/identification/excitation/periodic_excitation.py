@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from crane.common.atomic_output import replace_file
 from crane.common.errors import InputError, check_name
-from crane.common.progress import progress_reporter
+from crane.common.progress import Progress, progress_reporter
 from crane.common.result import Result
 from crane.common.samples import Array, as_count, as_number, as_seed
 from crane.common.threads import with_single_threaded_blas
@@ -25,7 +25,6 @@ from crane.identification.excitation.fourier_trajectory import FourierTrajectory
 from crane.identification.excitation.trajectory_optimizer import (
     COARSE_SAMPLES,
     QUANTITIES,
-    Progress,
     TrajectoryLimits,
     TrajectoryOptimizer,
     joint_values,
@@ -40,9 +39,7 @@ from crane.identification.mechanics.base_parameters import (
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.model_terms import MotionSamples
 from crane.machine.machine import Machine
-from crane.recordings import timeseries
-from crane.recordings.recording import FORCE_UNITS, VELOCITY_UNITS
-from crane.recordings.timeseries import TIME, Table
+from crane.recordings.recording import Recording
 
 _NOISE_SHARE = 0.01  # default noise per force limit of a drive
 _REPORTED_PARAMETERS = 5  # parameters in the table
@@ -113,23 +110,21 @@ class Excitation(Result):
         Raises:
             OutputError: The file cannot be written.
         """
-        units = {TIME: "s"}
-        for suffix in ("", "_velocity", "_acceleration", "_force"):
-            for joint in self.machine.active:
-                unit = self.machine.unit(joint)
-                units[joint + suffix] = {
-                    "": unit,
-                    "_velocity": VELOCITY_UNITS[unit],
-                    "_acceleration": f"{unit}/s2",
-                    "_force": FORCE_UNITS[unit],
-                }[suffix]
+        time, q, v, a, tau = self.motion()
+        units = {joint: self.machine.unit(joint) for joint in self.machine.active}
         lead, period = self.trajectory.lead, self.trajectory.period
-        notes = {
-            "crane reference": "",
-            "machine": self.machine.load_expression,
-            "task": f"excitation, steady from {lead:g} s, period {period:g} s",
-        }
-        timeseries.write_table(path, Table(units, np.column_stack(self.motion()), notes))
+        Recording(
+            time,
+            self.machine.active,
+            q,
+            v,
+            tau,
+            units,
+            {f"{joint}_acceleration": x for joint, x in zip(units, a.T, strict=True)},
+            {f"{joint}_acceleration": f"{unit}/s2" for joint, unit in units.items()},
+            machine=self.machine.load_expression,
+            task=f"excitation, steady from {lead:g} s, period {period:g} s",
+        ).to_csv(path)
 
     def to_yaml(self, path: str | Path) -> None:
         """Write the coefficients as YAML, see `FourierTrajectory`.
@@ -307,7 +302,7 @@ def _force_noise(machine: Machine, noise: Mapping[str, float] | None) -> tuple[A
 
 
 def _optimize_best(
-    search: TrajectoryOptimizer, draws: Array, starts: int, progress: Progress | None
+    search: TrajectoryOptimizer, draws: Array, starts: int, progress: Progress
 ) -> Array:
     """The best vector after optimization of the best random ones (V, size)."""
     costs = search.evaluate(draws)[0]
@@ -316,8 +311,7 @@ def _optimize_best(
     for start_index, start in enumerate(draws[order]):
 
         def report(share: float, tried: int = start_index) -> None:
-            if progress is not None:
-                progress((tried + share) / len(order))
+            progress((tried + share) / len(order))
 
         found = search.optimize(start, report)
         if (cost := float(search.evaluate(found[None])[0][0])) < lowest_cost:

@@ -9,7 +9,7 @@ import numpy as np
 
 from crane.common.errors import InputError, check_name
 from crane.common.one_line_repr import format_count
-from crane.common.progress import progress_reporter
+from crane.common.progress import Progress, progress_reporter
 from crane.common.result import Result
 from crane.common.samples import Array, as_count, as_number, as_seed
 from crane.common.threads import with_single_threaded_blas
@@ -17,7 +17,7 @@ from crane.common.units import format_quantity, format_table
 from crane.control.valve_commands import require_circuit
 from crane.description.sensors import VALVE_SIGNAL_PREFIX
 from crane.identification.calibration.unknowns import Unknown
-from crane.identification.excitation.exchange_algorithm import ExchangeAlgorithm, Progress
+from crane.identification.excitation.exchange_algorithm import ExchangeAlgorithm
 from crane.identification.excitation.fisher_information import CRITERIA, InformationMeasures
 from crane.identification.excitation.signal_information import SignalInformation, SignalLimits
 from crane.machine.machine import Machine

@@ -254,7 +254,7 @@ class SignalLimits:
         """Smallest distances (m,) to the ends of the strokes, per stroke."""
         q = self._strokes(run)
         ends = np.minimum(q.min(axis=0) - self._lower, self._upper - q.max(axis=0))
-        return np.asarray(ends / self._stroke_lengths)
+        return ends / self._stroke_lengths
 
     def worst_case_stroke_margins(self, run: Recording) -> Array:
         """Stroke margins (m,) of the worst machine with deviating parameters and the same signals.

@@ -7,13 +7,15 @@ from typing import Any
 import numpy as np
 
 from crane.common.errors import ClosureError, InputError, check_name
+from crane.common.progress import Progress
 from crane.common.samples import Array, as_number
 from crane.dynamics.dynamics import Dynamics
 from crane.identification.excitation.fisher_information import FisherInformation
 from crane.identification.excitation.fourier_trajectory import FourierTrajectory, fourier_basis
-from crane.identification.mechanics.base_parameters import stroke_limits
+from crane.identification.mechanics.base_parameters import HALF_TURN
 from crane.identification.mechanics.model_terms import MotionSamples
 from crane.machine.machine import Machine
+from crane.motion.workspaces.workspace_mapping import stroke_limits
 
 DENSE_SAMPLES = 64  # samples per period of the highest harmonic, for checks of limits
 COARSE_SAMPLES = 12  # the same for the optimization
@@ -30,7 +32,6 @@ _DIFFERENCE_STEP = 1e-6  # step of differences of scaled coefficients
 _INFEASIBLE_COST = 1e3  # cost and constraint violation if loops do not close
 _CONSTRAINT_TOLERANCE = 1e-3  # violation that the final scaling removes
 
-Progress = Callable[[float], None]
 QUANTITIES = ("stroke", "velocity", "acceleration", "force", "flow")
 _SINGULARITY_GAIN = 5.0  # ratio of gamma to that at home, near the end of the branch
 
@@ -95,7 +96,7 @@ def trajectory_limits(
     if not 0 <= as_number(margin, "the margin", "") < 1:
         raise InputError(f"the margin is {margin:g}, give a share from 0 to below 1")
     columns = machine.closure.active
-    lower, upper = stroke_limits(machine)
+    lower, upper = stroke_limits(machine, HALF_TURN)
     velocity, flow, areas = _fed(machine)
     found = TrajectoryLimits(
         (lower + upper) / 2,
@@ -162,11 +163,11 @@ def singularity_proximity(machine: Machine, samples: MotionSamples) -> Array:
     It is |gamma_P diag(span)| / (5 |...| at home). Near the end of the branch small active motions
     cause large passive ones, which drives cannot follow.
     """
-    lower, upper = stroke_limits(machine)
+    lower, upper = stroke_limits(machine, HALF_TURN)
     rows, span = machine.closure.passive, upper - lower
 
     def size(gamma: Array) -> Array:
-        return np.asarray(np.linalg.norm(gamma[..., rows, :] * span, axis=(-2, -1)))
+        return np.linalg.norm(gamma[..., rows, :] * span, axis=(-2, -1))
 
     home = float(size(machine.closure.gamma(machine.home)))
     return size(samples.gamma) / (_SINGULARITY_GAIN * home) if home else np.zeros(len(samples.q))

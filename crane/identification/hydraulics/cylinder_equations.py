@@ -213,7 +213,7 @@ def spool_position(valve: Valve, voltage: Array, step: float) -> Array:
         samples = np.arange(len(command), dtype=np.float64)
         command = np.interp(samples - valve.delay / step, samples, command)
     if not valve.bandwidth:
-        return np.asarray(command)
+        return command
     w = valve.bandwidth
     A = np.array([[0.0, 1.0], [-w * w, -2 * valve.damping * w]])
     system = cont2discrete(
@@ -227,7 +227,7 @@ def spool_position(valve: Valve, voltage: Array, step: float) -> Array:
             f"the signal asks the spool of '{valve.joint}' for {fastest:.3g} strokes/s, above its "
             f"rate {valve.rate:g}, record 'spool_{valve.joint}'"
         )
-    return np.asarray(states[:, 0] + start)
+    return states[:, 0] + start
 
 
 def noise_std(x: Array) -> float:
@@ -427,7 +427,7 @@ class WeakFormWindows:
     def integrate(self, weights: Array, f: Array) -> Array:
         """Weighted sums (2, K) of a signal (N,) over all windows."""
         view = sliding_window_view(f, weights.shape[1])[self.centres - self.half_width]
-        return np.asarray(weights @ view.T)
+        return weights @ view.T
 
     def apply_transpose(self, weights: Array, rows: Array, count: int) -> Array:
         """Transpose of `integrate` (N, p), applied to rows (2, K, p)."""
@@ -440,6 +440,4 @@ class WeakFormWindows:
     def are_uniform(self, labels: np.ndarray) -> np.ndarray:
         """Mask (K,) of windows in which the labels (N,) are constant."""
         changes = np.append(0, np.cumsum(np.diff(labels) != 0))
-        return np.asarray(
-            changes[self.centres + self.half_width] == changes[self.centres - self.half_width]
-        )
+        return changes[self.centres + self.half_width] == changes[self.centres - self.half_width]

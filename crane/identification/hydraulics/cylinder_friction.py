@@ -166,11 +166,7 @@ def identify_cylinder_friction(
 
 
 def _friction_law(values: Array, v: Array, smoothing: float) -> Array:
-    sign = np.tanh(v / smoothing) if smoothing else np.sign(v)
-    out = values[0] * sign + values[1] + values[2] * v
-    if len(values) == 5:
-        out = out + values[3] * np.exp(-((v / values[4]) ** 2)) * sign
-    return np.asarray(out)
+    return _friction_columns(v, smoothing, *values[4:]) @ values[:4]
 
 
 def _friction_columns(v: Array, smoothing: float, stribeck: float | None = None) -> Array:

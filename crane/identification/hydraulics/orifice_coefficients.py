@@ -233,13 +233,10 @@ def _weak_form_estimate(
                 groups.append(np.full(len(at), 2 * e + half))
                 samples.append(start + at)
         start += len(rows.is_smooth) + 100
-    order = np.argsort(np.concatenate(groups), kind="stable")
-    group = np.concatenate(groups)[order]
-    W_all, Z_all, y_all = (np.concatenate(part)[order] for part in (W, Z, y))
+    group = np.concatenate(groups)
+    W_all, Z_all, y_all = (np.concatenate(part) for part in (W, Z, y))
     try:
-        estimate = instrumental_variables(
-            W_all, y_all, Z_all, group, np.concatenate(samples)[order]
-        )
+        estimate = instrumental_variables(W_all, y_all, Z_all, group, np.concatenate(samples))
     except InputError as error:
         raise InputError(f"the cylinder of '{joint}': {error}") from None
     X, scale = estimate.values, estimate.noise**2

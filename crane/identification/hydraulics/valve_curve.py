@@ -19,7 +19,7 @@ from crane.common.errors import RecordingError
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
-from crane.identification.estimation import estimators
+from crane.identification.estimation.estimators import EstimatedValues, least_squares
 from crane.identification.hydraulics.cylinder_equations import (
     channel_values,
     cylinder_and_valve,
@@ -29,24 +29,28 @@ from crane.identification.signals.signal_quality import steady_means
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 
-PARAMETER_NAMES = ("edge up", "edge down", "slope up", "slope down")
-_PARAMETER_UNITS = ("V", "V", "{0}/s/V", "{0}/s/V")
+PARAMETER_NAMES = (
+    "edge up", "edge down", "slope up", "slope down",
+    "neutral", "dead_band", "half width", "flow up", "flow down",
+)  # fmt: skip
+_PARAMETER_UNITS = ("V", "V", "{0}/s/V", "{0}/s/V", "V", "", "V", "m3/s", "m3/s")
 _STANDSTILL_SHARE = 0.01  # of the fastest speed, below which the joint stands still
 _MIN_SIGNAL_SPREAD = 0.05  # of the signal's range: least spread of levels in one direction
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ValveCurve(Result):
+class ValveCurve(EstimatedValues, Result):
     """Identified curve of the steady speed over the valve signal.
 
     Attributes:
         joint: The cylinder's.
-        values: (4,) signals at the start of extending and retracting [V], and slopes of the speed
-            in these directions [m/s/V] or [rad/s/V], both positive.
-        covariance: (4, 4) covariance of the values.
+        values: (9,) signals at the start of extending and retracting [V], and slopes of the speed
+            in these directions [m/s/V] or [rad/s/V], both positive; of these follow the neutral
+            signal [V], the dead band as the share u0 of the nominal stroke, its half width [V],
+            and the flows at u = 1 for extending and retracting [m3/s].
+        covariance: (9, 9) covariance of the values.
         degrees_of_freedom: Degrees of freedom of the covariance.
         signal_range: full - neutral [V]; negative if a lower signal extends.
-        inlet_areas: (2,) areas of the inlets for extending and retracting [m2].
         signal: (M,) signals of the steady samples [V].
         speed: (M,) speeds of the steady samples.
         noise: Standard deviation of the speeds about the curve.
@@ -59,74 +63,41 @@ class ValveCurve(Result):
     covariance: Array
     degrees_of_freedom: float
     signal_range: float
-    inlet_areas: tuple[float, float]
     signal: Array
     speed: Array
     noise: float
     ringing: tuple[float, float, float] | None = None
 
-    def valve_parameters(self) -> tuple[tuple[str, ...], Array, Array]:
-        """Parameters of a machine file: names, values (5,) and their Jacobian (5, 4).
-
-        They are neutral [V], dead_band as the share u0, half width [V], and flows at u = 1 for
-        extending and retracting [m3/s].
-        """
-        up, down, s_up, s_down = self.values
-        turn, size = np.sign(self.signal_range), abs(self.signal_range)
-        half = 0.5 * turn * (up - down)
-        d_half = 0.5 * turn * np.array([1.0, -1, 0, 0])
-        rows = [np.array([0.5, 0.5, 0, 0]), d_half / size, d_half]
-        for area, slope, at in ((self.inlet_areas[0], s_up, 2), (self.inlet_areas[1], s_down, 3)):
-            row = -area * slope * d_half
-            row[at] += area * (size - half)
-            rows.append(row)
-        flows = [
-            a * s * (size - half) for a, s in zip(self.inlet_areas, (s_up, s_down), strict=True)
-        ]
-        values = np.array([0.5 * (up + down), half / size, half, *flows])
-        return (
-            ("neutral", "dead_band", "half width", "flow up", "flow down"),
-            values,
-            np.array(rows),
-        )
-
     @property
     def neutral(self) -> float:
         """Signal in the middle of the dead band [V]."""
-        return float(self.valve_parameters()[1][0])
+        return float(self.values[4])
 
     @property
     def dead_band(self) -> float:
         """Dead band as the share u0 of the nominal stroke."""
-        return float(self.valve_parameters()[1][1])
+        return float(self.values[5])
 
     @property
     def full_flows(self) -> tuple[float, float]:
         """Flows at u = 1 for extending and retracting [m3/s]."""
-        return float(self.valve_parameters()[1][3]), float(self.valve_parameters()[1][4])
+        return float(self.values[7]), float(self.values[8])
 
     def parameter_intervals(self, level: float = 0.95) -> dict[str, tuple[float, float, float]]:
         """Value and confidence interval of each parameter by name."""
-        from scipy.stats import t
-
-        factor = t.ppf(0.5 + 0.5 * level, self.degrees_of_freedom)
-        names, values, J = self.valve_parameters()
-        std = np.sqrt(np.diag(self.covariance)), np.sqrt(np.diag(J @ self.covariance @ J.T))
-        rows = zip(
-            (*PARAMETER_NAMES, *names),
-            np.concatenate([self.values, values]),
-            factor * np.concatenate(std),
-            strict=True,
-        )
-        return {name: (float(v), float(v - h), float(v + h)) for name, v, h in rows}
+        table = np.column_stack([self.values, self.confidence_interval(level)])
+        return {
+            name: (v, low, high)
+            for name, (v, low, high) in zip(PARAMETER_NAMES, table.tolist(), strict=True)
+        }
 
     def predict(self, signal: Array) -> Array:
         """Steady speeds of signals (N,) [V]."""
-        return _steady_speed(self.values, signal, np.sign(self.signal_range))[0]
+        return _steady_speed(self.values[:4], signal, np.sign(self.signal_range))[0]
 
     def to_text(self, unit: str = "m") -> str:
         """Table of all parameters."""
-        units = [text.format(unit) for text in _PARAMETER_UNITS] + ["V", "", "V", "m3/s", "m3/s"]
+        units = [text.format(unit) for text in _PARAMETER_UNITS]
         lines = [
             f"valve of {self.joint}: {len(self.signal)} steady samples",
             f"{'':<12}{'value':>12}   95 % interval",
@@ -202,19 +173,36 @@ def identify_valve(
     U, speeds = signal[at], v[at]
     values = _fit_curve(U, speeds, sign, fastest)
     fitted, J = _steady_speed(values, U, sign)
-    estimate = estimators.least_squares(J, speeds - fitted + J @ values, samples=at)
+    estimate = least_squares(J, speeds - fitted + J @ values, samples=at)
+    others, slopes = _valve_parameters(values, span, (cylinder.area_a, cylinder.area_b))
+    J = np.vstack([np.eye(4), slopes])
     return ValveCurve(
         joint=joint,
-        values=values,
-        covariance=estimate.covariance,
+        values=np.append(values, others),
+        covariance=J @ estimate.covariance @ J.T,
         degrees_of_freedom=estimate.degrees_of_freedom,
         signal_range=span,
-        inlet_areas=(cylinder.area_a, cylinder.area_b),
         signal=U,
         speed=speeds,
         noise=float(estimate.noise[0]),
         ringing=None if means.frequency is None else (*means.frequency, means.amplitude),
     )
+
+
+def _valve_parameters(
+    values: Array, signal_range: float, inlet_areas: tuple[float, float]
+) -> tuple[Array, Array]:
+    """Parameters (5,) of a machine file, see `ValveCurve`, and their Jacobian (5, 4)."""
+    up, down, *slopes = values
+    turn, size = np.sign(signal_range), abs(signal_range)
+    half, d_half = 0.5 * turn * (up - down), 0.5 * turn * np.array([1.0, -1, 0, 0])
+    found = [0.5 * (up + down), half / size, half]
+    rows = [np.array([0.5, 0.5, 0, 0]), d_half / size, d_half]
+    for i, (area, slope) in enumerate(zip(inlet_areas, slopes, strict=True)):
+        found.append(area * slope * (size - half))
+        rows.append(-area * slope * d_half)
+        rows[-1][2 + i] += area * (size - half)
+    return np.array(found), np.array(rows)
 
 
 def _steady_speed(values: Array, U: Array, sign: float) -> tuple[Array, Array]:
@@ -227,7 +215,7 @@ def _steady_speed(values: Array, U: Array, sign: float) -> tuple[Array, Array]:
 
 def _fit_curve(U: Array, v: Array, sign: float, fastest: float) -> Array:
     """Fit edges and slopes by least squares, starting from straight lines in each direction."""
-    from scipy.optimize import least_squares
+    from scipy import optimize
 
     start = np.empty(4)
     for i, sense in enumerate((1, -1)):
@@ -246,7 +234,7 @@ def _fit_curve(U: Array, v: Array, sign: float, fastest: float) -> Array:
 
     scale = [volts, volts, rate, rate]
     fine = 1e-14
-    found = least_squares(
+    found = optimize.least_squares(
         residuals, start, jac=jacobian, x_scale=scale, xtol=fine, ftol=fine, gtol=fine
     )
-    return np.asarray(found.x)
+    return found.x

@@ -9,14 +9,14 @@ import numpy as np
 from crane.closure.coordinates import Indices
 from crane.common.errors import ClosureError, InputError
 from crane.common.one_line_repr import OneLineRepr
-from crane.common.samples import Array
+from crane.common.samples import Array, independent_rows
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.model_terms import MotionSamples
-from crane.machine.machine import Machine
+from crane.motion.workspaces.workspace_mapping import stroke_limits
 
 _RANK_TOLERANCE = 1e-8  # independent part of a column, relative to its norm
 _ZERO_TOLERANCE = 1e-10  # norm of a zero column, relative to the largest
-_DEFAULT_SPAN = 1.0  # [rad], of the characteristic length, for joints without limits
+HALF_TURN = 1.0  # [rad] from home to the limits of joints without limits
 # order in which parameters are preferred as base parameters
 _PREFERENCE_ORDER = {
     "Izz": 0,
@@ -94,7 +94,7 @@ def random_samples(model: IdentificationModel, count: int, seed: int = 0) -> Mot
         InputError: The loops do not close within the limits.
     """
     machine, rng = model.machine, np.random.default_rng(seed)
-    lower, upper = stroke_limits(machine)
+    lower, upper = stroke_limits(machine, HALF_TURN)
     q_a: list[Array] = []
     for _ in range(20 * count):
         trial = rng.uniform(lower, upper)
@@ -119,22 +119,8 @@ def random_samples(model: IdentificationModel, count: int, seed: int = 0) -> Mot
     return model.samples(np.array(q_a), v_a, a_a, characteristic_time)
 
 
-def stroke_limits(machine: Machine) -> tuple[Array, Array]:
-    """Limits of the active joints; without limits a default range around home."""
-    home = machine.home[machine.closure.active]
-    span = machine.upper - machine.lower
-    is_unlimited, margin = (
-        ~np.isfinite(span),
-        _DEFAULT_SPAN * machine.closure.units[machine.closure.active],
-    )
-    return (
-        np.where(is_unlimited, home - margin, machine.lower),
-        np.where(is_unlimited, home + margin, machine.upper),
-    )
-
-
 def base_parameters(
-    model: IdentificationModel, samples: MotionSamples | None = None, seed: int = 0
+    model: IdentificationModel,
 ) -> BaseParameters:
     """Compute the base parameters of a model numerically (Gautier, 1991).
 
@@ -150,8 +136,7 @@ def base_parameters(
         InputError: The loops do not close within the limits.
     """
     p, n = len(model.names), len(model.machine.active)
-    if samples is None:
-        samples = random_samples(model, max(60, 4 * p // n), seed)
+    samples = random_samples(model, max(60, 4 * p // n))
     closure, bodies = model.machine.closure, 10 * len(model.bodies)
     # forces as virtual work per 1 rad or characteristic length, to compare drives
     rows = (model.regressor(samples) * closure.units[closure.active, None]).reshape(-1, p)
@@ -183,17 +168,8 @@ def group_parameters(
     norms = np.linalg.norm(rows, axis=0)
     zero = norms * units <= _ZERO_TOLERANCE * (norms * units).max(initial=0.0)
     scaled = rows / np.where(zero, 1.0, norms)
-    chosen: list[int] = []
-    directions = np.empty((len(rows), 0))
-    for i in sorted(np.flatnonzero(~zero).tolist(), key=preference):
-        rest = scaled[:, i]
-        for _ in range(2):  # twice is sufficient (Kahan, Parlett)
-            rest = rest - directions @ (directions.T @ rest)
-        length = np.linalg.norm(rest)
-        if length > _RANK_TOLERANCE:
-            chosen.append(i)
-            directions = np.column_stack([directions, rest / length])
-    independent = np.array(sorted(chosen), dtype=np.intp)
+    order = np.array(sorted(np.flatnonzero(~zero).tolist(), key=preference), dtype=np.intp)
+    independent = np.sort(order[independent_rows(scaled[:, order].T, _RANK_TOLERANCE)])
     q, r = np.linalg.qr(scaled[:, independent])
     share = np.linalg.solve(r, q.T @ scaled)
     share[np.abs(share) < 1e-9] = 0.0

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from crane.common.errors import CraneError, CraneWarning, InputError
-from crane.common.progress import progress_reporter
-from crane.common.samples import Array, as_number
+from crane.common.progress import Progress, progress_reporter
+from crane.common.samples import Array, as_number, root_mean_square
 from crane.common.units import format_table
 from crane.identification.mechanics.feasible_parameters import load_convex_solver
 from crane.identification.mechanics.identifiability import prior_from_names, read_priors
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.identify import RecordingOrMotion, identify, prepare_motions
 from crane.identification.mechanics.regression_equations import RegressionEquations
-from crane.identification.signals.signal_processing import Motion, Progress
+from crane.identification.signals.signal_processing import Motion
 from crane.machine.machine import Machine
 
 FOLD_COUNT = 5
@@ -42,7 +42,7 @@ class CrossValidationTrial:
     def mean_error(self) -> float:
         """Root mean square of the errors of folds with motion."""
         errors = self.errors[~np.isnan(self.errors)]
-        return float(np.sqrt(np.mean(errors**2))) if len(errors) else np.inf
+        return root_mean_square(errors) if len(errors) else np.inf
 
 
 def cross_validate(
@@ -73,7 +73,7 @@ def cross_validate(
     progress = progress_reporter(progress)
     if not candidates or not all(candidates.values()):
         raise InputError("there are no candidates, give values such as bandwidth=2,5,10")
-    motions = prepare_motions(machine, recording, options.get("trust", False), None)
+    motions = prepare_motions(machine, recording, options.get("trust", False))
     if (shortest := min(len(motion.time) for motion in motions)) < FOLD_COUNT * _MIN_FOLD_SAMPLES:
         raise InputError(
             f"{shortest} samples are too few for {FOLD_COUNT} folds, give at least "
@@ -97,8 +97,7 @@ def cross_validate(
             except CraneError as error:
                 reason = str(error)
         trials.append(CrossValidationTrial(settings, errors))
-        if progress is not None:
-            progress((done + 1) / len(grid))
+        progress((done + 1) / len(grid))
     if not np.isfinite(min(trial.mean_error for trial in trials)):
         raise InputError(
             "some fold of the training data is not determined by the others for any settings, "
@@ -107,7 +106,9 @@ def cross_validate(
     return sorted(trials, key=lambda trial: trial.mean_error)
 
 
-def identify_options(settings: Mapping[str, object], options: Mapping[str, Any]) -> dict[str, Any]:
+def identify_options(
+    machine: Machine, settings: Mapping[str, object], options: Mapping[str, Any]
+) -> dict[str, Any]:
     """Options of `identify` for the settings of a trial and other options."""
     out, prior_settings = dict(options), dict(settings)
     if _BANDWIDTH in prior_settings:
@@ -118,7 +119,7 @@ def identify_options(settings: Mapping[str, object], options: Mapping[str, Any])
             raise InputError(
                 "the prior is an array of all parameters, give it by name to vary parts of it"
             )
-        out["prior"] = read_priors(given_prior) | read_priors(prior_settings)
+        out["prior"] = read_priors(given_prior, machine) | read_priors(prior_settings, machine)
     return out
 
 
@@ -148,8 +149,10 @@ def _check_settings(
             if name == _BANDWIDTH:
                 as_number(_read_frequency(value), "the bandwidth", "Hz", greater_than=0)
             else:
-                prior_from_names(model, read_priors({name: value}), np.ones(len(model.names)))
-        identify_options(settings, options)
+                prior_from_names(
+                    model, read_priors({name: value}, machine), np.ones(len(model.names))
+                )
+        identify_options(machine, settings, options)
 
 
 def _read_frequency(value: object) -> float:
@@ -183,7 +186,7 @@ def _held_out_error(
             if len(motion.time[part]) >= _MIN_FOLD_SAMPLES
         ]
     with warnings.catch_warnings(action="ignore", category=CraneWarning):
-        trial = identify_options(settings, options)
+        trial = identify_options(machine, settings, options)
         # checks are not reliable on folds; the complete recordings were checked
         identification = identify(machine, training, **trial | {"trust": True})
         held_out_equations = RegressionEquations(

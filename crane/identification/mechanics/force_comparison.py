@@ -11,11 +11,12 @@ import numpy as np
 from crane.common.errors import CraneWarning
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
-from crane.identification.mechanics.recording_rejection import reject_delay, reject_unless_trusted
-from crane.identification.mechanics.smoothed_motion import signal_delay
-from crane.identification.signals.signal_processing import (
-    Motion,
-    sampling_step,
+from crane.identification.signals.signal_processing import Motion, sampling_step
+from crane.identification.signals.signal_quality import (
+    reject_delay,
+    reject_unless_trusted,
+    shifted_correlation,
+    signal_delay,
 )
 from crane.recordings.recording import Recording
 
@@ -124,8 +125,9 @@ def check_forces(
             )
             continue
         if correlation > _MIN_CORRELATION and scale < -4 * error and size > 1 / _MAX_FORCE_FACTOR:
-            text = f"'{joint}_force' is {scale:.2g} times the model's, turn its sign"
-            reject_unless_trusted(text, trust)
+            reject_unless_trusted(
+                f"'{joint}_force' is {scale:.2g} times the model's, turn its sign", trust
+            )
             continue
         ratio = math.sqrt(np.mean(measured**2) / np.mean(expected**2))
         is_known = 1 / _MAX_FORCE_FACTOR < size < _MAX_FORCE_FACTOR and error < size / 2
@@ -136,19 +138,20 @@ def check_forces(
         # like inertia a quarter of a period later
         if not 0.5 < ratio < 2.0:
             continue
-        shifted_correlation = _shifted_correlation(
+        correlation = shifted_correlation(
             expected, measured, round(lag / sampling_step(motion.time))
         )
-        if abs(lag) > longest_delay and shifted_correlation > max(
-            0.9, _shifted_correlation(expected, measured, 0) + 0.05
+        if abs(lag) > longest_delay and correlation > max(
+            0.9, shifted_correlation(expected, measured, 0) + 0.05
         ):
             reject_delay(f"{joint}_force", lag, "its model", trust)
     if messages:
-        text = (
+        warnings.warn(
             f"{', '.join(messages)}: friction and rotors may outweigh the bodies there, or the "
-            "unit is wrong, this recording cannot say"
+            "unit is wrong, this recording cannot say",
+            CraneWarning,
+            stacklevel=3,
         )
-        warnings.warn(text, CraneWarning, stacklevel=3)
 
 
 def warn_validation(training: ForceComparison, validation: ForceComparison) -> None:
@@ -172,12 +175,13 @@ def warn_validation(training: ForceComparison, validation: ForceComparison) -> N
                 f"({100 * validation_error:.3g} %)"
             )
     if messages:
-        text = (
+        warnings.warn(
             "errors on the validation are far above those on the training: "
             f"{', '.join(messages)}: the recordings do not belong together, or the training data "
-            "determine too little"
+            "determine too little",
+            CraneWarning,
+            stacklevel=3,
         )
-        warnings.warn(text, CraneWarning, stacklevel=3)
 
 
 def check_shared_samples(
@@ -201,11 +205,12 @@ def check_shared_samples(
         (_shared_share(*pair) for pair in itertools.product(recordings, validation)), default=0
     )
     if share > _MAX_SHARED_SHARE:
-        text = (
+        warnings.warn(
             f"{share:.0%} of the held-out samples are training data: their errors do not apply to "
-            "other motions, give other data"
+            "other motions, give other data",
+            CraneWarning,
+            stacklevel=3,
         )
-        warnings.warn(text, CraneWarning, stacklevel=3)
 
 
 def _shared_share(one: Recording | Motion, other: Recording | Motion) -> float:
@@ -241,10 +246,3 @@ def _force_scale(y: Array, x: Array, v: Array, a: Array) -> tuple[float, float, 
     parts = np.array([part.sum() for part in np.array_split(products, _BLOCK_COUNT)])
     error = math.sqrt(float(parts @ parts) * _BLOCK_COUNT / (_BLOCK_COUNT - 1)) / energy[1]
     return scale, error, abs(scale) * math.sqrt(energy[1] / energy[0])
-
-
-def _shifted_correlation(one: Array, other: Array, shift: int) -> float:
-    """Correlation of one signal with another one shifted by a number of samples."""
-    count = len(one) - abs(shift)
-    offsets = max(shift, 0), max(-shift, 0)
-    return float(np.corrcoef(one[offsets[1] :][:count], other[offsets[0] :][:count])[0, 1])

@@ -6,11 +6,11 @@ import numpy as np
 
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
+from crane.common.scratch_arrays import release_pages
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.recording_rejection import shift_remedy
 from crane.identification.signals.signal_processing import Motion, low_pass
-from crane.identification.signals.signal_quality import spectral_edge_frequency
+from crane.identification.signals.signal_quality import shift_remedy, spectral_edge_frequency
 from crane.recordings.recording import FORCE_SUFFIX
 
 _CUTOFF_FACTOR = 10.0  # cutoff, times the frequency of the motion
@@ -60,7 +60,7 @@ class ForceDelays(OneLineRepr):
             return np.zeros(len(self.joints), dtype=bool)
         limit = float(t.ppf(_CONFIDENCE, self.blocks - 1)) * self.std
         is_early = (self.seconds < -limit) & (self.explained > _MIN_EXPLAINED_SHARE)
-        return np.asarray((self.seconds > limit) | is_early)
+        return (self.seconds > limit) | is_early
 
     @property
     def text(self) -> str:
@@ -126,14 +126,15 @@ def force_delays(
     blocks = min(_MAX_BLOCKS, int(frequency * (time[-1] - time[0]) / _PERIODS_PER_BLOCK))
     if blocks < _MIN_BLOCKS or len(time) < 10 * filter_reach:
         return unknown
+    release_pages()
     at = model.samples(motion.q[chosen], motion.v[chosen], motion.a[chosen], step * decimation)
     W = model.regressor(at)[:, :, base.independent]
     for i in range(n):
         W[:, i] = low_pass(time, W[:, i], cutoff)
     known = low_pass(time, model.known_forces(at), cutoff)
     force = low_pass(motion.time, motion.tau, cutoff)[chosen]
-    speed = np.abs(motion.v)
-    is_resting = (speed <= np.maximum(min_speed, _STANDSTILL_SHARE * speed.max(axis=0)))[chosen]
+    fastest = np.maximum(motion.v.max(axis=0), -motion.v.min(axis=0))
+    is_resting = np.abs(motion.v[chosen]) <= np.maximum(min_speed, _STANDSTILL_SHARE * fastest)
     is_used = ~binary_dilation(is_resting, np.ones((2 * filter_reach + 1, 1), dtype=bool))
     is_used[:filter_reach] = is_used[-filter_reach:] = False
     is_used[:, ~model.machine.is_driven] = False  # forces of free joints are zero

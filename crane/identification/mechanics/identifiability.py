@@ -9,7 +9,7 @@ from scipy.linalg import qr
 
 from crane.common.errors import InputError, check_name
 from crane.common.samples import Array, as_number, as_sample
-from crane.description.specification import ParameterPrior
+from crane.description.estimation_settings import ParameterPrior, estimation_units
 from crane.identification.estimation.estimators import Estimate, Prior
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.feasible_parameters import body_size, body_units
@@ -117,15 +117,20 @@ def motion_advice(machine: Machine, motions: Sequence[Motion]) -> str:
     return "record a motion that determines them (crane excite)"
 
 
-def read_priors(given: float | Mapping[str, object]) -> dict[str, ParameterPrior]:
+def read_priors(
+    given: float | Mapping[str, object], machine: Machine
+) -> dict[str, ParameterPrior]:
     """Parse priors by name; a single relative standard deviation is that of all parameters.
 
     Raises:
         InputError: A prior is not valid.
     """
     if isinstance(given, Mapping):
+        turns = {joint: machine.unit(joint) == "rad" for joint in machine.joints}
         return {
-            name: what if isinstance(what, ParameterPrior) else ParameterPrior.parse(what)
+            name: what
+            if isinstance(what, ParameterPrior)
+            else ParameterPrior.parse(what, estimation_units(name, turns))
             for name, what in given.items()
         }
     share = as_number(given, "the prior's relative standard deviation", "", *_RELATIVE_STD_RANGE)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import InputError, check_name, suggest_names
 from crane.common.samples import Array, as_number, as_samples
-from crane.description.specification import TermValues
+from crane.description.estimation_settings import TermValues
 from crane.dynamics.joint_forces import JointForces
 from crane.identification.mechanics.model_terms import (
     ForceDirection,

@@ -1,6 +1,5 @@
 """Result of an identification: parameters, covariance, prediction errors, tables."""
 
-import csv
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.atomic_output import replace_file
+from crane.common.atomic_output import write_csv
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.units import format_table
@@ -233,14 +232,8 @@ class Identification(EstimatedValues, Result):
         Raises:
             OutputError: The file cannot be written.
         """
+        heads = ["parameter", "value", "std", "lower", "upper", "description", "mark", "group"]
         columns = [self.values, self.std, *self.confidence_interval().T, self.nominal]
-        with replace_file(path) as part, part.open("w", encoding="utf-8", newline="") as file:
-            table = csv.writer(file, lineterminator="\n")
-            table.writerow(
-                ["parameter", "value", "std", "lower", "upper", "description", "mark", "group"]
-            )
-            for name, numbers, mark, words in zip(
-                self.names, np.column_stack(columns).tolist(), self.marks, self.base.groups,
-                strict=True,
-            ):  # fmt: skip
-                table.writerow([name, *map(repr, numbers), mark, words])
+        numbers = np.column_stack(columns).tolist()
+        rows = zip(self.names, numbers, self.marks, self.base.groups, strict=True)
+        write_csv(path, [heads, *([name, *map(repr, x), *words] for name, x, *words in rows)])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.common.errors import CraneWarning, InputError, RecordingError, check_name, suggest_names
-from crane.common.progress import progress_reporter
+from crane.common.progress import Progress, ignore_progress, progress_reporter
 from crane.common.samples import Array, as_number, as_sample
 from crane.common.threads import with_single_threaded_blas
 from crane.identification.estimation.estimators import (
@@ -42,15 +42,17 @@ from crane.identification.mechanics.identifiability import (
 from crane.identification.mechanics.identification_model import IdentificationModel, TermChanges
 from crane.identification.mechanics.identification_result import Identification
 from crane.identification.mechanics.model_terms import FrictionTerm, ModelTerm, body_names
-from crane.identification.mechanics.recording_rejection import reject_unless_trusted
 from crane.identification.mechanics.regression_equations import (
     CombinedRegressor,
     RegressionEquations,
     is_long_enough,
 )
 from crane.identification.mechanics.smoothed_motion import smoothed_motion
-from crane.identification.signals.signal_processing import Motion, Progress
-from crane.identification.signals.signal_quality import spectral_edge_frequency
+from crane.identification.signals.signal_processing import Motion
+from crane.identification.signals.signal_quality import (
+    reject_unless_trusted,
+    spectral_edge_frequency,
+)
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 
@@ -174,8 +176,7 @@ def identify(
         )
         if validation_comparison is not None:
             warn_validation(training, validation_comparison)
-    if final_progress is not None:
-        final_progress(1.0)
+    final_progress(1.0)
     magnitudes = np.sqrt(identifiable.grouping**2 @ parameter_sizes**2)
     identification = Identification(
         model, identifiable, values, covariance, parameters, estimate, method, feasible, training,
@@ -194,7 +195,7 @@ def _compare_held_out(
     motions: Sequence[Motion],
     bandwidth: float,
     min_speeds: Array,
-    progress: Progress | None,
+    progress: Progress,
     values: Array,
 ) -> ForceComparison | None:
     """Compare held-out motions with the forces of base parameters; None if none is usable."""
@@ -235,7 +236,7 @@ def _build_prior(
     if given is not None:
         if not isinstance(given, Mapping | int | float):
             return check_prior(model, equations.base, given, feasible)
-        given_priors = read_priors(given)  # takes precedence over the machine file
+        given_priors = read_priors(given, model.machine)  # takes precedence over the machine file
         known = {
             name: what for name, what in known.items() if name not in given_priors
         } | given_priors
@@ -276,7 +277,7 @@ def build_equations(
     motions: Sequence[Motion],
     bandwidth: float | None = None,
     min_speed: Mapping[str, float] | ArrayLike | None = None,
-    progress: Progress | None = None,
+    progress: Progress = ignore_progress,
 ) -> tuple[RegressionEquations, BaseParameters]:
     """Regression equations of motions, and the identifiable part of the base parameters.
 
@@ -308,7 +309,7 @@ def prepare_motions(
     machine: Machine,
     recordings: RecordingOrMotion | Sequence[RecordingOrMotion],
     trust: bool,
-    progress: Progress | None,
+    progress: Progress = ignore_progress,
     role: str = "",
 ) -> list[Motion]:
     """Motions of recordings, with velocities and accelerations.
@@ -363,10 +364,8 @@ def speed_ranges(
     }
 
 
-def multi_pass_progress(progress: Progress | None) -> Progress | None:
+def multi_pass_progress(progress: Progress) -> Progress:
     """Progress over an unknown number of passes: each takes a share of the remainder."""
-    if progress is None:
-        return None
     done = 0.0
 
     def report(share: float) -> None:

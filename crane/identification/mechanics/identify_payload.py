@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.common.errors import InputError, RecordingError, check_name
-from crane.common.progress import progress_reporter
-from crane.common.samples import Array, as_sample
+from crane.common.progress import Progress, progress_reporter
+from crane.common.samples import Array, as_sample, root_mean_square
 from crane.common.threads import with_single_threaded_blas
 from crane.dynamics.dynamics import Dynamics
 from crane.identification.estimation.estimators import Estimate
@@ -29,12 +29,12 @@ from crane.identification.mechanics.payload_estimate import (
     static_cutoff,
     static_mass,
 )
-from crane.identification.mechanics.recording_rejection import reject_unless_trusted
 from crane.identification.mechanics.regression_equations import (
     RegressionEquations,
 )
 from crane.identification.mechanics.smoothed_motion import smoothed_motion
-from crane.identification.signals.signal_processing import Motion, Progress
+from crane.identification.signals.signal_processing import Motion
+from crane.identification.signals.signal_quality import reject_unless_trusted
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 
@@ -166,7 +166,7 @@ class _PayloadCase:
         return IdentificationModel(bare_machine, terms, machine_forces)
 
     def estimate_body(
-        self, has_inertia: bool, trust: bool, progress: Progress | None
+        self, has_inertia: bool, trust: bool, progress: Progress
     ) -> PayloadEstimate | None:
         """Estimate a load with its moments; None if nothing determines its mass."""
         model = self.model(has_inertia, self.com)
@@ -211,7 +211,7 @@ class _PayloadCase:
             self.com is not None,
         )  # fmt: skip
 
-    def estimate_point_mass(self, progress: Progress | None) -> PayloadEstimate | None:
+    def estimate_point_mass(self, progress: Progress) -> PayloadEstimate | None:
         """Estimate a mass at a point; None if its weight loads no moving drive."""
         motion, model = low_passed_motion(self.motion), self.model(False, None)
         load = PayloadTerm(self.machine, self.frame, False, self.point)
@@ -238,7 +238,7 @@ class _PayloadCase:
         std = [math.inf]
         for joint in self.moving_drives:
             i = self.machine.active.index(joint)
-            least = MIN_FRICTION_SHARE * float(np.sqrt(np.mean(motion.tau[:, i] ** 2)))
+            least = MIN_FRICTION_SHARE * root_mean_square(motion.tau[:, i])
             band = max(breakaway_force(self.machine, joint), least)
             std.append(band if joint in self.one_way_drives else math.inf)
         prior = np.zeros(len(std)), np.array(std)
@@ -335,12 +335,12 @@ def _check_mass(estimate: PayloadEstimate, trust: bool) -> None:
     """
     low, high = estimate.confidence_interval()[0].tolist()
     if high < 0:
-        text = (
+        reject_unless_trusted(
             f"the mass comes out as {low:.3g} to {high:.3g} kg, and no load weighs less than "
             "nothing: look at signs and units of forces or pressures, and identify the machine "
-            "without a load first"
+            "without a load first",
+            trust,
         )
-        reject_unless_trusted(text, trust)
 
 
 def _raise_unidentifiable(
@@ -382,4 +382,4 @@ def _identifiable_moments(base: BaseParameters, count: int) -> tuple[Array, Arra
     unseen = np.linalg.svd(K)[2][len(K) :]
     _, sizes, axes = np.linalg.svd(unseen[:, 1:4]) if len(unseen) else (0, np.zeros(3), np.eye(3))
     sizes = np.append(sizes, np.zeros(3 - len(sizes)))
-    return share, np.asarray(axes[sizes <= _IDENTIFIABLE_TOLERANCE])
+    return share, axes[sizes <= _IDENTIFIABLE_TOLERANCE]

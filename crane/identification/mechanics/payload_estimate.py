@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from crane.common.errors import InputError
-from crane.common.samples import Array
+from crane.common.samples import Array, true_runs
 from crane.common.units import format_table
 from crane.dynamics.dynamics import Dynamics
 from crane.identification.estimation.estimators import EstimatedValues
@@ -187,9 +187,8 @@ def static_mass(
     step = float(motion.time[1] - motion.time[0])
     v = low_passed_motion(motion).v
     is_resting = (np.abs(v) <= _REST_SPEED_SHARE * np.abs(v).max(axis=0)).all(axis=1)
-    edges = np.flatnonzero(np.diff(is_resting.astype(np.int8), prepend=0, append=0))
     runs = [
-        (i, j) for i, j in edges.reshape(-1, 2).tolist() if (j - i) * step >= _MIN_REST_DURATION
+        (i, j) for i, j in true_runs(is_resting).tolist() if (j - i) * step >= _MIN_REST_DURATION
     ]
     if not runs:
         return None

@@ -8,16 +8,21 @@ from itertools import pairwise
 import numpy as np
 
 from crane.common.errors import InputError
+from crane.common.progress import Progress, ignore_progress
 from crane.common.samples import Array
+from crane.common.scratch_arrays import release_pages
 from crane.identification.estimation.estimators import Estimate, Prior
-from crane.identification.estimation.regressor import triangular_factor, update_triangular_factor
+from crane.identification.estimation.regressor import (
+    Regressor,
+    triangular_factor,
+    update_triangular_factor,
+)
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.force_comparison import ForceComparison
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.model_terms import MotionSamples
 from crane.identification.signals.signal_processing import (
     Motion,
-    Progress,
     filter_kernel,
     filter_rows,
 )
@@ -117,7 +122,7 @@ class RegressionEquations:
         motions: Sequence[Motion],
         bandwidth: float,
         min_speed: Array,
-        progress: Progress | None = None,
+        progress: Progress = ignore_progress,
         values: Array | None = None,
     ):
         self.base, self.bandwidth, self.min_speed = base, bandwidth, min_speed
@@ -161,8 +166,7 @@ class RegressionEquations:
             cached_bytes = sum(one.nbytes for one in self._block_cache.values())
             if cached_bytes + W.nbytes <= _CACHE_BYTES:
                 self._block_cache[number] = W
-            if self._progress is not None:
-                self._progress((done + 1) / len(self._blocks))
+            self._progress((done + 1) / len(self._blocks))
             yield self._blocks[number].instants, W
 
     def _compute_block(self, number: int) -> Array:
@@ -175,6 +179,7 @@ class RegressionEquations:
         tau = part.motion.tau[start:stop]
         if part.filter_reach:
             both, tau = filter_rows(both, tau, part.step, self.bandwidth, thinning)
+        release_pages()
         here = slice(rows.start - start // thinning, rows.stop - start // thinning)
         self.forces[block.instants], self.offset[block.instants] = tau[here], both[here, :, -1]
         return np.ascontiguousarray(both[here, :, :-1])
@@ -361,8 +366,8 @@ def is_long_enough(motion: Motion, bandwidth: float) -> bool:
     return bandwidth * float(motion.time[-1] - motion.time[0]) >= _MIN_PERIODS
 
 
-class CombinedRegressor:
-    """Regressor of the used rows with combined columns: a `regressor.Regressor`.
+class CombinedRegressor(Regressor):
+    """Regressor of the used rows with combined columns.
 
     Args:
         equations: Equations with the regressor W (., r).

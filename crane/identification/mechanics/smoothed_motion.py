@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from crane.common.errors import CraneWarning, RecordingError, suggest_names
-from crane.common.samples import Array
-from crane.common.scratch_arrays import BLOCK_SIZE, release_pages, stack_columns
-from crane.identification.mechanics.recorded_loads import recorded_load_forces
-from crane.identification.mechanics.recording_rejection import reject_delay, reject_unless_trusted
+from crane.common.errors import CraneWarning, RecordingError, check_name, suggest_names
+from crane.common.progress import Progress, ignore_progress
+from crane.common.samples import Array, root_mean_square
+from crane.common.scratch_arrays import release_pages, stack_columns
+from crane.description.external_forces import WRENCH_COMPONENTS
+from crane.dynamics.dynamics import Dynamics
 from crane.identification.signals.signal_processing import (
     Motion,
-    Progress,
     check_gaps,
     differentiate,
     low_pass,
@@ -22,7 +22,11 @@ from crane.identification.signals.signal_processing import (
 )
 from crane.identification.signals.signal_quality import (
     outlier_mask,
+    reject_delay,
+    reject_unless_trusted,
     replace_outliers,
+    shifted_correlation,
+    signal_delay,
     spectral_edge_frequency,
     strongest_spectral_line,
 )
@@ -39,11 +43,12 @@ _MAX_SPEED_FACTOR = 30.0
 _HUM_FACTOR = 10.0  # times the frequency of the motion, above which a spectral line is hum
 _MIN_SAMPLES = 50  # samples
 _COMPARISON_CUTOFF = 10.0  # [Hz] of the comparison of velocities and positions
-_CORRELATION_TOLERANCE = 0.01  # of a correlation
-_MAX_DELAY = 1.0  # [s] longest delay of the search
+_MAX_COMPARED_SAMPLES = 1 << 20  # above which velocities are compared at fewer instants,
+_SAMPLES_PER_PERIOD = 16  # of the cutoff
 _MAX_OUTLIER_SHARE = 0.05  # of the samples of a column, above which it is rejected
 # units that are confused with SI units
 _COMMON_UNITS = {"rad": ("deg", 180 / math.pi), "m": ("mm", 1e3)}
+_LOAD_PREFIX, _PART_UNITS = "load_", {"force": "N", "moment": "N m"}
 
 
 def smoothed_motion(
@@ -52,7 +57,7 @@ def smoothed_motion(
     derivatives: str = "kalman",
     cutoff: float | None = None,
     trust: bool = False,
-    progress: Progress | None = None,
+    progress: Progress = ignore_progress,
 ) -> Motion:
     """Motion of a recording, with checks, velocities and accelerations.
 
@@ -118,7 +123,7 @@ def smoothed_motion(
     v, a = found.v, found.a
     is_moving = np.ones(n, dtype=bool)  # by more than the uncertainty of the velocity
     if found.std_v is not None:
-        deviations = np.array([np.sqrt(np.mean(x**2)) for x in found.std_v.T])
+        deviations = np.array([root_mean_square(x) for x in found.std_v.T])
         is_moving = np.array([x.std() for x in v.T]) > _MOTION_FACTOR * deviations
     is_noisy = ~is_moving & v.any(axis=0)
     v[:, ~is_moving] = a[:, ~is_moving] = 0.0
@@ -129,11 +134,12 @@ def smoothed_motion(
     # static friction makes any force
     for i in np.flatnonzero(is_noisy).tolist():
         joint, place = machine.active[i], float(found.q[:, i].mean())
-        text = (
+        warnings.warn(
             f"'{joint}' stands still but for noise: its forces are not informative, move it, or "
-            f"lock it ({joint}={place:.4g})"
+            f"lock it ({joint}={place:.4g})",
+            CraneWarning,
+            stacklevel=2,
         )
-        warnings.warn(text, CraneWarning, stacklevel=2)
     passband = math.inf
     if found.passband is not None:
         passband = float(found.passband[is_moving].min(initial=math.inf))
@@ -227,44 +233,6 @@ def _check_speeds(machine: Machine, v: Array, trust: bool) -> None:
             )
 
 
-def signal_delay(time: Array, one: Array, other: Array) -> float:
-    """Delay [s] of the second signal (N,) with respect to the first, at most 1 s.
-
-    It is the maximum of the correlation of the overlapping parts, refined by a parabola.
-    """
-    step = sampling_step(time)
-    one, other = one - one.mean(), other - other.mean()
-    shifts = np.arange(-(reach := min(round(_MAX_DELAY / step), len(time) // 4)), reach + 1)
-    products = _products(one, other, reach)
-    first, second = (np.append(0, np.cumsum(x**2)) for x in (one, other))
-    low, high = np.maximum(shifts, 0), len(time) + np.minimum(shifts, 0)
-    energy = (first[high - shifts] - first[low - shifts]) * (second[high] - second[low])
-    correlation = products / np.sqrt(np.maximum(energy, 1e-12 * first[-1] * second[-1] + 1e-300))
-    # the shortest of equal maxima, as for periodic signals
-    best = np.flatnonzero(correlation >= correlation.max() - _CORRELATION_TOLERANCE)
-    at = int(np.clip(best[np.abs(shifts[best]).argmin()], 1, 2 * reach - 1))
-    if correlation[at - 1 : at + 2].argmax() != 1:  # not at a local maximum
-        direction = 1 if correlation[at + 1] > correlation[at] else -1
-        while 1 < at < 2 * reach - 1 and correlation[at + direction] > correlation[at]:
-            at += direction
-    before, here, after = correlation[at - 1 : at + 2]
-    curvature = before - 2 * here + after
-    shift = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
-    return float((at - reach + shift) * step)
-
-
-def _products(one: Array, other: Array, reach: int) -> Array:
-    """Sums of one_k other_k+s for the shifts s from -reach to reach, in blocks of samples."""
-    from scipy.signal import correlate
-
-    total, padded = np.zeros(2 * reach + 1), np.pad(other, reach)
-    for start in range(0, len(one), BLOCK_SIZE):
-        part = one[start : start + BLOCK_SIZE]
-        window = padded[start : start + len(part) + 2 * reach]
-        total += correlate(window, part, mode="valid", method="fft")
-    return total
-
-
 def remove_outliers(
     time: Array, names: Sequence[str], columns: Array, trust: bool = False
 ) -> Array:
@@ -279,6 +247,7 @@ def remove_outliers(
     messages = []
     for name, column in () if trust else zip(names, columns.T, strict=True):
         bad = outlier_mask(column)
+        release_pages()
         if not bad.any():
             continue
         first = f"the first at {time[bad.argmax()]:.6g} s"
@@ -386,10 +355,14 @@ def _check_velocity(
     time: Array, x: Array, v: Array, joint: str, unit: str, longest_delay: float, trust: bool
 ) -> None:
     """Compare a velocity with the derivative of its coordinate below 10 Hz."""
-    time, columns = resample_evenly(time, np.column_stack([x, v]))
+    time, columns = resample_evenly(time, stack_columns([x, v], 2))
     step = sampling_step(time)
     if 0.4 / step > _COMPARISON_CUTOFF:
         columns = low_pass(time, columns, _COMPARISON_CUTOFF)
+        if len(time) > _MAX_COMPARED_SAMPLES:
+            stride = max(1, int(1.0 / (_SAMPLES_PER_PERIOD * _COMPARISON_CUTOFF * step)))
+            time, columns, step = time[::stride], columns[::stride].copy(), stride * step
+    release_pages()
     derivative = np.gradient(columns[:, 0], step, axis=0, edge_order=2)
     v = columns[:, 1]
     # less than a micrometre is noise or rounding, not motion
@@ -406,10 +379,7 @@ def _check_velocity(
             )
     delay = signal_delay(time, derivative, v)
     shift = round(delay / step)
-    first, second = (derivative, v) if shift >= 0 else (v, derivative)
-    overlap = len(v) - abs(shift)
-    first, second = first[:overlap], second[abs(shift) :]
-    correlation = float(np.corrcoef(first, second)[0, 1]) if np.ptp(v) > 0 else 0.0
+    correlation = shifted_correlation(derivative, v, shift) if np.ptp(v) > 0 else 0.0
     if correlation < 0.7 or not 0.5 < ratio < 2:
         return reject_unless_trusted(
             f"'{joint}_velocity' is not the derivative of '{joint}' (correlation "
@@ -419,3 +389,53 @@ def _check_velocity(
     if abs(delay) > longest_delay:
         reject_delay(f"{joint}_velocity", delay, f"'{joint}'", trust)
     return None
+
+
+def recorded_load_forces(machine: Machine, recording: Recording, q_a: Array, trust: bool) -> Array:
+    """Forces of recorded loads at the active joints, so that W beta = tau + forces.
+
+    Columns `load_NAME_force_x` to `load_NAME_moment_z` are a wrench in the world frame at the
+    frame of the machine's load NAME, or at the link NAME; missing components are zero.
+
+    Args:
+        machine: The recorded machine.
+        recording: Recording of N samples.
+        q_a: (N, n) [m], [rad].
+        trust: See `smoothed_motion`.
+
+    Returns:
+        (N, n) [N], [N m]; (1, n) zeros without loads.
+
+    Raises:
+        RecordingError: A load acts on an unknown link, or a load of the machine is not recorded.
+    """
+    frames = {force.name: force.frame for force in machine.external_forces}
+    wrenches: dict[str, Array] = {}
+    for column, values in recording.channels.items():
+        pieces = column.removeprefix(_LOAD_PREFIX).rsplit("_", 2)
+        part = "_".join(pieces[1:])
+        if not column.startswith(_LOAD_PREFIX) or part not in WRENCH_COMPONENTS:
+            continue
+        name, unit = pieces[0], recording.channel_units[column]
+        if unit != _PART_UNITS[part[:-2]]:
+            raise RecordingError(
+                f"'{column}' is recorded in {unit}, give {_PART_UNITS[part[:-2]]}"
+            )
+        if name not in frames:
+            problem = f"'{column}' acts on no link of '{machine.name}'"
+            check_name(name, machine.tree.links, problem, RecordingError)
+        rows = wrenches.setdefault(name, np.zeros((len(values), len(WRENCH_COMPONENTS))))
+        rows[:, WRENCH_COMPONENTS.index(part)] = values
+    for name in frames:
+        if name not in wrenches:
+            reject_unless_trusted(
+                f"'{machine.name}' has the load '{name}', and no column contains it: add "
+                f"{_LOAD_PREFIX}{name}_force_x and so on, or take a machine without it",
+                trust,
+            )
+    if not wrenches:
+        return np.zeros((1, q_a.shape[1]))
+    dynamics, total = Dynamics(machine), np.zeros_like(q_a)
+    for name, rows in wrenches.items():
+        total += dynamics.project_wrenches(q_a, {frames.get(name, name): rows})
+    return total

@@ -1,46 +1,58 @@
-"""Writing of identified machines: machine file and URDF files with identified parameters."""
+"""Writing of identified machines: friction laws, divided bodies, machine file and URDF files."""
 
-import shutil
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pinocchio as pin
-from lxml import etree
 
-from crane.common.atomic_output import replace_folder
-from crane.common.errors import CraneError, CraneWarning, InputError, OutputError
+from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.common.samples import Array
-from crane.common.unit_conversions import KeyPath
 from crane.description.force_elements import Friction
-from crane.description.kinematic_tree import inertia_problem
-from crane.description.machine_parameters import GRAVITY_PREFIX
-from crane.description.machine_schema import END_STOP, FORCE, GAS_SPRING, LOOP, ROPE
-from crane.description.parameter_changes import lock_joints
-from crane.description.specification import Chain, MachineSpec
-from crane.dynamics.dynamics import Dynamics
-from crane.formats.machine_file.machine_reader import read_machine_spec, read_plain_data
-from crane.formats.machine_file.machine_writer import friction_data
-from crane.formats.machine_file.yaml_text import format_yaml
-from crane.formats.machine_loading import load
-from crane.formats.parallel_robots import is_parallel_robot
-from crane.identification.mechanics.base_parameters import random_samples
-from crane.identification.mechanics.identification_result import Identification
-from crane.identification.mechanics.identified_description import (
-    FRICTION_PARAMETERS,
-    divide_locked_bodies,
-    friction_laws,
-    joint_combinations,
-    motor_chain,
-    replace_inertials,
+from crane.description.kinematic_tree import (
+    Inertial,
+    Joint,
+    Link,
+    inertia_problem,
+    with_rotor_inertias,
 )
-from crane.identification.mechanics.model_terms import BODY_PARAMETERS, FrictionTerm
+from crane.description.parameter_changes import lock_joints
+from crane.description.pinocchio_conversion import inertial_from_inertia
+from crane.dynamics.dynamics import Dynamics
+from crane.formats.machine_file.machine_writer import MachineDraft, friction_data
+from crane.formats.machine_loading import MachineVariants, load
+from crane.formats.xml_file import add_joint, add_link
+from crane.identification.mechanics.base_parameters import random_samples
+from crane.identification.mechanics.feasible_parameters import (
+    body_parameters,
+    pseudo_inertia,
+    thicken_body,
+)
+from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.identification_result import Identification
+from crane.identification.mechanics.model_terms import (
+    BODY_PARAMETERS,
+    DirectionalTerm,
+    ForceDirection,
+    FrictionTerm,
+    VelocityFriction,
+    body_names,
+)
 from crane.machine.machine import Machine
 
+T = TypeVar("T")
 _FEASIBLE_REMEDY = "give feasible=True"
 _FORCE_TOLERANCE = 1e-9  # of the largest force, for the check of the written machine
+SpeedRanges = Mapping[str, tuple[float, float]]
+FRICTION_PARAMETERS = tuple(item.name for item in fields(Friction))
+_SPEED_COUNT = 100  # speeds of a comparison of laws, in each direction
+_MAX_STRIBECK_SHARE = 0.3  # largest Stribeck velocity, relative to the largest speed
+_STRIBECK_GRID_SIZE = 30  # Stribeck velocities of the search
+_FLATNESS_TOLERANCE = 1e-6  # smallest eigenvalue of the scaled pseudo-inertia of a flat body
 
 
 def write_identified(identification: Identification, folder: str | Path) -> Path:
@@ -51,12 +63,11 @@ def write_identified(identification: Identification, folder: str | Path) -> Path
     lock=identification.described_machine.locked_joints)`.
 
     The parameters of a body are written to the link that its joint moves; inertials of links fixed
-    to it are removed. Friction, rotor inertias and gas pressures are the identified ones, other
-    passive forces those of the machine. Friction without a law in machine files is written as the
-    nearest law at steady speeds, with a warning about the difference. A motor that turns several
-    joints becomes a rotor with a coupling. Bodies of locked joints are divided among their links
-    by the descriptions. Everything else is copied from the files of the machine; meshes are
-    referred to by their paths. The written files are loaded and compared with the identification
+    to it are removed. Friction, rotor inertias and gas pressures are the identified ones, all else
+    is that of the machine, see `write_machine`. Friction without a law in machine files is written
+    as the nearest law at steady speeds, with a warning about the difference. A motor that turns
+    several joints becomes a rotor with a coupling. Bodies of locked joints are divided among their
+    links by the descriptions. The written files are loaded and compared with the identification
     before they replace existing ones.
 
     Args:
@@ -68,9 +79,8 @@ def write_identified(identification: Identification, folder: str | Path) -> Path
         The machine file.
 
     Raises:
-        InputError: The identified machine is not valid, only base parameters are known, the
-            machine has another format or parameter changes, or a machine file cannot represent the
-            terms of the model.
+        InputError: The identified machine is not valid, only base parameters are known, or a
+            machine file cannot represent the terms of the model.
         OutputError: The folder cannot be written, or contains the files of the machine.
     """
     try:
@@ -86,75 +96,93 @@ def write_identified(identification: Identification, folder: str | Path) -> Path
 
 def _write_identified(identification: Identification, folder: str | Path) -> Path:
     machine, parameters = identification.described_machine, identification.parameters
-    check_rewritable(machine)
     if parameters is None or not identification.model.bodies:
         raise InputError("forces determine base parameters only: give prior or feasible=True")
     # warnings were reported when the machine was loaded
     with warnings.catch_warnings(action="ignore", category=CraneWarning):
-        spec = read_machine_spec(machine.path)
-        unlocked_machine = load(machine.path) if machine.locked_joints else machine
+        unlocked_machine = _unlocked_machine(machine) if machine.locked_joints else machine
     bodies = divide_locked_bodies(machine, parameters, unlocked_machine)
-    chains = spec.chains if spec.payload is None else (*spec.chains, spec.payload.chain)
-    names = _file_names(chains)
-    file = f"{machine.path.stem}.yaml"
-    originals = {machine.path, *(chain.urdf for chain in chains)}
-    for name in (file, *names.values()):
-        if (target := (Path(folder) / name).resolve()) in originals:
-            raise OutputError(
-                f"{target}: is what '{machine.name}' was read from, choose another folder"
-            )
-    origin_text = (
-        f"identified by {identification.method}{', feasible' if identification.feasible else ''}"
-    )
-    if undetermined_count := identification.marks.count("not determined"):
-        origin_text += (
-            f", {undetermined_count} of {len(identification.marks)} base parameters not determined"
-        )
     laws, deviations = friction_laws(identification.model, parameters, identification.speeds)
-    content, motor_urdfs = _machine_file_content(identification, spec, names, origin_text, laws)
-    with replace_folder(folder) as part:
-        for chain in spec.chains:
-            tree = replace_inertials(chain.urdf, bodies, _fixed_links(spec), origin_text)
-            text = etree.tostring(tree, encoding="utf-8", xml_declaration=True)
-            (part / names[chain.name]).write_bytes(text.rstrip() + b"\n")
-        if spec.payload is not None:
-            payload_chain = spec.payload.chain
-            shutil.copyfile(payload_chain.urdf, part / names[payload_chain.name])
-        for name, text in motor_urdfs.items():
-            (part / name).write_text(text, encoding="utf-8")
-        (part / file).write_text(content, encoding="utf-8")
-        _check_written_machine(identification, bodies, part / file, exact=not deviations)
+    draft = _identified_draft(identification, unlocked_machine, bodies, laws)
+    check = partial(_check_written_machine, identification, bodies, exact=not deviations)
+    file = draft.write_folder(folder, check=check)
     if deviations:
         worst = max(deviations, key=lambda name: deviations[name])
         unit = "N" if worst in machine.joints and machine.unit(worst) == "m" else "N m"
-        text = (
+        warnings.warn(
             f"a machine file has no place for all of the friction of {', '.join(deviations)}: "
             "the nearest law at steady speeds is written, off by at most "
-            f"{deviations[worst]:.3g} {unit} ({worst})"
+            f"{deviations[worst]:.3g} {unit} ({worst})",
+            CraneWarning,
+            stacklevel=3,
         )
-        warnings.warn(text, CraneWarning, stacklevel=3)
-    return Path(folder) / file
+    return file
 
 
-def check_rewritable(machine: Machine) -> None:
-    """Check that the files of a machine can be written with other parameters.
+def _unlocked_machine(machine: Machine) -> Machine:
+    """The machine without locked joints; force elements that were replaced since stay replaced."""
+    variants = MachineVariants(replace(machine, locked_joints={}))
+    locked_spec = lock_joints(variants.spec, machine.locked_joints)
+    elements: dict[str, Any] = {}
+    for kind in ("forces", "gas_springs", "ropes", "end_stops"):
+        kept = getattr(locked_spec, kind)
+        removed = (x for x in getattr(variants.spec, kind) if x not in kept)
+        elements[kind] = (*getattr(machine, kind), *removed)
+    return variants.machine({}).replace(**elements)
 
-    Raises:
-        InputError: The format is not supported, or the machine has parameter changes other than
-            its gravity.
-    """
-    if any(chain.urdf.suffix.lower() != ".urdf" for chain in machine.chains) or (
-        not (machine.path.suffix.lower() == ".urdf") and is_parallel_robot(machine.path)
-    ):
-        raise InputError(
-            f"{machine.path.name}: an identified machine needs a machine file or URDF, make "
-            f"one: crane convert {machine.command_line_arguments} FOLDER"
+
+def _identified_draft(
+    result: Identification,
+    unlocked_machine: Machine,
+    bodies: Mapping[str, Array],
+    laws: Mapping[str, Friction],
+) -> MachineDraft:
+    """The identified machine, with notes on the uncertainty of its friction and rotor inertias."""
+    tree, described = unlocked_machine.tree, result.described_machine
+    rotors = _parameters_of_kind(result, "rotor_inertia")
+    for joint, value in rotors.items():
+        if value < 0:
+            raise InputError(f"'{joint}': rotor inertia is {value:g}, give feasible=True")
+    inertials: dict[str, Inertial | None] = {
+        link: None
+        for link, first in tree.bodies_by_link().items()
+        if link != first != tree.root_link
+    }
+    for link, body in bodies.items():
+        inertials[link] = inertial_from_inertia(pin.Inertia.FromDynamicParameters(body))
+    tree = tree.with_parts(*(replace(tree.links[x], inertial=y) for x, y in inertials.items()))
+    motors = joint_combinations(result.model)
+    directions = [motor.name for motor in motors]
+    friction = {x: y for x, y in unlocked_machine.friction.items() if x in described.locked_joints}
+    scales = _parameters_of_kind(result, "gas_scale")
+    draft = MachineDraft(
+        replace(
+            unlocked_machine,
+            source=f"{_origin_text(result)}; else {described.source or described.path.name}",
+            tree=with_rotor_inertias(tree, _without(rotors, directions)),
+            friction=friction | _without(laws, directions),
+            gas_springs=tuple(
+                replace(x, pressure=x.pressure * scales.get(x.joint, 1.0))
+                for x in unlocked_machine.gas_springs
+            ),
         )
-    if not all(name.startswith(GRAVITY_PREFIX) for name in machine.parameter_changes):
-        raise InputError(
-            f"'{machine.name}' was loaded with parameter changes, identify it as its files "
-            "describe it"
-        )
+    )
+    for motor in motors:
+        law, inertia = laws.get(motor.name, Friction()), rotors.get(motor.name, 0.0)
+        add_motor(draft, motor, tree.root_link, law, inertia)
+    draft.add_notes(_uncertainty_notes(result, laws, rotors))
+    return draft
+
+
+def _without(values: Mapping[str, T], names: Sequence[str]) -> dict[str, T]:
+    return {name: value for name, value in values.items() if name not in names}
+
+
+def _origin_text(result: Identification) -> str:
+    text = f"identified by {result.method}{', feasible' if result.feasible else ''}"
+    if undetermined_count := result.marks.count("not determined"):
+        text += f", {undetermined_count} of {len(result.marks)} base parameters not determined"
+    return text
 
 
 def _infeasible_body(bodies: Mapping[str, Array]) -> str | None:
@@ -168,110 +196,20 @@ def _infeasible_body(bodies: Mapping[str, Array]) -> str | None:
     return None
 
 
-def _file_names(chains: Sequence[Chain]) -> dict[str, str]:
-    """File name of each chain; a number distinguishes equal names."""
-    taken: dict[str, str] = {}
-    for number, chain in enumerate(chains):
-        name = chain.urdf.name
-        taken[chain.name] = f"{number}_{name}" if name in taken.values() else name
-    return taken
-
-
-def _fixed_links(spec: MachineSpec) -> set[str]:
-    """Links that are fixed to one that a joint moves."""
-    parent_joints = {joint.child: joint for joint in spec.tree.joints.values()}
-    found = set()
-    for link in parent_joints:
-        at = link
-        while at in parent_joints and not parent_joints[at].is_movable:
-            at = parent_joints[at].parent
-        if at != link and at in parent_joints:
-            found.add(link)
-    return found
-
-
-def _machine_file_content(
-    result: Identification,
-    spec: MachineSpec,
-    names: Mapping[str, str],
-    origin_text: str,
-    laws: Mapping[str, Friction],
-) -> tuple[str, dict[str, str]]:
-    """Content of the machine file, and of URDF files of motors that turn several joints."""
-    machine = result.described_machine
-    if machine.path.suffix.lower() == ".urdf":
-        data: dict[str, Any] = {"name": machine.name, "chains": [{"name": spec.chains[0].name}]}
-        data["loops"] = [
-            LOOP.values_of(loop) | {"axis": [float(x) for x in loop.axis]} for loop in spec.loops
-        ]
-        data["active"] = list(spec.active if spec.active is not None else machine.active)
-        if machine.tip is not None:
-            data["tip"] = machine.tip
-    else:
-        data = read_plain_data(machine.path)
-    if machine.gravity != spec.gravity:
-        data["gravity"] = list(machine.gravity)
-    data["source"] = f"{origin_text}; else {machine.source or machine.path.name}"
-    for chain in data["chains"]:
-        chain["urdf"] = names[chain["name"]]
-    if spec.payload is not None:
-        data["payload"] = {"urdf": names[spec.payload.chain.name]}
-    motor_urdfs = {}
-    combinations = joint_combinations(result.model)
-    for direction in combinations:
-        chain, coupling, text = motor_chain(direction, spec.tree.root_link)
-        data["chains"].append(chain)
-        data["couplings"] = [*(data.get("couplings") or ()), coupling]
-        motor_urdfs[chain["urdf"]] = text
-    friction = {x: law for x, law in spec.friction.items() if x in machine.locked_joints}
-    for joint in (*machine.joints, *(x.name for x in combinations)):
-        if joint in laws or joint in spec.friction:  # without friction in the model it has none
-            friction[joint] = laws.get(joint, Friction())
-    data["friction"] = {joint: friction_data(law) for joint, law in friction.items()}
-    rotors = {joint.name: joint.rotor_inertia for joint in spec.tree.moving_joints}
-    rotors |= _parameters_of_kind(result, "rotor_inertia")
-    for joint, value in rotors.items():
-        if value < 0:
-            raise InputError(f"'{joint}': rotor inertia is {value:g}, give feasible=True")
-    data["rotor_inertia"] = {joint: value for joint, value in rotors.items() if value}
-    scales = _parameters_of_kind(result, "gas_scale")
-    moving = lock_joints(spec, machine.locked_joints) if machine.locked_joints else spec
-
-    def elements_of(kind: str) -> list[Any]:
-        """Elements of a kind, including those that locked joints removed."""
-        kept = getattr(moving, kind)
-        return [*getattr(machine, kind), *(x for x in getattr(spec, kind) if x not in kept)]
-
-    data["forces"] = [FORCE.values_of(item) for item in elements_of("forces")]
-    data["gas_springs"] = {
-        item.joint: GAS_SPRING.values_of(item)
-        | {"pressure": item.pressure * scales.get(item.joint, 1.0)}
-        for item in elements_of("gas_springs")
-    }
-    data["ropes"] = [ROPE.values_of(item) for item in elements_of("ropes")]
-    data["end_stops"] = {item.joint: END_STOP.values_of(item) for item in elements_of("end_stops")}
-    for key in ("loops", "forces", "gas_springs", "ropes", "end_stops", "rotor_inertia"):
-        if not data.get(key):
-            data.pop(key, None)
-    notes = _uncertainty_notes(result, data)
-    return format_yaml(data, notes, spec.written_numbers), motor_urdfs
-
-
-def _uncertainty_notes(result: Identification, data: Mapping[str, Any]) -> dict[KeyPath, str]:
+def _uncertainty_notes(
+    result: Identification, laws: Mapping[str, Friction], rotors: Mapping[str, float]
+) -> dict[str, str]:
     """Comments on the uncertainty of friction and rotor inertias that are base parameters."""
-    found: dict[KeyPath, str] = {}
+    found: dict[str, str] = {}
     half = 0.5 * np.diff(result.confidence_interval(), axis=1)[:, 0]
     for i, (name, group) in enumerate(zip(result.names, result.base.groups, strict=True)):
         owner, _, kind = name.rpartition(".")
-        key_path = (kind, owner) if kind == "rotor_inertia" else ("friction", owner, kind)
-        place: Any = data
-        for key in key_path[:-1]:
-            place = place.get(key, {})
-        if group == name and np.isclose(
-            place.get(key_path[-1], np.nan), result.values[i], rtol=1e-9
-        ):
+        is_rotor = kind == "rotor_inertia"
+        written = rotors[owner] if is_rotor else getattr(laws.get(owner), kind, np.nan)
+        if group == name and np.isclose(written, result.values[i], rtol=1e-9):
             mark = result.marks[i] and f", {result.marks[i]}"
-            found[key_path] = f"identified ±{half[i]:.2g}, 95 %{mark}"
+            key = name if is_rotor else f"friction.{name}"
+            found[key] = f"identified ±{half[i]:.2g}, 95 %{mark}"
     return found
 
 
@@ -322,3 +260,166 @@ def _check_written_machine(
     others = [name for name in model.names if name.rpartition(".")[2] not in kinds]
     what = f"'{others[0]}'" if others else "friction over other velocities than the machine's"
     raise InputError(f"the model has {what}, for which a machine file has no place, leave it out")
+
+
+def friction_laws(
+    model: IdentificationModel, parameters: Array, speed_ranges: SpeedRanges
+) -> tuple[dict[str, Friction], dict[str, float]]:
+    """Friction law of each direction with friction terms in the model.
+
+    Terms that a machine file does not contain (presliding, frictional memory, root of the speed,
+    several Stribeck velocities) are replaced by the law that is nearest in least squares to the
+    total friction at steady speeds in both directions.
+
+    Args:
+        model: The model.
+        parameters: All parameters (p,).
+        speed_ranges: Least and largest speed of the comparison by direction [m/s], [rad/s].
+
+    Returns:
+        Laws by direction; and of those that are not exact the largest difference at a steady
+        speed [N], [N m].
+
+    Raises:
+        InputError: Identified friction is negative.
+    """
+    values = dict(zip(model.names, parameters.tolist(), strict=True))
+    terms_by_direction: dict[str, list[FrictionTerm]] = {}
+    for term in model.terms:
+        if isinstance(term, FrictionTerm):
+            terms_by_direction.setdefault(term.direction.name, []).append(term)
+    laws, deviations = dict[str, Friction](), dict[str, float]()
+    for name, terms in terms_by_direction.items():
+        law = _exact_law(model, name, terms, values)
+        if law is None:
+            law, deviations[name] = _nearest_law(terms, values, speed_ranges[name])
+        laws[name] = law
+    return laws, deviations
+
+
+def _exact_law(
+    model: IdentificationModel, name: str, terms: list[FrictionTerm], values: Mapping[str, float]
+) -> Friction | None:
+    found = {each.removeprefix(f"{name}."): values[each] for term in terms for each in term.names}
+    if not found.keys() <= set(FRICTION_PARAMETERS) or found.get("stiction", 0.0) < 0:
+        return None
+    # a joint without described friction is identified with an unsmoothed sign
+    law = model.machine.friction.get(name, Friction(smoothing=0.0))
+    stribeck_velocities = [
+        v for term in terms if isinstance(term, VelocityFriction) for v in term.stribeck_velocities
+    ]
+    try:
+        stribeck = stribeck_velocities[0] if stribeck_velocities else law.stribeck
+        return Friction(smoothing=law.smoothing, stribeck=stribeck, **found)
+    except InputError as error:
+        raise InputError(f"'{name}': {error}, give feasible=True") from None
+
+
+def _nearest_law(
+    terms: list[FrictionTerm], values: Mapping[str, float], speed_range: tuple[float, float]
+) -> tuple[Friction, float]:
+    from scipy.optimize import lsq_linear
+
+    low, high = speed_range
+    v = np.linspace(low, high, _SPEED_COUNT)
+    v = np.concatenate([-v[::-1], v])
+    identified_force = np.zeros_like(v)
+    for term in terms:
+        identified_force += term.steady_forces(v) @ [values[each] for each in term.names]
+    sign, best, lowest_cost = np.sign(v), Friction(), np.inf
+    first = min(max(low, high / 1e3), _MAX_STRIBECK_SHARE * high)
+    for stribeck in np.geomspace(first, _MAX_STRIBECK_SHARE * high, _STRIBECK_GRID_SIZE).tolist():
+        basis = np.column_stack(
+            [sign, np.ones_like(v), v, np.abs(v), sign * np.exp(-((v / stribeck) ** 2))]
+        )
+        bounds = np.array([0.0, -np.inf, 0.0, -np.inf, 0.0]), np.full(5, np.inf)
+        found = lsq_linear(basis, identified_force, bounds)
+        if found.cost < lowest_cost:
+            lowest_cost = found.cost
+            max_deviation = float(np.abs(basis @ found.x - identified_force).max())
+            coulomb, offset, viscous, viscous_offset, stiction = np.round(found.x, 12).tolist()
+            stiction_parameters = {"stiction": stiction, "stribeck": stribeck} if stiction else {}
+            best = Friction(coulomb, offset, viscous, viscous_offset, 0.0, **stiction_parameters)
+    return best, max_deviation
+
+
+def divide_locked_bodies(
+    machine: Machine, parameters: Array, unlocked_machine: Machine
+) -> dict[str, Array]:
+    """Divide the parameters of bodies with locked joints among their links, (10,) each.
+
+    For a body with the pseudo-inertia P (`pseudo_inertia`) that consists of links with the
+    descriptions D_k, whose sum is D, link k gets
+
+        P_k = T D_k T^T,   T = L L_D^-1,   P = L L^T,  D = L_D L_D^T,
+
+    all in the frame of the body's joint: the sum of the links is P, each link is feasible if its
+    description is, and P = D gives the descriptions. Rods and plates without thickness are
+    thickened. Links that locks fix to the ground are unchanged.
+
+    Args:
+        machine: Machine with locked joints.
+        parameters: (10 nb,) parameters of its bodies.
+        unlocked_machine: The machine without locked joints.
+
+    Raises:
+        InputError: A body is not feasible.
+    """
+    names = body_names(unlocked_machine)
+    described = Dynamics(unlocked_machine).parameters[: 10 * len(names)].reshape(-1, 10)
+    links_by_body: dict[int, list[tuple[str, Array, Array]]] = {}
+    out = {}
+    for name, body in zip(names, described, strict=True):
+        frame = machine.model.frames[machine.frame(name)]
+        A = frame.placement.homogeneous  # the pseudo-inertia about the body's joint is A P A^T
+        if frame.parentJoint == 0:
+            out[name] = body
+            continue
+        P = pseudo_inertia(body)
+        units = np.sqrt(np.maximum(np.diag(P), np.finfo(float).tiny))
+        if np.linalg.eigvalsh(P / np.outer(units, units))[0] <= _FLATNESS_TOLERANCE:
+            P = pseudo_inertia(thicken_body(body))
+        links_by_body.setdefault(frame.parentJoint - 1, []).append((name, A, P))
+    for i, links in links_by_body.items():
+        body = parameters[10 * i : 10 * i + 10]
+        if len(links) == 1:
+            out[links[0][0]] = body
+            continue
+        try:
+            L = np.linalg.cholesky(pseudo_inertia(body))
+            D = np.linalg.cholesky(sum(A @ P @ A.T for _, A, P in links))
+        except np.linalg.LinAlgError:
+            listed = ", ".join(f"'{name}'" for name, *_ in links)
+            raise InputError(
+                f"the body of the locked links {listed} is not feasible, give feasible=True"
+            ) from None
+        T = L @ np.linalg.inv(D)
+        for name, A, P in links:
+            link_transform = np.linalg.inv(A) @ T @ A
+            out[name] = body_parameters(link_transform @ P @ link_transform.T)
+    return out
+
+
+def joint_combinations(model: IdentificationModel) -> list[ForceDirection]:
+    """Directions of a model that combine several active joints."""
+    directions = [term.direction for term in model.terms if isinstance(term, DirectionalTerm)]
+    return list({x.name: x for x in directions if x.factors}.values())
+
+
+def add_motor(
+    draft: MachineDraft, direction: ForceDirection, parent: str, law: Friction, inertia: float
+) -> None:
+    """Add the rotor of a motor that turns several joints, and its coupling with them.
+
+    Its joint has the name of the direction and carries rotor inertia and friction. Its angle is
+    that of the motor on the joints' side. Its link has a mass of 1 mg, as bodies need a mass.
+    """
+    name, zero = direction.name, (0.0, 0.0, 0.0)
+    rotor = Inertial(1e-6, zero, zero, (1e-12, 0.0, 0.0, 1e-12, 0.0, 1e-12))
+    robot = draft.urdf_of_link(parent)
+    add_link(robot, Link(f"{name}_rotor", "", rotor))
+    add_joint(robot, Joint(name, "revolute", parent, f"{name}_rotor", "", axis=(0.0, 0.0, 1.0)))
+    turned = {joint: -factor for joint, factor in (direction.factors or {}).items()}
+    draft.data["couplings"].append({"name": name, "joints": {name: 1.0} | turned})
+    draft.data["friction"][name] = friction_data(law)
+    draft.data["rotor_inertia"][name] = inertia

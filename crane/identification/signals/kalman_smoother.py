@@ -86,6 +86,7 @@ def kalman_smooth(y: Array, step: float) -> tuple[Array, Array, float, float]:
     G = np.stack([_backward_recursion(C, F, forced[:, :, i]) for i in range(4)], axis=2)
     covariance[:reach] += np.einsum("kij,jl,kil->ki", G, cov_mu, G)[:, :3]
 
+    release_pages()
     units = (h / step) ** np.arange(3)
     sigma = math.sqrt(variance)
     states *= units
@@ -134,7 +135,7 @@ def likelihood(y: Array, h: float) -> tuple[float, Array, Array, float]:
         rows = np.vstack([stacked_factor, np.column_stack([U, free[k]])])
         stacked_factor = np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)
     R, rest = stacked_factor[:4, :4], stacked_factor[4:, 4]
-    mu = np.asarray(np.linalg.solve(R, stacked_factor[:4, 4]), dtype=np.float64)
+    mu = solve_linear(R, stacked_factor[:4, 4])
     squares = max(float(free[reach:] @ free[reach:] + rest @ rest), float(np.finfo(float).tiny))
     freedom = len(y) - 4
     cost = freedom * math.log(squares) + 2 * np.linalg.slogdet(R)[1] - 12 * math.log(h)

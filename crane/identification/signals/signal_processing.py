@@ -1,18 +1,23 @@
 """Derivatives, filters, resampling and decimation of recorded signals."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from crane.common.errors import InputError, RecordingError, check_name
 from crane.common.one_line_repr import OneLineRepr
+from crane.common.progress import Progress, ignore_progress
 from crane.common.samples import Array, as_number
-from crane.common.scratch_arrays import empty_array, release_pages
+from crane.common.scratch_arrays import (
+    BLOCK_SIZE,
+    MIN_FILE_ELEMENTS,
+    compute_in_blocks,
+    empty_array,
+    release_pages,
+)
 from crane.identification.signals.kalman_smoother import kalman_smooth
 
-Progress = Callable[[float], None]
 METHODS = ("kalman", "lowpass")
 _MIN_SAMPLES = 50  # samples
 _MAX_GAP = 5.0  # steps
@@ -21,6 +26,7 @@ _STEP_TOLERANCE = 1e-3  # steps, by which one may differ from the others
 # Blackman and Harris, about its middle
 _WINDOW_COEFFICIENTS = np.array([0.35875, 0.48829, 0.14128, 0.01168])
 _WINDOW_LENGTH = 1.3332  # over 1 / cutoff
+_FILTER_MEMORY = 16.0  # over 1 / cutoff, after which the low-pass has forgotten 1 - 1e-16
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -78,7 +84,7 @@ def differentiate(
     q: Array,
     method: str = "kalman",
     cutoff: float | None = None,
-    progress: Progress | None = None,
+    progress: Progress = ignore_progress,
 ) -> Derivatives:
     """Velocities and accelerations from measured coordinates.
 
@@ -112,8 +118,7 @@ def differentiate(
         std_v[:, i], std_a[:, i] = std.T[1:]
         del states, std
         release_pages()
-        if progress is not None:
-            progress((i + 1) / q.shape[1])
+        progress((i + 1) / q.shape[1])
     return Derivatives(position, v, a, std_v, std_a, noise, half)
 
 
@@ -126,7 +131,8 @@ def sampling_step(time: Array) -> float:
     if len(time) < _MIN_SAMPLES:
         raise RecordingError(f"{len(time)} samples are too few, record at least {_MIN_SAMPLES}")
     step = (time[-1] - time[0]) / (len(time) - 1)
-    deviation = np.abs(time - (time[0] + step * np.arange(len(time))))
+    deviation = np.linspace(time[0], time[-1], len(time))
+    np.abs(np.subtract(deviation, time, out=deviation), out=deviation)
     if not deviation.max() <= _MAX_JITTER * step:
         at = int(deviation.argmax())
         raise RecordingError(
@@ -180,7 +186,8 @@ def check_gaps(time: Array) -> None:
 def low_pass(time: Array, x: Array, cutoff: float, order: int = 4) -> Array:
     """Zero-phase Butterworth low-pass of x (N, ...), forwards and backwards.
 
-    The amplitude at the frequency f is 1 / (1 + (f/cutoff)^(2 order)), 1/2 at the cutoff [Hz].
+    The amplitude at the frequency f is 1 / (1 + (f/cutoff)^(2 order)), 1/2 at the cutoff [Hz]. A
+    long series is filtered in blocks that overlap by the memory of the filter.
 
     Raises:
         InputError: The cutoff is not below half of the sampling frequency.
@@ -190,7 +197,16 @@ def low_pass(time: Array, x: Array, cutoff: float, order: int = 4) -> Array:
     step = sampling_step(time)
     if not 0 < cutoff < 0.5 / step:
         raise InputError(f"cutoff is {cutoff:g} Hz, give one between 0 and {0.5 / step:g} Hz")
-    return np.asarray(sosfiltfilt(butter(order, cutoff, output="sos", fs=1 / step), x, axis=0))
+    sections = butter(order, cutoff, output="sos", fs=1 / step)
+    reach = math.ceil(_FILTER_MEMORY / (cutoff * step))
+    if np.size(x) < MIN_FILE_ELEMENTS or x.ndim > 2 or reach > BLOCK_SIZE:
+        return np.asarray(sosfiltfilt(sections, x, axis=0))
+    return compute_in_blocks(
+        lambda part: sosfiltfilt(
+            sections, x[max(0, part.start - reach) : part.stop + reach], axis=0
+        )[min(part.start, reach) :][: part.stop - part.start].reshape(-1, x[0].size),
+        len(x),
+    ).reshape(x.shape, order="F")
 
 
 def filter_kernel(step: float, cutoff: float) -> Array:
@@ -207,7 +223,7 @@ def filter_kernel(step: float, cutoff: float) -> Array:
     n = math.ceil(0.5 * length) - 1
     phase = 2 * math.pi * np.arange(-n, n + 1.0) / length
     weights = np.cos(np.outer(phase, np.arange(4.0))) @ _WINDOW_COEFFICIENTS
-    return np.asarray(weights / weights.sum())
+    return weights / weights.sum()
 
 
 def average_periods(time: Array, x: Array, period: float) -> tuple[Array, Array, Array]:
@@ -296,6 +312,6 @@ def _weighted_means(x: Array, weights: Array, decimation: int) -> Array:
     def convolved(x: Array) -> Array:
         edges = [(lead, reach), *[(0, 0)] * (x.ndim - 1)]
         whole = upfirdn(weights, np.pad(x, edges), down=decimation, axis=0)
-        return np.asarray(whole[kept_samples][: -(-count // decimation)])
+        return whole[kept_samples][: -(-count // decimation)]
 
     return convolved(x) / convolved(np.ones(count)).reshape(-1, *[1] * (x.ndim - 1))

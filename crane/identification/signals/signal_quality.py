@@ -1,13 +1,15 @@
-"""Outliers, spectral lines and steady samples of recorded signals."""
+"""Quality of recorded signals: outliers, spectral lines, delays, steady samples, rejection."""
 
 import math
+import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from crane.common.errors import InputError, RecordingError
-from crane.common.samples import Array, as_number
-from crane.common.scratch_arrays import BLOCK_SIZE
+from crane.common.errors import CraneWarning, InputError, RecordingError
+from crane.common.samples import Array, as_number, true_runs
+from crane.common.scratch_arrays import BLOCK_SIZE, release_pages
 from crane.identification.signals.signal_processing import low_pass, sampling_step
 
 _SEGMENT_COUNT = 8
@@ -26,6 +28,8 @@ _MAD_TO_STD = 1.482602218505602
 _MAX_CHANGE = 0.02  # largest change relative to the range of a signal
 _MIN_PERIODS = 3  # least number of periods of a ringing
 _MAX_RESIDUAL_SHARE = 0.5  # largest share of the squares that a sinusoid leaves
+_CORRELATION_TOLERANCE = 0.01  # of a correlation
+_MAX_DELAY = 1.0  # [s] longest delay of the search
 
 
 def spectral_edge_frequency(x: Array, step: float, share: float = 0.995) -> float:
@@ -38,6 +42,7 @@ def spectral_edge_frequency(x: Array, step: float, share: float = 0.995) -> floa
     """
     edges = []
     for column in filter(np.ptp, x.T):
+        release_pages()
         windowed = column - column.mean()
         windowed /= max(column.std(), 1e-300)
         phase = np.linspace(0.0, 2 * np.pi, len(column), endpoint=False)
@@ -158,6 +163,51 @@ def _outlier_runs(x: Array, length: int, noise: float) -> np.ndarray:
     return found
 
 
+def signal_delay(time: Array, one: Array, other: Array) -> float:
+    """Delay [s] of the second signal (N,) with respect to the first, at most 1 s.
+
+    It is the maximum of the correlation of the overlapping parts, refined by a parabola.
+    """
+    step = sampling_step(time)
+    one, other = one - one.mean(), other - other.mean()
+    shifts = np.arange(-(reach := min(round(_MAX_DELAY / step), len(time) // 4)), reach + 1)
+    products = _products(one, other, reach)
+    first, second = (np.append(0, np.cumsum(x**2)) for x in (one, other))
+    low, high = np.maximum(shifts, 0), len(time) + np.minimum(shifts, 0)
+    energy = (first[high - shifts] - first[low - shifts]) * (second[high] - second[low])
+    correlation = products / np.sqrt(np.maximum(energy, 1e-12 * first[-1] * second[-1] + 1e-300))
+    # the shortest of equal maxima, as for periodic signals
+    best = np.flatnonzero(correlation >= correlation.max() - _CORRELATION_TOLERANCE)
+    at = int(np.clip(best[np.abs(shifts[best]).argmin()], 1, 2 * reach - 1))
+    if correlation[at - 1 : at + 2].argmax() != 1:  # not at a local maximum
+        direction = 1 if correlation[at + 1] > correlation[at] else -1
+        while 1 < at < 2 * reach - 1 and correlation[at + direction] > correlation[at]:
+            at += direction
+    before, here, after = correlation[at - 1 : at + 2]
+    curvature = before - 2 * here + after
+    shift = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
+    return float((at - reach + shift) * step)
+
+
+def shifted_correlation(one: Array, other: Array, shift: int) -> float:
+    """Correlation of one signal with another one shifted by a number of samples."""
+    count = len(one) - abs(shift)
+    offsets = max(shift, 0), max(-shift, 0)
+    return float(np.corrcoef(one[offsets[1] :][:count], other[offsets[0] :][:count])[0, 1])
+
+
+def _products(one: Array, other: Array, reach: int) -> Array:
+    """Sums of one_k other_k+s for the shifts s from -reach to reach, in blocks of samples."""
+    from scipy.signal import correlate
+
+    total, padded = np.zeros(2 * reach + 1), np.pad(other, reach)
+    for start in range(0, len(one), BLOCK_SIZE):
+        part = one[start : start + BLOCK_SIZE]
+        window = padded[start : start + len(part) + 2 * reach]
+        total += correlate(window, part, mode="valid", method="fft")
+    return total
+
+
 def steady_samples(
     time: Array, settle: float, *signals: Array, share: float = _MAX_CHANGE, relative: bool = False
 ) -> np.ndarray:
@@ -250,10 +300,9 @@ def steady_means(time: Array, settle: float, signal: Array, answer: Array) -> St
     plain = _steady_mask(time, settle, signal, answer)
     held = _steady_mask(time, settle, signal)
     step = sampling_step(time)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], held, [False]]).astype(int)))
     means, found = plain.copy(), []
     pairs = np.stack([signal, answer])
-    for start, end in edges.reshape(-1, 2).tolist():
+    for start, end in true_runs(held).tolist():
         if plain[start:end].all():
             continue
         period, amplitude = _ringing(time[start:end], answer[start:end], settle)
@@ -307,4 +356,37 @@ def _period_means(time: Array, rows: Array, period: float) -> Array:
     whole = np.concatenate([np.zeros((len(rows), 1)), np.cumsum(steps, axis=1)], axis=1)
     since = np.maximum(time - period, time[0])
     before = np.stack([np.interp(since, time, row) for row in whole])
-    return np.asarray((whole - before) / np.maximum(time - since, time[1] - time[0]))
+    return (whole - before) / np.maximum(time - since, time[1] - time[0])
+
+
+def reject_unless_trusted(
+    text: str, trust: bool, remedy: str = "if the recording is right, trust it (trust)"
+) -> None:
+    """Reject a recording that is probably wrong, or warn if it is trusted.
+
+    Raises:
+        RecordingError: It is not trusted.
+    """
+    if not trust:
+        raise RecordingError(f"{text}; {remedy}")
+    warnings.warn(f"{text}: trusted", CraneWarning, stacklevel=3)
+
+
+def reject_delay(name: str, delay: float, reference: str, trust: bool) -> None:
+    """Reject a column with a delay [s] with respect to another, or warn if it is trusted.
+
+    Raises:
+        RecordingError: It is not trusted.
+    """
+    side = "behind" if delay > 0 else "ahead of"
+    reject_unless_trusted(
+        f"'{name}' is {abs(delay) * 1e3:.0f} ms {side} {reference}, record them with one clock",
+        trust,
+        f"or {shift_remedy({name: delay})}",
+    )
+
+
+def shift_remedy(delays: Mapping[str, float]) -> str:
+    """Text that offers to take delays [s] out of columns."""
+    options = " ".join(f"--shift '{name}={delay:.3g}'" for name, delay in delays.items())
+    return f"take that out ({options}, in Python crane.recordings.shift_columns)"

@@ -160,11 +160,18 @@ def _map_patch(
     return patch
 
 
-def stroke_limits(machine: Machine) -> tuple[Array, Array]:
-    """Limits of the active joints; without limits pi, or the characteristic length, from home."""
+def stroke_limits(machine: Machine, half_turn: float = np.pi) -> tuple[Array, Array]:
+    """Limits of the active joints; without limits half a turn, or the characteristic length, off.
+
+    Args:
+        machine: The machine.
+        half_turn: Distance from home of a missing limit of a joint that turns [rad].
+    """
     home = machine.home[machine.closure.active]
     units = machine.closure.units[machine.closure.active]
-    half_range = np.where(machine.coordinates.is_translation[machine.closure.active], units, np.pi)
+    half_range = np.where(
+        machine.coordinates.is_translation[machine.closure.active], units, half_turn
+    )
     return (
         np.where(np.isfinite(machine.lower), machine.lower, home - half_range),
         np.where(np.isfinite(machine.upper), machine.upper, home + half_range),

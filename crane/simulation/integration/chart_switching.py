@@ -1,14 +1,15 @@
 """Integration through dead centres and branch crossings by a change of the chart."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 
 import numpy as np
 
 from crane.codegen import Tape
 from crane.common.errors import InputError
+from crane.common.progress import ignore_progress
 from crane.common.samples import Array
-from crane.control.control_law import ControlLaw, Controller, ControllerInputs
+from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
 from crane.simulation.integration.charts import (
     MAX_MOTION_PER_STEP,
@@ -22,21 +23,46 @@ from crane.simulation.integration.charts import (
     correct_polynomial,
     extrapolate_states,
     relative_rank,
-    row_layout,
 )
 from crane.simulation.integration.integrators import StickSlipIntegrator
-from crane.simulation.integration.machine_formulas import raise_undetermined
+from crane.simulation.integration.machine_formulas import raise_undetermined, trace_law
 from crane.simulation.integration.python_stepper import IntegrationHaltError, StepProgress
-from crane.simulation.integration.run_notes import RunNotes
 
 _NEARLY_SINGULAR_MARGIN = 1e5  # on the inertia that counts as none, of what explains a halt
 _LIMIT_RELAXATION = np.array([2.0, 0.1])  # factors of the limits where no chart is better
 _MAX_RECENT_STATES = 500
+_MAX_LISTED = 4  # times in a note
+_MOTION_BACK = 1e-3  # of the fastest joint, coordinate units: difference of determinants
 _REPEATED_STEPS = 4 * (NODES_BEFORE + STEPS_BEFORE)  # at least, before a crossing
 _MAX_SHARE = 2  # of steps that locate a crossing in an interval of outputs
 _CONFIGURATION_TOLERANCE = 1e-6  # between predicted and closed configuration, coordinate units
 # least ratios of condition numbers: at a dead centre, and of a chart that is tried after a halt
 _DEAD_CENTRE_IMPROVEMENT, _HALT_IMPROVEMENT = 10.0, 1.5
+
+
+class RunNotes:
+    """Notes about a run; those of equal words are one, with their times and their number."""
+
+    def __init__(self) -> None:
+        self._times: dict[tuple[str, str], list[float]] = {}
+
+    def add(self, time: float, before: str, after: str) -> None:
+        """Note what happens at a time [s], which stands between two parts of the text."""
+        self._times.setdefault((before, after), []).append(time)
+
+    def __iter__(self) -> Iterator[str]:
+        """The texts, in the order in which they were first noted."""
+        for (before, after), times in self._times.items():
+            yield f"{before}{_format_times(times)}{after}"
+
+
+def _format_times(times: list[float]) -> str:
+    """Text such as "at t = 1.2 s", or "at t = 1.2, 2.4, ..., 9.6 s (8 times)"."""
+    listed = [f"{time:.4g}" for time in times]
+    if len(listed) > _MAX_LISTED:
+        listed = [*listed[: _MAX_LISTED - 1], "...", listed[-1]]
+    count = f" ({len(times)} times)" if len(times) > 1 else ""
+    return f"at t = {', '.join(listed)} s{count}"
 
 
 class ChartSwitchingIntegrator:
@@ -47,8 +73,6 @@ class ChartSwitchingIntegrator:
 
     Args:
         chart: The machine in the coordinates of the user.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
         make_integrator: Creates the integrator of a chart.
 
     Attributes:
@@ -56,25 +80,19 @@ class ChartSwitchingIntegrator:
         notes: Notes for the user about the motion.
     """
 
-    def __init__(
-        self,
-        chart: Chart,
-        control: Controller,
-        controller_state_count: int,
-        make_integrator: Callable[[Chart], StickSlipIntegrator],
-    ):
-        self._make_integrator, self._control = make_integrator, control
+    def __init__(self, chart: Chart, make_integrator: Callable[[Chart], StickSlipIntegrator]):
+        self._make_integrator = make_integrator
         self._chart, self._integrator = chart, make_integrator(chart)
         self._chart_limits = chart.chart_limits
         self._known_integrators = [(chart, self._integrator)]
-        self._row_layout = row_layout(chart.machine, control, controller_state_count)
+        self._row_layout = chart.row_layout
         self._segment_start = self.done = 0
-        self._recent_states = np.zeros((0, self._row_layout.start_index("tau")))
+        self._recent_states = np.zeros((0, chart.state_layout.size))
         self.notes = RunNotes()
         self._orientation, self._has_passed_dead_centre = 1.0, False
 
     def run(
-        self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None
+        self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress
     ) -> None:
         """Integrate from each time to the next; see `StickSlipIntegrator.run` for arguments.
 
@@ -130,11 +148,11 @@ class ChartSwitchingIntegrator:
         )
 
     def _progress_from(self, first: int, progress: StepProgress) -> StepProgress:
-        return None if progress is None else lambda done: progress(first + done)
+        return lambda done: progress(first + done)
 
     def _switch_chart(self, time: float, state: Array, halt: IntegrationHaltError | None) -> bool:
         """Change to a better chart and transform the state; returns whether there is one."""
-        at = self._row_layout.view(np.resize(state, self._row_layout.size))
+        at = self._chart.state_layout.view(state.copy())  # a chart keeps its configuration
         chart, nq = self._chart, self._chart.machine.model.nv
         better_chart = chart.find_better_chart(
             at.q, MIN_IMPROVEMENT if halt is None else _HALT_IMPROVEMENT
@@ -146,14 +164,12 @@ class ChartSwitchingIntegrator:
                 halt is not None
                 and chart.find_better_chart(at.q, _DEAD_CENTRE_IMPROVEMENT) is not None
             ):
-                active = better_chart.machine.closure.active
-                left = np.setdiff1d(chart.machine.closure.active, active)
-                names = " and ".join(f"'{chart.machine.joints[i]}'" for i in left)
+                names = _joints_left(chart, better_chart)
                 raise IntegrationHaltError(
                     time,
                     at.q[chart.user_columns],
-                    f": {'joints' if len(left) > 1 else 'joint'} {names} at a dead centre, where "
-                    "inverse dynamics is undefined",
+                    f": {'joints' if len(names) > 1 else 'joint'} {' and '.join(names)} at a dead "
+                    "centre, where inverse dynamics is undefined",
                     ": keep the reference away from there, or drive other joints",
                 )
             return False
@@ -169,7 +185,7 @@ class ChartSwitchingIntegrator:
 
     def _explain_by_mass_matrix(self, time: float, state: Array) -> IntegrationHaltError | None:
         """The halt where the mass matrix of the user is (nearly) singular, else None."""
-        q = self._row_layout.view(np.resize(state, self._row_layout.size)).q
+        q = self._chart.state_layout.view(state).q
         chart = self._known_integrators[0][0]
         error = chart.dynamics.singular_mass_error(q, margin=_NEARLY_SINGULAR_MARGIN)
         if error is None:
@@ -198,10 +214,10 @@ class ChartSwitchingIntegrator:
             self._recent_states,
         )
         machine, now = chart.machine, times[0] + i * step + integrator.offset
-        prediction = self._predict_crossing(now, state, times[0] + (i - 1) * step)
-        if prediction is None:
+        prediction = self._predict_crossing(state)
+        if prediction is None or np.prod(prediction) >= 3.0 * MAX_MOTION_PER_STEP:
             return None
-        crossing, speed = prediction
+        crossing, speed = now + prediction[0], prediction[1]
         share = max(1, int(np.ceil(step * speed / MAX_MOTION_PER_STEP)))
         stride = max(
             1,
@@ -231,9 +247,7 @@ class ChartSwitchingIntegrator:
             path = extrapolate_states(
                 instants[nodes], fine_rows[nodes, :size], integrator.python_stepper.observe
             )
-            q = self._row_layout.view(
-                np.resize(path.state_at(behind_time), self._row_layout.size)
-            ).q
+            q = chart.state_layout.view(path.state_at(behind_time)).q
             crossed_chart = chart.chart_with_columns(q, machine.closure.active)
             units = machine.closure.units
             if (
@@ -266,14 +280,17 @@ class ChartSwitchingIntegrator:
             rows: See `run`.
 
         Returns:
-            Index of the next instant; None where instants are close already, or those before are
-            unknown.
+            Index of the next instant; None where there is no crossing ahead, instants are close
+            already, or those before are unknown.
         """
-        share = int(np.ceil(step * self._speed(state) / MAX_MOTION_PER_STEP))
-        needed = int(np.ceil(_REPEATED_STEPS / max(share, 1)))
-        before = min(max(needed, 2), len(self._recent_states))
-        if share <= _MAX_SHARE or not before:
+        prediction = self._predict_crossing(state)
+        if prediction is None or prediction[0] > 2.0 * step or not len(self._recent_states):
             return None
+        share = int(np.ceil(step * prediction[1] / MAX_MOTION_PER_STEP))
+        if share <= _MAX_SHARE:
+            return None
+        needed = int(np.ceil(_REPEATED_STEPS / share))
+        before = min(max(needed, 2), len(self._recent_states))
         state[:], self._integrator.offset = self._recent_states[-before], 0.0
         end = min(i + 1, len(times))
         fine_step, count = step / share, (end - i + before) * share
@@ -281,7 +298,7 @@ class ChartSwitchingIntegrator:
         fine_rows = np.empty((count, rows.shape[1]))
         self._recent_states = self._recent_states[:0]
         try:
-            self.run(instants, state, fine_step, fine_rows)
+            self.run(instants, state, fine_step, fine_rows, ignore_progress)
         finally:
             self.done = self._segment_start = i
         rows[i:end] = fine_rows[before * share :: share]
@@ -291,46 +308,31 @@ class ChartSwitchingIntegrator:
         self._recent_states = self._recent_states[-share:][: min(known, 1)]
         return end
 
-    def _speed(self, state: Array) -> float:
-        """Speed of the fastest joint [rad/s], [characteristic lengths per s]."""
-        at = self._row_layout.view(np.resize(state, self._row_layout.size))
-        closure = self._chart.machine.closure
-        return float(np.abs(closure.gamma(at.q) @ at.v_a / closure.units).max())
+    def _predict_crossing(self, state: Array) -> tuple[float, float] | None:
+        """Time from a state to a branch crossing ahead, and speed of the fastest joint; else None.
 
-    def _predict_crossing(
-        self, now: float, state: Array, last_time: float
-    ) -> tuple[float, float] | None:
-        """Time of a branch crossing ahead of a state, and speed of the fastest joint; else None.
-
-        Args:
-            now: Time of the state [s].
-            state: The state.
-            last_time: Time of the last recent state [s].
+        By the least determinant of the loops at the state and a little before.
         """
         chart, closure = self._chart, self._chart.machine.closure
-        if not closure.is_compiled or not len(self._recent_states):
+        if not (closure.is_compiled and np.isfinite(state).all()):
             return None
-        at, last = (
-            self._row_layout.view(np.resize(one, self._row_layout.size))
-            for one in (state, self._recent_states[-1])
-        )
-        determinant, last_determinant = (
-            closure.compiled_closure.least_determinant(at.q),
-            closure.compiled_closure.least_determinant(last.q),
-        )
-        if not (now > last_time and 0.0 < determinant < last_determinant):
+        at = chart.state_layout.view(state)
+        v = closure.gamma(at.q) @ at.v_a
+        speed = float(np.abs(v / closure.units).max())
+        if not speed:
             return None
-        time_to_crossing = determinant / (last_determinant - determinant) * (now - last_time)
-        v, speed = closure.gamma(at.q) @ at.v_a, self._speed(state)
+        time_back = _MOTION_BACK / speed
+        determinant, determinant_before = (
+            closure.compiled_closure.least_determinant(q) for q in (at.q, at.q - time_back * v)
+        )
+        if not 0.0 < determinant < determinant_before:
+            return None
+        time = determinant / (determinant_before - determinant) * time_back
         home = self._known_integrators[0][0].machine
-        is_singular = relative_rank(
-            chart.machine, at.q + time_to_crossing * v
-        ) < MAX_RELATIVE_RANK * relative_rank(home, home.home)
-        return (
-            (now + time_to_crossing, speed)
-            if is_singular and time_to_crossing * speed < 3.0 * MAX_MOTION_PER_STEP
-            else None
+        is_singular = relative_rank(chart.machine, at.q + time * v) < (
+            MAX_RELATIVE_RANK * relative_rank(home, home.home)
         )
+        return (time, speed) if is_singular else None
 
     def _record_crossing(
         self,
@@ -408,16 +410,11 @@ class ChartSwitchingIntegrator:
             self._orientation * np.linalg.slogdet(velocity_maps)[0] < 0
         )
         if len(behind_indices) and not self._has_passed_dead_centre:
-            self._has_passed_dead_centre, user_machine = (
-                True,
-                self._known_integrators[0][0].machine,
-            )
-            left_columns = np.setdiff1d(user_machine.closure.active, chart.machine.closure.active)
-            names = " and ".join(f"'{user_machine.joints[i]}'" for i in left_columns)
-            verb = "pass" if len(left_columns) > 1 else "passes"
+            self._has_passed_dead_centre = True
+            names = _joints_left(self._known_integrators[0][0], chart)
             self.notes.add(
                 float(times[behind_indices[0]]),
-                f"{names} {verb} a dead centre ",
+                f"{' and '.join(names)} {'pass' if len(names) > 1 else 'passes'} a dead centre ",
                 ": from there on active coordinates alone do not determine the configuration, "
                 "take passive joints with them",
             )
@@ -429,17 +426,17 @@ class ChartSwitchingIntegrator:
     @property
     def _uses_inverse_dynamics(self) -> bool:
         """Whether the controller uses inverse dynamics or gravity in coordinates of the user."""
-        control, n, tape = self._control, len(self._chart.user_columns), Tape()
+        control = self._chart.control
         if isinstance(control, ValveDrive) or not isinstance(control, ControlLaw):
             return False
-        columns = control.references(np.zeros(1)).shape[1]
-        sizes = n, n, self._row_layout.parts["controller"], len(control.settings), columns
-        q_a, v_a, state, settings, reference = (
-            tape.load_vector(i, 0, size) for i, size in enumerate(sizes)
-        )
-        functions = raise_undetermined, raise_undetermined
         try:
-            control.law(ControllerInputs(q_a, v_a, state, settings, reference, *functions))
+            trace_law(self._chart, Tape(), (raise_undetermined, raise_undetermined))
         except InputError:
             return True
         return False
+
+
+def _joints_left(chart: Chart, better_chart: Chart) -> list[str]:
+    """Names in quotes of the independent coordinates of a chart that are not those of another."""
+    left = np.setdiff1d(chart.machine.closure.active, better_chart.machine.closure.active)
+    return [f"'{chart.machine.joints[i]}'" for i in left]

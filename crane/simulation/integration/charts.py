@@ -18,6 +18,7 @@ their rates at instants before the crossing, and then also behind it, are integr
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -50,26 +51,34 @@ _RANK_TOLERANCE = 1e-12  # share of the largest singular value that counts as ze
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """A machine in independent coordinates, with the coordinates of its user and controller.
+    """A controlled machine in independent coordinates, with those of its user and controller.
 
     Attributes:
         dynamics: Dynamics of the machine in the coordinates of the chart.
+        control: Its `Controller`; a `ControlLaw` where it is traced.
+        controller_state_count: Number of states of the controller.
         user_columns: (n,) columns of the active joints of the user.
         stick_slip: Stick-slip modes of the joints, shared by all charts of a run.
         free_joints: Free joints among the active joints of the user.
     """
 
     dynamics: Dynamics
+    control: Any
+    controller_state_count: int
     user_columns: Indices
     stick_slip: StickSlipModes
     free_joints: tuple[str, ...]
 
     @classmethod
-    def from_dynamics(cls, dynamics: Dynamics) -> "Chart":
+    def from_dynamics(
+        cls, dynamics: Dynamics, control: Controller, controller_state_count: int
+    ) -> "Chart":
         """The chart of the coordinates of the user."""
         machine = dynamics.machine
         return cls(
             dynamics,
+            control,
+            controller_state_count,
             machine.closure.active,
             StickSlipModes(machine, dynamics.forces.stick_slip_columns),
             machine.free,
@@ -242,50 +251,48 @@ class Chart:
         # the circuit acts in any coordinates
         machine = replace(machine, hydraulics=self.machine.hydraulics)
         dynamics = Dynamics(machine, self.dynamics.formulation, self.dynamics.backend)
-        return Chart(dynamics, self.user_columns, self.stick_slip, self.free_joints)
+        return replace(self, dynamics=dynamics)
 
+    @cached_property
+    def state_layout(self) -> Layout:
+        """Layout of the state: q (nv), v_a (n), contacts, controller, work, dissipated [J].
 
-def state_layout(machine: Machine, controller_state_count: int) -> Layout:
-    """Layout of the state: q (nv), v_a (n), contacts, controller, work, dissipated [J].
+        `contacts` are the states of external forces: tangential deformations of tyres. `work` is
+        that of the active forces, then of each external force.
+        """
+        machine = self.machine
+        return Layout(
+            q=machine.model.nv,
+            v_a=len(machine.active),
+            contacts=state_count(machine.external_forces),
+            controller=self.controller_state_count,
+            work=1 + len(machine.external_forces),
+            dissipated=1,
+        )
 
-    `contacts` are the states of external forces: tangential deformations of tyres. `work` is that
-    of the active forces, then of each external force.
-    """
-    return Layout(
-        q=machine.model.nv,
-        v_a=len(machine.active),
-        contacts=state_count(machine.external_forces),
-        controller=controller_state_count,
-        work=1 + len(machine.external_forces),
-        dissipated=1,
-    )
+    @cached_property
+    def output_layout(self) -> Layout:
+        """Layout of the outputs.
 
+        They are tau (n), friction (n), kinetic and potential energy [J], friction of joints at
+        rest, wrench and channels of each external force, accelerations of all joints where the
+        machine has supports, and channels of circuits.
+        """
+        machine, n = self.machine, len(self.machine.active)
+        external_force_outputs = sum(
+            len(WRENCH_COMPONENTS) + len(force.channels) for force in machine.external_forces
+        )
+        return Layout(
+            tau=n, friction=n, kinetic=1, potential=1,
+            friction_at_rest=len(find_stick_slip_columns(machine)),
+            external=external_force_outputs, a=machine.model.nv if machine.supports else 0,
+            channels=len(self.control.channels) if isinstance(self.control, ValveDrive) else 0,
+        )  # fmt: skip
 
-def output_layout(machine: Machine, control: Controller) -> Layout:
-    """Layout of the outputs.
-
-    They are tau (n), friction (n), kinetic and potential energy [J], friction of joints at rest,
-    wrench and channels of each external force, accelerations of all joints where the machine has
-    supports, and channels of circuits.
-    """
-    n, rest = len(machine.active), len(find_stick_slip_columns(machine))
-    channels = len(control.channels) if isinstance(control, ValveDrive) else 0
-    external_force_outputs = sum(
-        len(WRENCH_COMPONENTS) + len(force.channels) for force in machine.external_forces
-    )
-    return Layout(
-        tau=n, friction=n, kinetic=1, potential=1, friction_at_rest=rest,
-        external=external_force_outputs, a=machine.model.nv if machine.supports else 0,
-        channels=channels,
-    )  # fmt: skip
-
-
-def row_layout(machine: Machine, control: Controller, controller_state_count: int) -> Layout:
-    """Layout of a recorded row: the state, then the outputs."""
-    return Layout(
-        **state_layout(machine, controller_state_count).parts,
-        **output_layout(machine, control).parts,
-    )
+    @cached_property
+    def row_layout(self) -> Layout:
+        """Layout of a recorded row: the state, then the outputs."""
+        return Layout(**self.state_layout.parts, **self.output_layout.parts)
 
 
 NODES_BEFORE = 7  # nodes before the crossing

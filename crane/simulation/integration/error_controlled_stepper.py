@@ -7,7 +7,6 @@ coefficients are those of scipy.
 
 from abc import abstractmethod
 from collections.abc import Hashable, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -24,7 +23,6 @@ from crane.codegen.symbolic import (
     subtract_vectors,
 )
 from crane.common.samples import Array
-from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
 from crane.dynamics.external_forces import state_count
 from crane.machine.machine import Machine
@@ -53,7 +51,7 @@ def characteristic_energy(machine: Machine) -> float:
     return float(mass * (closure.characteristic_length / closure.characteristic_time) ** 2)
 
 
-def error_tolerances(chart: Chart, controller_state_count: int, tolerance: float) -> Array:
+def error_tolerances(chart: Chart, tolerance: float) -> Array:
     """Absolute tolerances (k,) of all states, and then the relative tolerance.
 
     Those of work and dissipation, which do not act back, are larger by `ENERGY_TOLERANCE_FACTOR`.
@@ -68,7 +66,7 @@ def error_tolerances(chart: Chart, controller_state_count: int, tolerance: float
         state_count(chart.machine.external_forces), closure.characteristic_length
     )
     scales = np.concatenate(
-        [closure.units, rates, contact_scales, np.ones(controller_state_count), energies]
+        [closure.units, rates, contact_scales, np.ones(chart.controller_state_count), energies]
     )
     return tolerance * np.append(MIN_SCALE * scales, 1.0)
 
@@ -93,8 +91,6 @@ class ErrorControlledStepper(MachineCodeStepper):
 
     Args:
         chart: The machine in a chart.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
         method: Further properties on which the code depends.
         fold_settings: Whether zeros and ones among the settings of the controller become part of
             the code.
@@ -107,19 +103,17 @@ class ErrorControlledStepper(MachineCodeStepper):
     def __init__(
         self,
         chart: Chart,
-        control: ControlLaw,
-        controller_state_count: int,
         method: tuple[Hashable, ...],
         fold_settings: bool,
         tolerance: Array,
     ):
-        self._steps_end_at_outputs = isinstance(control, ValveDrive)
-        super().__init__(chart, control, controller_state_count, method, fold_settings)
+        self._steps_end_at_outputs = isinstance(chart.control, ValveDrive)
+        super().__init__(chart, method, fold_settings)
         self.tolerance = np.ascontiguousarray(tolerance)
         self._step_state = np.zeros(6)
         # of the controller, or its reference, and of external forces [s]
-        sources: list[Any] = [x for x in (control, control.reference) if hasattr(x, "breaks")][:1]
-        breaks = [x.breaks() for x in (*chart.machine.external_forces, *sources)]
+        sources = [x for x in (self._control, self._control.reference) if hasattr(x, "breaks")]
+        breaks = [x.breaks() for x in (*chart.machine.external_forces, *sources[:1])]
         self._break_times = np.unique(np.concatenate([*breaks, [np.inf]]))
 
     def restart(self) -> None:
@@ -322,23 +316,14 @@ class DormandPrinceStepper(ErrorControlledStepper):
 
     Args:
         chart: The machine in a chart.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
         tolerance: Error of a step, relative to the size of the state.
 
     Raises:
         FormulaTooLongError: The formulas are too long to be compiled.
     """
 
-    def __init__(
-        self,
-        chart: Chart,
-        control: ControlLaw,
-        controller_state_count: int,
-        tolerance: float = DORMAND_PRINCE_TOLERANCE,
-    ):
-        errors = error_tolerances(chart, controller_state_count, tolerance)
-        super().__init__(chart, control, controller_state_count, ("explicit",), False, errors)
+    def __init__(self, chart: Chart, tolerance: float = DORMAND_PRINCE_TOLERANCE):
+        super().__init__(chart, ("explicit",), False, error_tolerances(chart, tolerance))
 
     def _add_method(self, program: Program) -> None:
         """stage1(s, k, h) to stage11, extra0 to extra2; finish(constants, s, k, h, tol); dense."""

@@ -8,10 +8,11 @@ import numpy as np
 
 from crane.codegen import FormulaTooLongError
 from crane.common.errors import ClosureError, InputError
+from crane.common.progress import ignore_progress
 from crane.common.samples import Array
-from crane.control.control_law import ControlLaw, Controller
+from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
-from crane.simulation.integration.charts import Chart, row_layout
+from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.error_controlled_stepper import (
     MAX_REFERENCE_SPACING,
     ErrorControlledStepper,
@@ -34,12 +35,10 @@ _MAX_TRANSITIONS = 2000  # stick-slip transitions within an output interval
 class StickSlipIntegrator(ABC):
     """Base class of integrators in one chart.
 
-    A method implements `_advance`, and `_make_step` if its steps have a given size.
+    A method implements `_advance`.
 
     Args:
         chart: The machine in a chart.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
         compiled_method: The compiled method, or None.
 
     Attributes:
@@ -51,14 +50,8 @@ class StickSlipIntegrator(ABC):
 
     _max_transitions = _MAX_TRANSITIONS
 
-    def __init__(
-        self,
-        chart: Chart,
-        control: Controller,
-        controller_state_count: int,
-        compiled_method: MachineCodeStepper | None,
-    ):
-        self.python_stepper = PythonStepper(chart, control, controller_state_count)
+    def __init__(self, chart: Chart, compiled_method: MachineCodeStepper | None):
+        self.python_stepper = PythonStepper(chart)
         self.done = self.next_instant = 0
         self.offset = self._first = self._step = 0.0
         self._stick_slip, self._compiled_method = chart.stick_slip, compiled_method
@@ -71,7 +64,12 @@ class StickSlipIntegrator(ABC):
             self._compiled_method.bounds[3:5] = limits
 
     def run(
-        self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None
+        self,
+        times: Array,
+        state: Array,
+        step: float,
+        rows: Array,
+        progress: StepProgress = ignore_progress,
     ) -> int:
         """Integrate from each of the times to the next, while the chart is regular.
 
@@ -97,8 +95,7 @@ class StickSlipIntegrator(ABC):
                 break
             if not self.offset < -_TIME_TOLERANCE * step:  # within rounding errors
                 self.offset = 0.0
-            if progress is not None:
-                progress(self.done)
+            progress(self.done)
         return self.next_instant
 
     @abstractmethod
@@ -144,13 +141,6 @@ class StickSlipIntegrator(ABC):
         """
         return 0.0
 
-    def _make_step(self, time: float, state: Array, length: float) -> tuple[Array, float]:
-        """State and margin after one step of a given size.
-
-        Methods that locate events within their steps do not need it.
-        """
-        raise NotImplementedError
-
     def _outputs_and_margin(self, time: float, state: Array) -> tuple[Array, float]:
         if self._compiled_method is not None:
             return self._compiled_method.observe(time, state)
@@ -179,40 +169,6 @@ class StickSlipIntegrator(ABC):
             self._compiled_method.adopt_modes()
         self._stick_slip.record_transition(time, state)
 
-    def _advance_to_transition(
-        self, time: float, state: Array, length: float, step: float
-    ) -> float:
-        """Integrate to a stick-slip transition within a step.
-
-        Args:
-            time: [s].
-            state: State at this time, replaced by that at the transition with the new modes.
-            length: Step size [s].
-            step: Output interval [s].
-
-        Returns:
-            Time from the start of the step to the transition [s].
-
-        Raises:
-            IntegrationHaltError: There are too many transitions.
-        """
-        self._count_transition(time, state, step)
-        margin_before, (_, margin_behind) = (
-            self._outputs_and_margin(time, state)[1],
-            self._make_step(time, state, length),
-        )
-        if margin_before < -EVENT_TOLERANCE:
-            time_offset = 0.0
-        else:
-            time_offset, state[:] = locate_event(
-                lambda part: self._make_step(time, state, part),
-                margin_before,
-                length,
-                margin_behind,
-            )
-        self._find_modes(time + time_offset, state)
-        return time_offset
-
     def _count_transition(self, time: float, state: Array, step: float) -> None:
         """Count a stick-slip transition.
 
@@ -232,7 +188,7 @@ class StickSlipIntegrator(ABC):
             )
 
 
-_STEPS_PER_REPORT = 5000  # between reports of progress
+_STEPS_PER_REPORT = 1000  # between reports of progress; their rows stay in the cache
 # steps before and after a halt that are repeated with finer steps
 _STEPS_BEFORE_HALT, _STEPS_AFTER_HALT = 40, 20
 _REFINEMENT_FACTORS = (2, 8)  # of finer steps
@@ -244,18 +200,17 @@ class FixedStepIntegrator(StickSlipIntegrator):
 
     Args:
         chart: The machine in a chart.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
     """
 
-    def __init__(self, chart: Chart, control: Controller, controller_state_count: int):
+    def __init__(self, chart: Chart):
+        control = chart.control
         self._compiled_stepper: RungeKuttaStepper | None = None
         compiled = not isinstance(control, ValveDrive) and chart.dynamics.backend == "compiled"
         if compiled and chart.machine.has_traceable_forces and isinstance(control, ControlLaw):
             with suppress(FormulaTooLongError):
-                self._compiled_stepper = RungeKuttaStepper(chart, control, controller_state_count)
-        self._row_size = row_layout(chart.machine, control, controller_state_count).size
-        super().__init__(chart, control, controller_state_count, self._compiled_stepper)
+                self._compiled_stepper = RungeKuttaStepper(chart)
+        self._row_size = chart.row_layout.size
+        super().__init__(chart, self._compiled_stepper)
 
     def _advance(
         self,
@@ -302,7 +257,42 @@ class FixedStepIntegrator(StickSlipIntegrator):
             self._find_modes(times[0], state)
         return True
 
+    def _advance_to_transition(
+        self, time: float, state: Array, length: float, step: float
+    ) -> float:
+        """Integrate to a stick-slip transition within a step.
+
+        Args:
+            time: [s].
+            state: State at this time, replaced by that at the transition with the new modes.
+            length: Step size [s].
+            step: Output interval [s].
+
+        Returns:
+            Time from the start of the step to the transition [s].
+
+        Raises:
+            IntegrationHaltError: There are too many transitions.
+        """
+        self._count_transition(time, state, step)
+        margin_before, (_, margin_behind) = (
+            self._outputs_and_margin(time, state)[1],
+            self._make_step(time, state, length),
+        )
+        if margin_before < -EVENT_TOLERANCE:
+            time_offset = 0.0
+        else:
+            time_offset, state[:] = locate_event(
+                lambda part: self._make_step(time, state, part),
+                margin_before,
+                length,
+                margin_behind,
+            )
+        self._find_modes(time + time_offset, state)
+        return time_offset
+
     def _make_step(self, time: float, state: Array, length: float) -> tuple[Array, float]:
+        """State and margin after one step of a given size."""
         if self._compiled_stepper is not None:
             after, row = state.copy(), np.empty((1, self._row_size))
             if self._compiled_stepper.run(np.array([time]), after, length, row):
@@ -350,30 +340,25 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
 
     Args:
         chart: The machine in a chart.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
         stepper_factory: Creates the compiled method.
 
     Raises:
         FormulaTooLongError: The formulas are too long to be compiled.
     """
 
-    def __init__(
-        self,
-        chart: Chart,
-        control: ControlLaw,
-        controller_state_count: int,
-        stepper_factory: Callable[..., ErrorControlledStepper],
-    ):
-        self._stepper = stepper_factory(chart, control, controller_state_count)
-        super().__init__(chart, control, controller_state_count, self._stepper)
-        self._chart, self._period_in_steps = chart, 0
-        self._sampled_drive = (
-            control if isinstance(control, ValveDrive) and control.period else None
-        )
+    def __init__(self, chart: Chart, stepper_factory: Callable[[Chart], ErrorControlledStepper]):
+        self._stepper = stepper_factory(chart)
+        super().__init__(chart, self._stepper)
+        self._chart, self._period_in_steps, drive = chart, 0, chart.control
+        self._sampled_drive = drive if isinstance(drive, ValveDrive) and drive.period else None
 
     def run(
-        self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None
+        self,
+        times: Array,
+        state: Array,
+        step: float,
+        rows: Array,
+        progress: StepProgress = ignore_progress,
     ) -> int:
         """See `StickSlipIntegrator.run`.
 

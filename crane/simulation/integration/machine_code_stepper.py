@@ -14,9 +14,8 @@ from crane.codegen import (
 )
 from crane.codegen.symbolic import add_vectors, scale_vector
 from crane.common.samples import Array
-from crane.control.control_law import ControlLaw
 from crane.dynamics import external_forces
-from crane.simulation.integration.charts import Chart, output_layout, state_layout
+from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.machine_formulas import (
     AT_REST_SUFFIX,
     MachineFormulas,
@@ -48,8 +47,6 @@ class MachineCodeStepper:
 
     Args:
         chart: The machine in a chart.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
         method: Further properties on which the code depends.
         fold_settings: Whether zeros and ones among the settings of the controller become part of
             the code.
@@ -71,15 +68,8 @@ class MachineCodeStepper:
 
     _step_state: Array  # the argument h of the routine `run`, see `StepLoop`
 
-    def __init__(
-        self,
-        chart: Chart,
-        control: ControlLaw,
-        controller_state_count: int,
-        method: tuple,
-        fold_settings: bool,
-    ):
-        machine = chart.machine
+    def __init__(self, chart: Chart, method: tuple, fold_settings: bool):
+        machine, control = chart.machine, chart.control
         self._chart, self._control, self._fold_settings = chart, control, fold_settings
         self.closure_code = machine.closure.compiled_closure
         self._dynamics_constants = chart.dynamics.formula_constants
@@ -94,29 +84,24 @@ class MachineCodeStepper:
             else external_forces.ExternalForceCallback(machine.external_forces)
         )
         self.has_stick_slip = bool(chart.stick_slip.columns)
-        self.state_layout = state_layout(machine, controller_state_count)
-        self.output_layout = output_layout(machine, control)
+        self.state_layout, self.output_layout = chart.state_layout, chart.output_layout
         key = (
             *method,
-            controller_formula_key(
-                control, self.controller_columns, chart, controller_state_count, fold_settings
-            ),
-            controller_state_count,
+            controller_formula_key(chart, fold_settings),
+            chart.controller_state_count,
             bool(machine.supports),
             *chart.formula_key,
         )
-        self._program = machine_program(machine, control, key, self._build)
+        self._program = machine_program(chart, key, self._build)
 
     def _build(self, program: Program) -> None:
-        raise NotImplementedError
+        """Add the formulas and routines."""
 
     def _trace_controlled_machine(self, tape: Tape) -> MachineFormulas:
         """The machine with its controller; references and state are the arguments 3 and 4."""
         references = tape.load_vector(3, 0, self.reference_columns)
         settings = controller_settings(self._control, tape, 2, self._fold_settings)
-        return trace_machine(
-            self._chart, self._control, tape, self.state_layout, 4, references, settings
-        )
+        return trace_machine(self._chart, tape, 4, references, settings)
 
     @property
     def event(self) -> float:
@@ -175,24 +160,19 @@ class MachineCodeStepper:
         return out[layout["outputs"]], float(out[layout.start_index("margin")])
 
 
-_BLOCK_STEPS = 1000  # steps of a call, whose rows stay in the cache until they are copied
-
-
 class RungeKuttaStepper(MachineCodeStepper):
     """Compiled steps of the classical Runge-Kutta method, with a traced controller.
 
     Args:
         chart: The machine in a chart.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
 
     Raises:
         FormulaTooLongError: The formulas are too long to be compiled.
     """
 
-    def __init__(self, chart: Chart, control: ControlLaw, controller_state_count: int):
+    def __init__(self, chart: Chart):
         self._step_state = np.zeros(3)
-        super().__init__(chart, control, controller_state_count, ("rk4",), fold_settings=False)
+        super().__init__(chart, ("rk4",), fold_settings=False)
 
     def _build(self, program: Program) -> None:
         for suffix, with_joints_at_rest in self._rest_variants:
@@ -261,24 +241,15 @@ class RungeKuttaStepper(MachineCodeStepper):
             or at an `event`.
         """
         self._step_state[:] = step, 0.5 * step, 0.0
-        length = min(_BLOCK_STEPS, len(times))
-        half_step_times = times[::length, None] + 0.5 * step * np.arange(2 * length + 1)
-        block_starts = range(0, len(times), length)
-        instants = half_step_times.ravel()[: 2 * len(times) + len(block_starts)]
-        references = reference_samples(self._chart.machine, self._control, instants)
-        out = np.empty((length, rows.shape[1]))
-        arguments = self._common_arguments
-        for i, first in enumerate(block_starts):
-            count = min(length, len(times) - first)
-            done = self._program.call(
-                "run", count, self.closure_code.close_address, *arguments,
-                references[i * half_step_times.shape[1] :], state, out, self._step_state,
-                self.bounds,
-            )  # fmt: skip
-            rows[first : first + done] = out[:done]
-            if done < count:
-                return first + done
-        return len(times)
+        half_steps = times[0] + 0.5 * step * np.arange(2 * len(times) + 1)
+        references = reference_samples(self._chart.machine, self._control, half_steps)
+        out = np.empty((len(times), rows.shape[1]))
+        done = self._program.call(
+            "run", len(times), self.closure_code.close_address, *self._common_arguments,
+            references, state, out, self._step_state, self.bounds,
+        )  # fmt: skip
+        rows[:done] = out[:done]
+        return done
 
     def _add_sum_formulas(self, program: Program) -> None:
         """displaced(s, k, h) = s + h k; finish(geometry, s, k1, ..., k4, h) = s + h/6 (...).

@@ -7,7 +7,6 @@ import numpy as np
 
 from crane.closure.kinematics_formulas import FormulaConstants, wrap_rotation_vector
 from crane.codegen import (
-    Layout,
     LayoutView,
     Program,
     Scalar,
@@ -151,9 +150,7 @@ def raise_undetermined(a_a: Sequence[Scalar] = (), friction: bool = False) -> li
 
 def trace_machine(
     chart: Chart,
-    control: ControlLaw,
     tape: Tape,
-    layout: Layout,
     state_argument: int,
     references: list[Scalar],
     settings: list[Scalar],
@@ -163,9 +160,7 @@ def trace_machine(
 
     Args:
         chart: The machine in a chart.
-        control: Its controller.
         tape: The tape; its arguments 0 and 1 are geometry and constants of the dynamics.
-        layout: Layout of the state.
         state_argument: Number of the argument that holds the state.
         references: References of the controller, then of the external forces.
         settings: Settings of the controller.
@@ -173,7 +168,8 @@ def trace_machine(
             those that remain arguments; those of the machine if not given.
     """
     geometry, pattern = folded_constants or (None, chart.dynamics.constant_pattern)
-    structure, columns = chart.dynamics.formula_structure, reference_count(control)
+    structure, control = chart.dynamics.formula_structure, chart.control
+    columns, layout = reference_count(control), chart.state_layout
     q, kinematics, loops = chart.machine.closure.compiled_closure.trace_kinematics(
         tape, 0, state_argument, geometry
     )
@@ -209,29 +205,49 @@ def wrap_rotations(chart: Chart, state: Sequence[Scalar]) -> list[Scalar]:
     return out
 
 
-def controller_formula_key(
-    control: ControlLaw,
-    reference_columns: int,
+def trace_law(
     chart: Chart,
-    controller_state_count: int,
-    fold_settings: bool,
-) -> Hashable:
+    tape: Tape,
+    functions: tuple[Callable[..., list[Scalar]], Callable[..., list[Scalar]]],
+    fold_settings: bool = False,
+) -> tuple[ControllerInputs, Sequence[Scalar], Sequence[Scalar]]:
+    """Trace a control law without the machine.
+
+    Args:
+        chart: The machine in a chart.
+        tape: The tape; coordinates, velocities, states, settings and references are its arguments.
+        functions: Inverse dynamics and gravity, see `ControllerInputs`.
+        fold_settings: Whether zeros and ones among the settings become part of the formulas.
+
+    Returns:
+        Its inputs, forces (n,), and rates (k,) of its states.
+    """
+    n, control = len(chart.user_columns), chart.control
+    inputs = ControllerInputs(
+        tape.load_vector(0, 0, n),
+        tape.load_vector(1, 0, n),
+        tape.load_vector(2, 0, chart.controller_state_count),
+        controller_settings(control, tape, 3, fold_settings),
+        tape.load_vector(4, 0, reference_count(control)),
+        *functions,
+    )
+    return inputs, *control.law(inputs)
+
+
+def controller_formula_key(chart: Chart, fold_settings: bool) -> Hashable:
     """Formulas of a controller as a key, so that equal ones share their machine code.
 
     The controller is traced without the machine: the results of inverse dynamics and gravity are
     arguments.
 
     Args:
-        control: The controller.
-        reference_columns: Number of its references.
         chart: The machine in a chart.
-        controller_state_count: Number of states of the controller.
         fold_settings: Whether zeros and ones among the settings become part of the formulas.
 
     Raises:
         InputError: The number of forces or rates is wrong, or a free joint gets a force.
     """
-    tape, n = Tape(), len(chart.user_columns)
+    tape, n, control = Tape(), len(chart.user_columns), chart.control
     requested_accelerations: list[Scalar] = []
 
     def inverse(a_a: Sequence[Scalar], friction: bool) -> list[Scalar]:
@@ -239,20 +255,12 @@ def controller_formula_key(
         requested_accelerations.extend([*a_a, float(friction)])
         return forces
 
-    inputs = ControllerInputs(
-        q_a=tape.load_vector(0, 0, n),
-        v_a=tape.load_vector(1, 0, n),
-        state=tape.load_vector(2, 0, controller_state_count),
-        settings=controller_settings(control, tape, 3, fold_settings),
-        reference=tape.load_vector(4, 0, reference_columns),
-        inverse=inverse,
-        gravity=lambda: tape.load_vector(6, 0, n),
-    )
-    tau, rates = control.law(inputs)
-    if (len(tau), len(rates)) != (n, controller_state_count):
+    functions = inverse, lambda: tape.load_vector(6, 0, n)
+    inputs, tau, rates = trace_law(chart, tape, functions, fold_settings)
+    if (len(tau), len(rates)) != (n, chart.controller_state_count):
         raise InputError(
             f"the law of {type(control).__name__} gives {len(tau)} forces and {len(rates)} rates, "
-            f"give {n} and {controller_state_count}: one per active joint, one per state"
+            f"give {n} and {chart.controller_state_count}: one per active joint, one per state"
         )
     chart.check_free_joints(tau)
     channels: list[Scalar] = []
@@ -263,35 +271,29 @@ def controller_formula_key(
         for part in (tau, rates, channels, requested_accelerations)
     ]
     # as text, in which the constant 2.0 and operation number 2 differ
-    return repr((reference_columns, len(control.settings), tape.operations, outputs))
+    return repr((len(inputs.reference), len(control.settings), tape.operations, outputs))
 
 
-def machine_program(
-    machine: Machine, control: ControlLaw, key: tuple, build: Callable[[Program], None]
-) -> Program:
+def machine_program(chart: Chart, key: tuple, build: Callable[[Program], None]) -> Program:
     """Machine code of a machine with its controller, kept by the loops of the machine.
 
     It is cached only if controller and external forces are classes of this package: the code of a
     class of the user may depend on more than the key.
 
     Args:
-        machine: The machine.
-        control: The controller.
+        chart: The machine in a chart.
         key: Properties on which the code depends, with `controller_formula_key`.
         build: Function that adds formulas and routines.
 
     Raises:
         FormulaTooLongError: The formulas are too long to be compiled.
     """
-    closure = machine.closure.compiled_closure
+    closure, control = chart.machine.closure.compiled_closure, chart.control
+    parts = (control, getattr(control, "command", control), *chart.machine.external_forces)
+    if all(type(part).__module__.startswith("crane.") for part in parts):
+        return closure.cached_program(key, build)
     if key not in closure.programs:
-        parts: list[object] = [control, *machine.external_forces]
-        if isinstance(control, ValveDrive):
-            parts.append(control.command)
-        if all(type(part).__module__.startswith("crane.") for part in parts):
-            closure.programs[key] = closure.cached_program(key, build)
-        else:
-            closure.programs[key] = Program.from_cache(None, build)
+        closure.programs[key] = Program.from_cache(None, build)
     return closure.programs[key]
 
 

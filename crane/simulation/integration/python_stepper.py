@@ -13,12 +13,12 @@ from crane.common.errors import (
     SingularMassMatrixError,
 )
 from crane.common.samples import Array
-from crane.control.control_law import Controller
 from crane.control.valve_drive import ValveDrive
+from crane.dynamics.external_forces import ExternalForceValues
 from crane.machine.machine import Machine
 from crane.motion.limit_violations import limit_tolerances
 from crane.motion.trajectory import Trajectory
-from crane.simulation.integration.charts import Chart, state_layout
+from crane.simulation.integration.charts import Chart
 
 
 class IntegrationHaltError(SimulationError):
@@ -116,7 +116,7 @@ def _passed_limit_text(
 
 _EXTRAPOLATION_TIME = 1e-3  # extrapolation of a halted motion [characteristic times]
 
-StepProgress = Callable[[int], None] | None
+StepProgress = Callable[[int], None]
 """Called with the number of finished steps."""
 
 
@@ -125,8 +125,6 @@ class PythonStepper:
 
     Args:
         chart: The machine in a chart.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
 
     Attributes:
         state_layout: Layout of the state.
@@ -135,9 +133,9 @@ class PythonStepper:
             was computed last.
     """
 
-    def __init__(self, chart: Chart, control: Controller, controller_state_count: int):
-        self._chart, self._dynamics, self._control = chart, chart.dynamics, control
-        self.state_layout = state_layout(chart.machine, controller_state_count)
+    def __init__(self, chart: Chart):
+        self._chart, self._dynamics, self._control = chart, chart.dynamics, chart.control
+        self.state_layout = chart.state_layout
         self.chart_limits, self.transition_margin = chart.chart_limits, 1.0
 
     def find_modes(self, time: float, state: Array, outputs: Array | None = None) -> None:
@@ -153,12 +151,11 @@ class PythonStepper:
         """
         at, chart = self.state_layout.view(state), self._chart
         try:
+            v_a = chart.user_velocities(at.q, at.v_a)
             tau = np.zeros(0) if outputs is None else outputs[: len(chart.user_columns)]
             if outputs is None:
-                tau, _ = self._controller_output(time, at, chart.user_velocities(at.q, at.v_a))
-            self._set_circuit_friction(time, at, chart.user_velocities(at.q, at.v_a))
-            forces = chart.chart_forces(at.q, tau)
-            forces += chart.external_forces(time, at.q, at.v_a, at.contacts).generalized_forces
+                tau, _ = self._controller_output(time, at, v_a)
+            forces, _ = self._applied_forces(time, at, v_a, tau)
             at.v_a[:] = chart.stick_slip.find_modes(self._dynamics, at.q, at.v_a, forces)
         except (ClosureError, SingularMassMatrixError) as error:
             raise self._closure_halt(time, state, error) from None
@@ -183,10 +180,8 @@ class PythonStepper:
         Raises:
             IntegrationHaltError: The loops do not close, or the configuration is singular.
         """
-        rate, tau = self._state_rate(time, state)
+        rate, tau, forces, external_values = self.state_rate(time, state)
         at = self.state_layout.view(state)
-        external_values = self._chart.external_forces(time, at.q, at.v_a, at.contacts)
-        forces = self._chart.chart_forces(at.q, tau) + external_values.generalized_forces
         observation = self._dynamics.evaluate_closed("observation", at.q, at.v_a, forces)
         outputs = [tau, observation, external_values.outputs]
         closure, control = self._chart.machine.closure, self._control
@@ -224,7 +219,7 @@ class PythonStepper:
                     ", and with steps an eighth as long, too: let method DOP853 choose them, or "
                     "look at its forces and gains",
                 )
-            rate, _ = self._state_rate(time + share * step, state + share * step * rate)
+            rate, *_ = self.state_rate(time + share * step, state + share * step * rate)
             rate_sum = rate_sum + weight * rate
         after = state + step / 6 * rate_sum
         self.close_loops(time + step, after)
@@ -271,32 +266,40 @@ class PythonStepper:
         remedy = {"default_remedy": ""} if isinstance(error, SingularMassMatrixError) else {}
         return IntegrationHaltError(time, self.user_coordinates(state), f": {error}", **remedy)
 
-    def _state_rate(self, time: float, state: Array) -> tuple[Array, Array]:
-        at, chart = self.state_layout.view(state), self._chart
+    def state_rate(
+        self, time: float, state: Array
+    ) -> tuple[Array, Array, Array, ExternalForceValues]:
+        """Rate of the state, forces of the controller, all forces and external ones.
+
+        Raises:
+            IntegrationHaltError: The loops do not close, or the configuration is singular.
+        """
+        at = self.state_layout.view(state)
         try:
-            v_a = chart.user_velocities(at.q, at.v_a)
+            v_a = self._chart.user_velocities(at.q, at.v_a)
             tau, controller_rate = self._controller_output(time, at, v_a)
-            self._set_circuit_friction(time, at, v_a)
-            external_values = chart.external_forces(time, at.q, at.v_a, at.contacts)
-            forces = chart.chart_forces(at.q, tau) + external_values.generalized_forces
+            forces, external_values = self._applied_forces(time, at, v_a, tau)
             rates = self._dynamics.evaluate_closed("rates", at.q, at.v_a, forces)
         except (ClosureError, SingularMassMatrixError) as error:
             raise self._closure_halt(time, state, error) from None
         self.transition_margin = float(rates[-1])
         energies = [tau @ v_a, *external_values.powers, rates[-2]]
-        return np.concatenate(
-            [rates[:-2], external_values.state_rates, controller_rate, energies]
-        ), tau
+        rate = np.concatenate([rates[:-2], external_values.state_rates, controller_rate, energies])
+        return rate, tau, forces, external_values
 
-    def _set_circuit_friction(self, time: float, state: LayoutView, v_a: Array) -> None:
-        control = self._control
+    def _applied_forces(
+        self, time: float, state: LayoutView, v_a: Array, tau: Array
+    ) -> tuple[Array, ExternalForceValues]:
+        """Forces along the coordinates of the chart, and external ones; sets circuit friction."""
+        control, chart = self._control, self._chart
         if self._dynamics.forces.circuit_friction_columns and isinstance(control, ValveDrive):
-            inputs = control.inputs_at(
-                time, state.q[self._chart.user_columns], v_a, state.controller
-            )
+            inputs = control.inputs_at(time, state.q[chart.user_columns], v_a, state.controller)
             self._dynamics.set_circuit_friction(
                 np.array(control.circuit_friction(inputs), dtype=np.float64)
             )
+        external_values = chart.external_forces(time, state.q, state.v_a, state.contacts)
+        forces = chart.chart_forces(state.q, tau) + external_values.generalized_forces
+        return forces, external_values
 
     def _controller_output(
         self, time: float, state: LayoutView, v_a: Array

@@ -19,7 +19,6 @@ from crane.codegen.symbolic import (
     subtract_vectors,
 )
 from crane.common.samples import Array
-from crane.control.control_law import ControlLaw
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.error_controlled_stepper import (
     ErrorControlledStepper,
@@ -70,41 +69,26 @@ class RadauStepper(ErrorControlledStepper):
 
     Args:
         chart: The machine in a chart.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
         tolerance: Error of a step, relative to the size of the state.
 
     Raises:
         FormulaTooLongError: The formulas are too long to be compiled.
     """
 
-    def __init__(
-        self,
-        chart: Chart,
-        control: ControlLaw,
-        controller_state_count: int,
-        tolerance: float = RADAU_TOLERANCE,
-    ):
-        closure = chart.machine.closure
+    def __init__(self, chart: Chart, tolerance: float = RADAU_TOLERANCE):
+        closure, controller_state_count = chart.machine.closure, chart.controller_state_count
         active = closure.units[closure.active]
         self._mobility, self._controller_state_count = len(active), controller_state_count
         difference_steps = _DIFFERENCE_STEP * np.concatenate(
             [active / closure.characteristic_time, active, np.ones(controller_state_count)]
         )
         tolerances_and_steps = np.concatenate(
-            [error_tolerances(chart, controller_state_count, tolerance), difference_steps]
+            [error_tolerances(chart, tolerance), difference_steps]
         )
-        super().__init__(
-            chart, control, controller_state_count, ("radau",), False, tolerances_and_steps
-        )
+        super().__init__(chart, ("radau",), False, tolerances_and_steps)
 
     def _add_method(self, program: Program) -> None:
-        self._system = RadauLinearSystem(
-            self.state_layout,
-            self._mobility,
-            self._controller_state_count,
-            self._chart.machine.closure.active.tolist(),
-        )
+        self._system = RadauLinearSystem(self._chart)
         for suffix, with_joints_at_rest in self._rest_variants:
             dynamics = self._trace_controlled_machine(Tape()).dynamics_formulas
             mass = [x for row in dynamics.mass_matrix for x in row]
@@ -268,8 +252,7 @@ class RadauStepper(ErrorControlledStepper):
         program.add_formula("dense", 1, [x for row in coefficients for x in row])
 
     def _write_step(self, program: Program, step: StepLoop) -> tuple[StepWriter, StepWriter]:
-        sizes = self.state_layout.size, self._mobility, self._controller_state_count
-        writer = _RadauStepCode(program, step, *sizes)
+        writer = _RadauStepCode(program, step, self._chart)
         return writer.write_attempt, writer.write_interpolation
 
 
@@ -279,22 +262,14 @@ class _RadauStepCode:
     Args:
         program: The program with its formulas.
         step: The loop over steps.
-        size: Length of the state.
-        mobility: Number of active coordinates.
-        controller_state_count: Number of states of the controller.
+        chart: The machine in a chart.
     """
 
-    def __init__(
-        self,
-        program: Program,
-        step: StepLoop,
-        size: int,
-        mobility: int,
-        controller_state_count: int,
-    ):
-        r = self._r = step.routine
+    def __init__(self, program: Program, step: StepLoop, chart: Chart):
+        r, size, mobility = step.routine, chart.state_layout.size, len(chart.machine.active)
+        self._r = r
         self._step, self._mobility, self._size = step, mobility, size
-        m = self._direction_count = mobility + controller_state_count
+        m = self._direction_count = mobility + chart.controller_state_count
         # rates have further outputs, which the next rate overwrites
         further = program.formula_outputs("rate").size - size
         sizes: dict[str, Layout | int] = {

@@ -11,6 +11,7 @@ from crane.codegen.symbolic import (
     subtract_vectors,
     transpose,
 )
+from crane.simulation.integration.charts import Chart
 
 # eigenvalues of the inverse of the matrix of the method
 REAL_EIGENVALUE = 3.0 + 3.0 ** (2 / 3) - 3.0 ** (1 / 3)
@@ -68,18 +69,14 @@ class RadauLinearSystem:
     factors that are 0 for the velocities of joints at rest.
 
     Args:
-        state_layout: Layout of the state.
-        mobility: Number n of active coordinates.
-        controller_state_count: Number k of the states of the controller.
-        active: Columns of the active coordinates.
+        chart: The machine in a chart.
     """
 
-    def __init__(
-        self, state_layout: Layout, mobility: int, controller_state_count: int, active: list[int]
-    ):
-        self._state_layout, self._active = state_layout, active
-        self._mobility, self._controller_state_count = mobility, controller_state_count
-        n, k, nq = mobility, controller_state_count, state_layout.parts["q"]
+    def __init__(self, chart: Chart):
+        self._state_layout = chart.state_layout
+        self._active = chart.machine.closure.active.tolist()
+        k, n, nq = chart.controller_state_count, len(self._active), chart.machine.model.nv
+        self._mobility, self._controller_state_count = n, k
         self.layout = Layout(
             q_v=nq * n, q_q=nq * n, o_o=k * k, o_v=k * n, o_q=k * n, v_o=n * k, v_v=n * n,
             v_q=n * n, mass=n * n, free=n,

@@ -16,7 +16,6 @@ from crane.codegen.symbolic import (
     subtract_vectors,
     symbolic_entries,
 )
-from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
 from crane.dynamics.external_forces import state_count
 from crane.simulation.integration.charts import Chart
@@ -86,25 +85,17 @@ class RosenbrockStepper(ErrorControlledStepper):
 
     Args:
         chart: The machine in a chart.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
         tolerance: Error of a step, relative to the size of the state.
 
     Raises:
         FormulaTooLongError: The formulas are too long to be compiled.
     """
 
-    def __init__(
-        self,
-        chart: Chart,
-        control: ControlLaw,
-        controller_state_count: int,
-        tolerance: float = ROSENBROCK_TOLERANCE,
-    ):
+    def __init__(self, chart: Chart, tolerance: float = ROSENBROCK_TOLERANCE):
         scales = (
-            control.scales
-            if isinstance(control, ValveDrive)
-            else np.full(controller_state_count, _CONTROLLER_ACCURACY)
+            chart.control.scales
+            if isinstance(chart.control, ValveDrive)
+            else np.full(chart.controller_state_count, _CONTROLLER_ACCURACY)
         )
         self._stiff_state_count = int(np.isfinite(scales).sum())
         closure = chart.machine.closure
@@ -124,7 +115,7 @@ class RosenbrockStepper(ErrorControlledStepper):
         errors = np.append(
             ROSENBROCK_TOLERANCE / tolerance / accuracies, [tolerance, 1.0 / energy]
         )
-        super().__init__(chart, control, controller_state_count, method, True, errors)
+        super().__init__(chart, method, True, errors)
 
     def _add_method(self, program: Program) -> None:
         """combine(state, u), prepare(..., h), solve(rate, u, factors, h), finish, dense."""

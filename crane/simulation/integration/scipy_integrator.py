@@ -8,7 +8,6 @@ import numpy as np
 
 from crane.common.errors import ClosureError
 from crane.common.samples import Array
-from crane.control.control_law import Controller
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.integrators import StickSlipIntegrator
 from crane.simulation.integration.python_stepper import IntegrationHaltError, StepProgress
@@ -18,6 +17,9 @@ from crane.simulation.integration.stick_slip_modes import EVENT_TOLERANCE, locat
 # end of a branch
 _MAX_PASSIVE_VELOCITY = 300.0
 SCIPY_TOLERANCE = 1e-9  # error of a step, relative to the size of the state
+# length of a rotation vector [rad] at which it is limited to pi and the method starts anew; their
+# rates are infinite at 2 pi
+_MAX_ROTATION = 1.25 * np.pi
 _ABSOLUTE_TOLERANCE_SHARE = 1e-2  # absolute over relative tolerance, in coordinate or SI units
 SCIPY_METHODS = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
 
@@ -27,22 +29,13 @@ class ScipyIntegrator(StickSlipIntegrator):
 
     Args:
         chart: The machine in a chart.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
         method: One of `SCIPY_METHODS`.
         tolerance: Error of a step, relative to the size of the state.
     """
 
-    def __init__(
-        self,
-        chart: Chart,
-        control: Controller,
-        controller_state_count: int,
-        method: str,
-        tolerance: float = SCIPY_TOLERANCE,
-    ):
+    def __init__(self, chart: Chart, method: str, tolerance: float = SCIPY_TOLERANCE):
         self._tolerance = tolerance
-        super().__init__(chart, control, controller_state_count, None)
+        super().__init__(chart, None)
         self._chart, self._closure, self._method = chart, chart.machine.closure, method
 
     def _advance(
@@ -64,9 +57,9 @@ class ScipyIntegrator(StickSlipIntegrator):
         closure, end = self._closure, first + step * len(times)
         instants = np.append(times, end)
         start_time = instants[self.next_instant] + self.offset
-        units, characteristic_time, view = (
+        units, coordinates, view = (
             closure.units,
-            closure.characteristic_time,
+            self._chart.machine.coordinates,
             self.python_stepper.state_layout.view,
         )
 
@@ -74,12 +67,12 @@ class ScipyIntegrator(StickSlipIntegrator):
             closed = state.copy()  # gamma is valid at closed configurations alone
             q = view(closed).q
             with suppress(ClosureError):  # of a trial state beyond the branch
-                q[:] = closure.solve(q[closure.active])
-            return self.python_stepper.observe(time, closed)[0]
+                q[:] = coordinates.unwrap_rotations(closure.solve(q[closure.active]), q)
+            return self.python_stepper.state_rate(time, closed)[0]
 
         absolute_tolerances = np.full(len(state), _ABSOLUTE_TOLERANCE_SHARE * self._tolerance)
         view(absolute_tolerances).q[:] *= units
-        view(absolute_tolerances).v_a[:] *= units[closure.active] / characteristic_time
+        view(absolute_tolerances).v_a[:] *= units[closure.active] / closure.characteristic_time
         method: Any = getattr(integrate, self._method)
         solver = method(
             rate, start_time, state.copy(), end, rtol=self._tolerance, atol=absolute_tolerances
@@ -114,8 +107,9 @@ class ScipyIntegrator(StickSlipIntegrator):
                 later, event_state = locate_event(trial, before, until - start, after)
                 until = start + later
             self._record(instants, until, dense_output, state, rows)
-            if progress is not None:
-                progress(self.next_instant)
+            progress(self.next_instant)
+            if event_state is None and self._has_long_rotation(solver.y):
+                event_state = solver.y
             if event_state is not None:
                 state[:] = event_state
                 self.python_stepper.close_loops(until, state)
@@ -127,6 +121,12 @@ class ScipyIntegrator(StickSlipIntegrator):
             if self._chart.largest_gamma_entry(q) > self.python_stepper.chart_limits[0]:
                 return False
         return True
+
+    def _has_long_rotation(self, state: Array) -> bool:
+        """Whether a rotation vector has to be limited to pi."""
+        q = self.python_stepper.state_layout.view(state).q
+        columns = self._chart.machine.coordinates.rotation_columns
+        return any(np.linalg.norm(q[i : i + 3]) > _MAX_ROTATION for i in columns)
 
     def _check_passive_velocities(self, time: float, state: Array) -> None:
         """Check the velocities of the passive joints.

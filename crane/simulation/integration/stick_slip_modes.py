@@ -21,6 +21,7 @@ import numpy as np
 
 from crane.closure.closure import Closure
 from crane.closure.coordinates import Indices
+from crane.common.one_line_repr import list_first
 from crane.common.samples import Array
 from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.joint_forces import REST_VELOCITY
@@ -91,13 +92,8 @@ class StickSlipModes:
         if not self.is_undetermined:
             return []
         names = [f"'{joint}'" for joint in self._joints]
-        more = (
-            f" and {len(names) - _MAX_NAMED_JOINTS} more joints"
-            if len(names) > _MAX_NAMED_JOINTS
-            else ""
-        )
         return [
-            f"friction of {', '.join(names[:_MAX_NAMED_JOINTS])}{more} holds the machine at "
+            f"friction of {list_first(names, 'joints', _MAX_NAMED_JOINTS)} holds the machine at "
             "rest in more ways than one: the motion is determined, how they share the load is "
             "not, and their 'rest_' channels are one way"
         ]
@@ -243,7 +239,7 @@ def _independent_columns(columns: Array) -> tuple[Indices, int]:
         )
         if least_singular_value > 2.0 * _RANK_TOLERANCE:
             return np.arange(count), count
-    from scipy.linalg import qr  # slow to import
+    from scipy.linalg import qr  # slow to call
 
     upper, order = qr(columns, mode="r", pivoting=True)
     sizes = np.abs(np.diag(upper))

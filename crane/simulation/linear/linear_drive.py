@@ -53,7 +53,7 @@ class LinearizedDrive:
         self.output_units: dict[str, str] = {}
         self.initial_states, self.initial_inputs = np.zeros(0), np.zeros(len(self.input_units))
         self.scales, self.vapour_pressure, self._engine_droop = np.zeros(0), 0.0, 0.0
-        self._valve_drive: ValveDrive | None = None
+        self._valve_drive: Any = None  # a `ValveDrive`
         self._input_matrix = np.eye(n)[:, machine.is_driven]
         if valves:
             control = ValveDrive(machine, ValveSignals(machine, [0.0], {}), pressures)
@@ -91,7 +91,6 @@ class LinearizedDrive:
 
         An underlapped valve, which is never closed, counts as that of a moving joint.
         """
-        assert self._valve_drive is not None
         circuit = self._valve_drive.circuit
         moving = {
             x
@@ -109,7 +108,6 @@ class LinearizedDrive:
 
     def load_bearing_mask(self, forces: Array) -> Any:
         """(k,) whether states are pressures of the chambers that carry forces (n,)."""
-        assert self._valve_drive is not None
         is_load_bearing = np.zeros(len(self.state_units), dtype=bool)
         for i, first in zip(
             self._active_indices, self._valve_drive.circuit.cylinder_state_starts, strict=True
@@ -124,7 +122,6 @@ class LinearizedDrive:
             z (k + m,); its derivatives (k + m, r) by pressures and openings; lower and upper
             bounds (r,) of these, which keep valves open and pumps within their droop.
         """
-        assert self._valve_drive is not None
         hydraulics, names = self._valve_drive.circuit.hydraulics, list(self.state_units)
         supply, k = hydraulics.supply, len(names)
         z = np.concatenate([self.initial_states, self.initial_inputs])
@@ -191,7 +188,6 @@ class LinearizedDrive:
             self._state_count,
             len(self.input_units),
         )
-        assert control is not None
         tape = Tape()
         q_a, v_a, states = (
             tape.load_vector(0, 0, n),
@@ -242,9 +238,7 @@ class LinearizedDrive:
         def build(program: Program) -> None:
             program.add_formula("formula", 2, {"values": values, "slopes": derivative_values})
 
-        if key not in compiled_closure.programs:
-            compiled_closure.programs[key] = compiled_closure.cached_program(key, build)
-        return compiled_closure.programs[key]
+        return compiled_closure.cached_program(key, build)
 
     def evaluate(
         self, q_a: Array, v_a: Array, states: Array, inputs: Array

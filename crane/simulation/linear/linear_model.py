@@ -123,13 +123,10 @@ class LinearModel(Result):
 
     def response(self, frequencies: ArrayLike) -> Array:
         """G = C (i w - A)^-1 B + D (f, p, m), complex, at frequencies (f,) [Hz]."""
-        frequencies = np.asarray(frequencies, dtype=np.float64)
-        eye, found = np.eye(len(self.A)), []
-        for frequency in frequencies:
-            found.append(
-                self.C @ np.linalg.solve(2j * np.pi * frequency * eye - self.A, self.B) + self.D
-            )
-        return np.array(found)
+        s = 2j * np.pi * np.asarray(frequencies, dtype=np.float64)[:, None, None]
+        return np.asarray(
+            self.C @ np.linalg.solve(s * np.eye(len(self.A)) - self.A, self.B) + self.D
+        )
 
     def simulate(self, times: ArrayLike, start: ArrayLike, inputs: ArrayLike) -> Array:
         """Deviations y (N, p) from a start x (k,) under constant inputs u (m,), exactly.
@@ -145,11 +142,11 @@ class LinearModel(Result):
         start, u = as_sample(start, k, "start", self.states), as_sample(inputs, m, "inputs")
         whole = np.zeros((k + m, k + m))
         whole[:k, :k], whole[:k, k:] = self.A, self.B
-        rows = [
+        states = [
             expm(whole * time) @ np.concatenate([start, u])
             for time in np.asarray(times, dtype=np.float64)
         ]
-        return np.array([self.C @ row[:k] + self.D @ u for row in rows])
+        return np.asarray(np.array(states) @ np.hstack([self.C, self.D]).T)
 
     def dominant_state(self, mode: Mode) -> str:
         """The state that a mode moves most: a joint, or else a pressure or spool."""
@@ -255,17 +252,19 @@ class LinearModel(Result):
         path = Path(path)
         if path.suffix not in (".mat", ".npz"):
             raise OutputError(f"{path}: a linear model is written as .mat or .npz")
-        values: dict[str, Any] = {name: getattr(self, name) for name in ("A", "B", "C", "D")}
-        values |= {name: getattr(self, name) for name in ("x", "u", "y", "rate")}
-        named = {name: getattr(self, name) for name in ("states", "inputs", "outputs")}
-        if path.suffix == ".mat":
-            from scipy.io import savemat
+        kind = object if path.suffix == ".mat" else str
+        values: dict[str, Any] = {
+            name: np.array(getattr(self, name), dtype=kind)
+            for name in ("states", "inputs", "outputs")
+        }
+        values |= {name: getattr(self, name) for name in ("A", "B", "C", "D", "x", "u", "y")}
+        values["rate"] = self.rate
+        with replace_file(path) as part:
+            if path.suffix == ".mat":
+                from scipy.io import savemat
 
-            cells = {key: np.array(value, dtype=object) for key, value in named.items()}
-            with replace_file(path) as part:
-                savemat(str(part), values | cells, appendmat=False)
-        else:
-            every: dict[str, Any] = values | {key: np.array(x) for key, x in named.items()}
-            with replace_file(path) as part, open(part, "wb") as file:
-                np.savez(file, **every)
+                savemat(str(part), values, appendmat=False)
+            else:
+                with open(part, "wb") as file:
+                    np.savez(file, **values)
         return path

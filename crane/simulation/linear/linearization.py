@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.errors import CraneWarning, InputError, suggest_names
+from crane.common.errors import CraneWarning, InputError, check_name
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_samples
 from crane.description.machine_parameters import unknown_parameter_text
@@ -24,56 +24,44 @@ from crane.simulation.linear.trim import find_trim
 _DIFFERENCE_STEP = 2e-4  # in coordinate units: nine digits remain
 
 
-class LinearizedExternalForces:
-    """External forces of a machine along its active joints at time 0.
+def external_force_derivatives(machine: Machine, q_a: Array, v_a: Array) -> tuple[Array, Array]:
+    """External forces along the active joints at time 0, and their derivatives.
 
-    Forces with states (`ExternalForce.state_count`) are left out, with a warning.
+    The derivatives are differences of fourth order. Forces with states
+    (`ExternalForce.state_count`) are left out, with a warning.
 
     Args:
         machine: The machine.
+        q_a: (n,) active coordinates.
+        v_a: (n,) active velocities.
+
+    Returns:
+        gamma^T J^T w (n,), and its derivatives (n, 2 n) by q_A and v_A.
     """
-
-    def __init__(self, machine: Machine):
-        memoryless = [force for force in machine.external_forces if not force.state_count]
-        excluded_names = [force.name for force in machine.external_forces if force.state_count]
-        if excluded_names:
-            warnings.warn(
-                f"{machine.name}: forces that remember their way have no linear model, left out: "
-                f"{', '.join(excluded_names)}",
-                CraneWarning,
-                stacklevel=3,
-            )
-        self._closure, self._has_forces = machine.closure, bool(memoryless)
-        self._forces = ExternalForces(machine, memoryless)
-        units = self._closure.units[self._closure.active]
-        self._steps = (
-            np.concatenate([units, units / self._closure.characteristic_time]) * _DIFFERENCE_STEP
+    memoryless = [force for force in machine.external_forces if not force.state_count]
+    excluded_names = [force.name for force in machine.external_forces if force.state_count]
+    if excluded_names:
+        warnings.warn(
+            f"{machine.name}: forces that remember their way have no linear model, left out: "
+            f"{', '.join(excluded_names)}",
+            CraneWarning,
+            stacklevel=3,
         )
+    closure, forces, n = machine.closure, ExternalForces(machine, memoryless), len(q_a)
 
-    def active_forces(self, q_a: Array, v_a: Array) -> Array:
-        """gamma^T J^T w (n,)."""
-        if not self._has_forces:
-            return np.zeros(len(q_a))
-        q = self._closure.solve(q_a)
-        gamma = self._closure.gamma(q)
-        return np.asarray(
-            gamma.T
-            @ self._forces.generalized_forces(0.0, q, gamma @ v_a, np.zeros(0)).generalized_forces
-        )
+    def active_forces(x: Array) -> Array:
+        q = closure.solve(x[:n])
+        gamma = closure.gamma(q)
+        applied = forces.generalized_forces(0.0, q, gamma @ x[n:], np.zeros(0))
+        return np.asarray(gamma.T @ applied.generalized_forces)
 
-    def jacobian(self, q_a: Array, v_a: Array) -> Array:
-        """Derivatives (n, 2 n) by q_A and v_A, by differences of fourth order."""
-        n, x = len(q_a), np.concatenate([q_a, v_a])
-        derivatives = np.zeros((n, 2 * n))
-        for i, step in enumerate(self._steps if self._has_forces else ()):
-            displacement = step * np.eye(2 * n)[i]
-
-            def force(steps: int, displacement: Array = displacement) -> Array:
-                displaced = x + steps * displacement
-                return self.active_forces(displaced[:n], displaced[n:])
-
-            derivatives[:, i] = (8 * (force(1) - force(-1)) - (force(2) - force(-2))) / (12 * step)
-        return derivatives
+    x, derivatives = np.concatenate([q_a, v_a]), np.zeros((n, 2 * n))
+    units = closure.units[closure.active]
+    steps = _DIFFERENCE_STEP * np.concatenate([units, units / closure.characteristic_time])
+    for i, h in enumerate(np.diag(steps) if memoryless else ()):
+        once, twice = (active_forces(x + k * h) - active_forces(x - k * h) for k in (1, 2))
+        derivatives[:, i] = (8 * once - twice) / (12 * steps[i])
+    return active_forces(x), derivatives
 
 
 def linearize(
@@ -119,10 +107,8 @@ def linearize(
     """
     if not isinstance(machine, Machine):
         machine = load(machine)
-    if drive not in (None, "valves", "forces"):
-        raise InputError(
-            f"drive '{drive}' is unknown, {suggest_names(('valves', 'forces'), drive)}"
-        )
+    if drive is not None:
+        check_name(drive, ("valves", "forces"), f"drive '{drive}' is unknown")
     valves = machine.hydraulics is not None if drive is None else drive == "valves"
     if valves and machine.hydraulics is None:
         raise InputError(f"'{machine.name}' has no valves, take the drive 'forces'")
@@ -136,8 +122,7 @@ def linearize(
     dynamics = Dynamics(machine)
     q = machine.closure.solve(q_a)
     linearized_drive = LinearizedDrive(machine, dynamics, q, valves, pressures)
-    external = LinearizedExternalForces(machine)
-    external_force = external.active_forces(q_a, v_a)
+    external_force, external_jacobian = external_force_derivatives(machine, q_a, v_a)
     drive_states, u = find_trim(dynamics, linearized_drive, q_a, v_a, external_force)
     n, k, m = len(q_a), len(drive_states), len(u)
     values, drive_jacobian = linearized_drive.evaluate(q_a, v_a, drive_states, u)
@@ -148,7 +133,7 @@ def linearize(
     a, b = np.zeros((size, size)), np.zeros((size, m))
     a[:n, n : 2 * n] = np.eye(n)
     a[n : 2 * n] = by_tau @ drive_jacobian[:n, :size]
-    a[n : 2 * n, : 2 * n] += by_tau @ external.jacobian(q_a, v_a)
+    a[n : 2 * n, : 2 * n] += by_tau @ external_jacobian
     a[n : 2 * n, :n] += dynamics_derivatives["q_a"]
     a[n : 2 * n, n : 2 * n] += dynamics_derivatives["v_a"]
     a[2 * n :] = drive_jacobian[n : n + k, :size]
@@ -234,8 +219,7 @@ def linear_models(
                 )
             )
         drift_warnings += [str(warning.message) for warning in caught_warnings]
-        if progress is not None:
-            progress((i + 1) / len(combinations))
+        progress((i + 1) / len(combinations))
     if drift_warnings:
         text = f"{len(drift_warnings)} of {len(combinations)} are {drift_warnings[0]}, the first"
         warnings.warn(text, CraneWarning, stacklevel=2)
@@ -292,8 +276,7 @@ def _select_outputs(
         outputs |= {name: (row, 0.0, unit) for (name, unit), row in inputs}
     names = default_names if names is None else list(names)
     for name in names:
-        if name not in outputs:
-            raise InputError(f"output '{name}' is unknown, {suggest_names(outputs, name)}")
+        check_name(name, outputs, f"output '{name}' is unknown")
     matrix = np.array([outputs[name][0] for name in names]).reshape(len(names), -1)
     y = np.array([outputs[name][1] for name in names], dtype=np.float64)
     return matrix[:, :size], matrix[:, size:], y, {name: outputs[name][2] for name in names}
@@ -309,9 +292,6 @@ def _values_by_joint(
         return as_samples(specified, len(default), label, machine.active).astype(np.float64)
     out = default.copy()
     for joint, value in specified.items():
-        if joint not in machine.active:
-            raise InputError(
-                f"{label}: '{joint}' is no active joint, {suggest_names(machine.active, joint)}"
-            )
+        check_name(joint, machine.active, f"{label}: '{joint}' is no active joint")
         out[machine.active.index(joint)] = float(value)
     return out

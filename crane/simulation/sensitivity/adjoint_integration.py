@@ -67,13 +67,7 @@ class AdjointIntegrator:
         accuracy: float = STEP_ACCURACY,
     ):
         self._motion, self._nominal_constants, self._accuracy = motion, nominal_constants, accuracy
-        of = (
-            motion.chart,
-            motion.control,
-            motion.controller_state_count,
-            motion.stiff_state_count,
-            outputs,
-        )
+        of = motion.chart, motion.stiff_state_count, outputs
         no_changes = SimulationConstants(*(np.zeros(part.shape[-1]) for part in nominal_constants))
         self._forward_derivatives = ForwardDerivatives(*of, no_changes)
         self._reverse_derivatives = ReverseDerivatives(*of, changes)

@@ -6,15 +6,21 @@ of the controller or circuit on which the rates depend; c are all constants of t
 direction (ds, dc) or backwards for weighted sums, through the closed loops phi(q, c) = 0:
 
     J_P dq_P = -(J_A dq_A + dphi/dc dc).
+
+Changes dq are small motions of the joints: of ball joints and floating bases along and about the
+axes of the body, so that they do not jump where rotation vectors do, with the rates
+dq_A' = dv_A - [v, dq]_A of `motion_commutator`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from crane.codegen import Program, Scalar, SymbolicExpression
 from crane.codegen.differentiation import directional_derivative, weighted_gradient
+from crane.codegen.symbolic import add_vectors, cross, subtract_vectors
 from crane.common.samples import Array
+from crane.dynamics.dynamics_formulas import DynamicsFormulas
 from crane.simulation.integration.machine_formulas import AT_REST_SUFFIX
 from crane.simulation.sensitivity.rate_formulas import (
     DifferentiatedFormulas,
@@ -95,6 +101,8 @@ class ForwardDerivatives(RateProgram):
         for array in range(1, 5):
             seed(array)
         derivatives = directional_derivative(formulas.all_values, seeds)
+        turned = motion_commutator(dynamics, {i: row[0] for i, row in moving.items()})
+        derivatives[: self._mobility] = subtract_vectors(derivatives[: self._mobility], turned)
         for k, (_, factor) in enumerate(formulas.outputs, start=len(formulas.rate)):
             derivatives[k] = factor * derivatives[k]
         program.add_formula("tangent" + suffix, 12, derivatives)
@@ -154,21 +162,47 @@ class ReverseDerivatives(RateProgram):
         for k, (_, factor) in enumerate(formulas.outputs, start=len(formulas.rate)):
             weights[k] = factor * weights[k]
         loops = dynamics.loops
+        held_parts = dynamics.kinematics.geometry.partly_active_joints(loops.active_joints)
+        moved_joints = [*loops.passive_joints, *held_parts]
         passive = [
-            SymbolicExpression(tape, operation_index(dynamics.q[i - 1]))
-            for i in loops.passive_joints
+            SymbolicExpression(tape, operation_index(dynamics.q[i - 1])) for i in moved_joints
         ]
         found = weighted_gradient(formulas.all_values, weights, [*numbers, *passive])
         out: Sequence[Scalar] = found[: len(numbers)]
         if loops.rows:
             # q_P depends linearly on the gaps of the loops; their values cancel
             gaps = [tape.load(7, r) for r in range(len(loops.rows))]
-            changes = loops.coordinate_changes(gaps)
-            z = weighted_gradient(
-                [changes[i] for i in loops.passive_joints], found[len(numbers) :], gaps
-            )
+            held: dict[int, list[Scalar]] = {joint: [0.0] for joint in loops.active_joints}
+            motion, _ = loops.solve_passive(held, [[-1.0 * gap] for gap in gaps])
+            changes = {i: row[0] for i, row in motion.items()}
+            steps, turned = loops.coordinate_steps(changes), motion_commutator(dynamics, changes)
+            values = [*(steps[i] for i in moved_joints), *turned]
+            shares = [-1.0 * w for w in weights[: self._mobility]]
+            z = weighted_gradient(values, [*found[len(numbers) :], *shares], gaps)
             by_loops = weighted_gradient([row.phi for row in loops.rows], z, numbers)
             out = [one + other for one, other in zip(out, by_loops, strict=True)]
         program.add_formula("cotangent" + suffix, 7, out)
         widths = {"weights": ("both", len(weights)), "out": ("both", len(out))}
         self._add_routine(program, "against" + suffix, "cotangent" + suffix, widths)
+
+
+def motion_commutator(dynamics: DynamicsFormulas, motion: Mapping[int, Scalar]) -> list[Scalar]:
+    """Commutator [v, x]_A (n,) of the velocities v and a small motion x of all joints.
+
+    The rate of a small motion x along joint velocities v that change by dv is x' = dv - [v, x]:
+    [v, x] = w x t for the angular parts w, t of a ball joint, and for the linear parts u, l of a
+    floating base w x l + u x t (Lie bracket of SE(3)); 0 of all other joints.
+
+    Args:
+        dynamics: Formulas with v.
+        motion: x by joint.
+    """
+    v, geometry = dynamics.joint_velocities, dynamics.kinematics.geometry
+    x: list[Scalar] = [0.0, *(motion[i] for i in range(1, len(v)))]
+    out: list[Scalar] = [0.0] * len(v)
+    for i in geometry.rotation_bodies:
+        out[i : i + 3] = cross(v[i : i + 3], x[i : i + 3])
+    for i in geometry.floating_bases:
+        linear, angular = slice(i, i + 3), slice(i + 3, i + 6)
+        out[linear] = add_vectors(cross(v[angular], x[linear]), cross(v[linear], x[angular]))
+    return [out[joint] for joint in dynamics.loops.active_joints]

@@ -18,12 +18,11 @@ from crane.codegen.symbolic import (
 )
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
 from crane.description.sensors import FORCE_SUFFIX, INCLINATION_PREFIX, VELOCITY_SUFFIX
 from crane.dynamics.external_forces import reference_counts
 from crane.machine.machine import Machine
-from crane.simulation.integration.charts import Chart, state_layout
+from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.machine_formulas import (
     AT_REST_SUFFIX,
     MachineFormulas,
@@ -68,8 +67,6 @@ class RateProgram:
 
     Args:
         chart: The machine in the coordinates of the user.
-        control: Its controller.
-        controller_state_count: Number of all states of the controller.
         stiff_state_count: Number of the first ones, on which the rates depend.
         outputs: Names of the outputs, see `sensitivities`.
         variable_constants: Nonzero for constants that change.
@@ -85,20 +82,18 @@ class RateProgram:
     def __init__(
         self,
         chart: Chart,
-        control: ControlLaw,
-        controller_state_count: int,
         stiff_state_count: int,
         outputs: Sequence[str],
         variable_constants: SimulationConstants,
     ):
+        control = chart.control
         self._chart, self._control, self.outputs = chart, control, tuple(outputs)
         self._stiff_state_count, self._variable_constants = stiff_state_count, variable_constants
         machine = chart.machine
         self._mobility = len(machine.active)
-        self._state_layout = state_layout(machine, controller_state_count)
+        self._state_layout = chart.state_layout
         self.state_size = 2 * self._mobility + stiff_state_count
-        self._controller_columns = reference_count(control)
-        self._reference_columns = self._controller_columns + sum(
+        self._reference_columns = reference_count(control) + sum(
             reference_counts(machine.external_forces)
         )
         self._frames = observed_frames(machine, outputs)
@@ -112,13 +107,10 @@ class RateProgram:
             for is_variable, part in zip(variable_constants, constants, strict=False)
         )
         self._folded_constants = geometry, dynamics_constants
-        form = controller_formula_key(
-            control, self._controller_columns, chart, controller_state_count, True
-        )
         key = (
             type(self).__name__,
-            form,
-            controller_state_count,
+            controller_formula_key(chart, True),
+            chart.controller_state_count,
             stiff_state_count,
             *chart.formula_key,
             self.outputs,
@@ -127,7 +119,7 @@ class RateProgram:
             *(np.asarray(part != 0).tobytes() for part in variable_constants[:5]),
         )
         try:
-            self._program = machine_program(machine, control, key, self._build)
+            self._program = machine_program(chart, key, self._build)
         except FormulaTooLongError:
             raise InputError(
                 f"the formulas of '{machine.name}' are too long to differentiate: lock joints"
@@ -201,9 +193,7 @@ class RateProgram:
         constants = FormulaConstants(tape, 2, self._folded_settings)
         machine = trace_machine(
             self._chart,
-            self._control,
             tape,
-            self._state_layout,
             5,
             references,
             constants.vector(0, len(self._folded_settings)),
@@ -215,9 +205,8 @@ class RateProgram:
             else []
         )
         accelerations = machine.accelerations(with_joints_at_rest)
-        coordinate_rates = machine.dynamics_formulas.coordinate_derivatives
         rate = [
-            *(coordinate_rates[i] for i in self._chart.machine.closure.active),
+            *machine.dynamics_formulas.v_a,
             *accelerations.a_a,
             *machine.controller_rate[: self._stiff_state_count],
         ]

@@ -7,12 +7,12 @@ import numpy as np
 
 from crane.closure.coordinates import Indices
 from crane.common.errors import InputError, SimulationError
+from crane.common.progress import ignore_progress
 from crane.common.samples import Array
 from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
 from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.external_forces import state_count
-from crane.simulation.integration.charts import Chart, row_layout
 from crane.simulation.integration.stick_slip_modes import StickSlipTransition
 from crane.simulation.sensitivity.rate_derivatives import ForwardDerivatives
 from crane.simulation.sensitivity.simulation_constants import SimulationConstants
@@ -113,8 +113,6 @@ class SimulatedMotion:
 
     Attributes:
         chart: The machine in a chart.
-        control: Its controller.
-        controller_state_count: Number of states of the controller.
         stiff_state_count: Number of the first ones, on which the rates depend.
         time: (2 N + 1,) instants and the middles between them [s].
         rows: (2 N + 1, .) rows at these times, see `integrate`.
@@ -126,7 +124,7 @@ class SimulatedMotion:
         has_joints_at_rest: Whether a joint is at rest.
 
     Raises:
-        InputError: The machine has no formulas or a floating base.
+        InputError: The machine has no formulas.
         SimulationError: The motion reaches a dead centre; else as `simulate`.
     """
 
@@ -139,32 +137,26 @@ class SimulatedMotion:
         step: float,
         method: str | None = None,
         tolerance: float | None = None,
-        progress: Callable[[float], None] | None = None,
+        progress: Callable[[float], None] = ignore_progress,
     ):
-        machine, self.chart = dynamics.machine, Chart.from_dynamics(dynamics)
-        self.control, self._step, self.has_joints_at_rest = control, step, False
+        machine = dynamics.machine
+        self._step, self.has_joints_at_rest = step, False
         if dynamics.backend != "compiled" or not machine.has_traceable_forces:
             raise InputError(
                 f"'{machine.name}' with its controller has no formulas to differentiate: lock "
                 "joints, or write the controller as a Law, and loads as ExternalForce"
-            )
-        if machine.coordinates.is_rotation_vector[machine.closure.active].any():
-            raise InputError(
-                f"'{machine.name}' floats or turns freely about a ball joint, sensitivities are "
-                "of machines without active rotation vectors: lock them"
             )
         if state_count(machine.external_forces):
             raise InputError(
                 f"'{machine.name}' has contacts that give way along the ground, sensitivities "
                 "are of those without lateral stiffness"
             )
-        self.chart.stick_slip.transitions = []
         made = (dynamics, control, initial, 2 * step_count, 0.5 * step, method)
-        run = integrate(*made, progress, tolerance, self.chart)
+        run = integrate(*made, progress, tolerance, records_transitions=True)
         if run.stop is not None:
             raise run.stop
         time, parts, self.notes = run.time, run.rows, run.notes
-        self.time, self.controller_state_count = time, parts.controller.shape[1]
+        self.time, self.chart = time, run.chart
         stride = max(1, len(time) // _MAX_CHECKED_SAMPLES)
         for at, configuration in zip(time[::stride], parts.q[::stride], strict=True):
             if self.chart.largest_gamma_entry(configuration) > self.chart.chart_limits[0]:
@@ -175,17 +167,14 @@ class SimulatedMotion:
         self.stiff_state_count = (
             control.circuit.stiff_state_count
             if isinstance(control, ValveDrive)
-            else self.controller_state_count
+            else self.chart.controller_state_count
         )
-        layout = row_layout(machine, control, self.controller_state_count)
+        layout = self.chart.row_layout
         self.rows = np.hstack([getattr(parts, name) for name in layout.parts])
         self.parts = layout.view(self.rows[::2])
         self._states = self.rows[:, : layout.start_index("tau")]
-        make = integrator_factory(
-            dynamics, control, self.controller_state_count, method, tolerance
-        )
-        self._integrator = make(self.chart)
-        self.transitions: list[StickSlipTransition] = self.chart.stick_slip.transitions
+        self._integrator = integrator_factory(self.chart, method, tolerance)(self.chart)
+        self.transitions = self.chart.stick_slip.transitions or []
         self.chart.stick_slip.transitions = None  # repeated parts are not recorded
         columns, closure = self.chart.user_columns, machine.closure
         minimal = np.hstack(

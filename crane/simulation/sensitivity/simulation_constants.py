@@ -32,7 +32,8 @@ class SimulationConstants(NamedTuple):
         frames: Position (3,) on its body, x axis (3,) and direction up in the world (3,) of each
             frame of an output.
         references: (N, c) references at N instants.
-        initial_state: (m,) initial minimal state.
+        initial_state: (m,) initial minimal state, with a small motion of the active joints from
+            the nominal configuration in place of their coordinates.
     """
 
     geometry: Array
@@ -57,6 +58,7 @@ def simulation_constants_of(
     initial: tuple[Array, Array],
     frames: Sequence[str],
     times: Array,
+    nominal_start: Array,
     variant: Machine | None = None,
 ) -> SimulationConstants:
     """Constants of a simulation.
@@ -67,6 +69,7 @@ def simulation_constants_of(
         initial: Initial q_A and v_A.
         frames: Links of outputs.
         times: (N,) instants of the references [s].
+        nominal_start: (nv,) configuration from which the initial one is a small motion.
         variant: A machine of the same structure with its controller, whose constants are computed
             instead.
     """
@@ -78,6 +81,7 @@ def simulation_constants_of(
     # the scale of residuals does not affect the motion
     geometry[-1] = dynamics.machine.closure.compiled_closure.geometry.constants[-1]
     q = machine.closure.solve(initial[0], initial_guess=machine.home)
+    motion = np.linalg.solve(machine.coordinates.rate_matrix(nominal_start), q - nominal_start)
     # compiling does not pay for a single configuration
     controller_state = control.start_closed(Dynamics(machine, backend="pinocchio"), q)
     if isinstance(control, ValveDrive):
@@ -100,7 +104,7 @@ def simulation_constants_of(
         np.asarray(control.settings, dtype=np.float64),
         np.concatenate(frame_constants),
         reference_samples(machine, control, times),
-        np.concatenate([*initial, controller_state]),
+        np.concatenate([motion[machine.closure.active], initial[1], controller_state]),
     )
 
 
@@ -133,6 +137,7 @@ class ParameterDirections:
     ):
         self._dynamics, self._control = dynamics, control
         self._initial_motion, self._frames = start, frames
+        self._start = dynamics.machine.closure.solve(start[0], initial_guess=dynamics.machine.home)
 
     @cached_property
     def _constant_derivatives(self) -> ConstantDerivatives:
@@ -209,7 +214,7 @@ class ParameterDirections:
             control.for_machine(machine) if isinstance(control, ValveDrive) else control
         )
         return simulation_constants_of(
-            self._dynamics, machine_controller, start, self._frames, times, machine
+            self._dynamics, machine_controller, start, self._frames, times, self._start, machine
         )
 
     def _start_derivative(self, name: str, times: Array) -> SimulationConstants:

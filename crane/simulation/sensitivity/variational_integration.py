@@ -181,8 +181,6 @@ class VariationalIntegrator:
         is_variable = (np.any(part != 0, axis=tuple(range(part.ndim - 1))) for part in directions)
         self._forward_derivatives = ForwardDerivatives(
             motion.chart,
-            motion.control,
-            motion.controller_state_count,
             motion.stiff_state_count,
             outputs,
             SimulationConstants(*(part.astype(np.float64) for part in is_variable)),

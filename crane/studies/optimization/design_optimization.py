@@ -3,13 +3,12 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.stats import qmc
 
 from crane.common.errors import InputError, check_name
-from crane.common.progress import progress_reporter
+from crane.common.progress import Progress, progress_reporter
 from crane.common.result import Result
 from crane.common.samples import Array, as_count, as_seed
 from crane.formats.machine_loading import MachineVariants
@@ -39,6 +38,7 @@ from crane.studies.optimization.variant_measures import (
     available_measures,
     check_unique_names,
     load_positions,
+    unique_names,
 )
 from crane.studies.parallel_jobs import (
     StoredResults,
@@ -174,7 +174,7 @@ def design(
     processes: int = 1,
     scheduler: str | None = None,
     checkpoint: str | Path | None = None,
-    progress: Any = None,
+    progress: Progress | None = None,
 ) -> Design:
     """Find the parameters of a machine that are best for measures of it.
 
@@ -221,9 +221,7 @@ def design(
     if not objectives:
         raise InputError("no objective is given, name what to minimise or to maximise")
     names, lower, upper = ranges = _parameter_ranges(base_machine, vary)
-    chosen_tasks = tuple(base_machine.tasks if tasks is None else tasks)
-    for task in chosen_tasks:
-        check_name(task, base_machine.tasks, f"task '{task}' is unknown")
+    chosen_tasks = unique_names("task", base_machine.tasks, tasks)
     options = MeasureOptions(frame, find_rule(rule), chosen_tasks, load_user_measures(measures))
     base_job = _base_job(base_machine, name, ranges, objectives, require, options, measures)
     initial_values = np.array([MachineVariants(base_machine).values[x] for x in names])
@@ -234,12 +232,12 @@ def design(
     total = starts * len(objectives) + (points if is_multi_objective else 0)
 
     def solve_jobs(
-        jobs: Sequence[DesignJob], finished: int, kept: StoredResults[DesignSolution] | None
+        jobs: Sequence[DesignJob], finished: int, kept: StoredResults[DesignSolution]
     ) -> list[DesignSolution]:
         return compute_jobs(
             solve_design_job, jobs, processes, scheduler,
-            lambda done: progress and progress((finished + done) / total),
-            kept and replace(kept, keys=[(str(finished + i),) for i in range(len(jobs))]),
+            lambda done: progress((finished + done) / total),
+            replace(kept, keys=[(str(finished + i),) for i in range(len(jobs))]),
         )  # fmt: skip
 
     single_jobs = [
@@ -390,7 +388,7 @@ def _simplex_weights(objective_count: int, point_count: int) -> Array:
         :point_count
     ]
     samples = -np.log(np.clip(samples, 1e-9, 1.0))
-    return np.asarray(samples / samples.sum(axis=1, keepdims=True))
+    return samples / samples.sum(axis=1, keepdims=True)
 
 
 def _nondominated(solutions: Sequence[DesignSolution]) -> list[DesignSolution]:

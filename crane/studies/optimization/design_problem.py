@@ -11,7 +11,7 @@ from zlib import crc32
 import numpy as np
 from scipy.optimize import minimize
 
-from crane.common.checkpoint import Checkpoint
+from crane.common.checkpoint import open_checkpoint
 from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
@@ -121,14 +121,13 @@ class DesignProblem:
                 with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
                     evaluation = VariantEvaluation(
                         self._variants,
-                        job.parameter_names,
-                        values,
-                        job.upper - job.lower,
+                        dict(zip(job.parameter_names, values.tolist(), strict=True)),
                         self._options,
                         self._load_positions,
+                        dict(zip(job.parameter_names, job.upper - job.lower, strict=True)),
                     )
                     duals = [
-                        evaluation.evaluate_dual(x) for x in (*self.objectives, *self.requirements)
+                        evaluation.evaluate(x) for x in (*self.objectives, *self.requirements)
                     ]
                 for text, x in zip((*self.objectives, *self.requirements), duals, strict=True):
                     if not (np.isfinite(x.value) and np.isfinite(x.derivatives).all()):
@@ -152,8 +151,7 @@ class DesignProblem:
                 initial_values, values, np.full(count, np.nan),
                 np.full(len(self.requirements), -np.inf), False, str(error),
             )  # fmt: skip
-        slacks = np.array([x.value for x in duals[count:]])
-        slacks = np.where(np.array(self.job.is_equality, dtype=bool), -np.abs(slacks), slacks)
+        slacks = self.signed_slacks(np.array([x.value for x in duals[count:]]))
         tolerances = _REQUIREMENT_TOLERANCE * np.array(self.scales(duals[count:], 0.0))
         objectives = np.array([x.value for x in duals[:count]])
         return DesignSolution(
@@ -168,6 +166,10 @@ class DesignProblem:
     def with_all_objectives(self, solution: DesignSolution) -> DesignSolution:
         """Return a solution with the values of all objectives."""
         return self.solution(solution.initial_values, solution.values, solution.message)
+
+    def signed_slacks(self, values: Array) -> Array:
+        """Return the slacks of requirements with these values, never above 0 for equalities."""
+        return np.where(np.array(self.job.is_equality, dtype=bool), -np.abs(values), values)
 
     def scales(self, duals: Sequence[DualNumber], smallest: float) -> list[float]:
         """Return the scale of each value: its magnitude, or its change over a range."""
@@ -189,7 +191,7 @@ def solution_columns(
 @contextmanager
 def kept_solutions(
     checkpoint: str | Path | None, machine: Machine, job: DesignJob, settings: tuple[object, ...]
-) -> Iterator[StoredResults[DesignSolution] | None]:
+) -> Iterator[StoredResults[DesignSolution]]:
     """Context of the solutions in a checkpoint, if there is one, without the keys of jobs.
 
     Args:
@@ -198,9 +200,6 @@ def kept_solutions(
         job: Job with all objectives; jobs with one objective leave cells empty.
         settings: All that the solutions depend on besides the machine.
     """
-    if checkpoint is None:
-        yield None
-        return
     sizes = len(job.lower), len(job.objectives), len(job.requirements), 1, len(job.lower), 1
     ends = np.cumsum(sizes).tolist()
 
@@ -221,7 +220,7 @@ def kept_solutions(
 
     starts = [f"start {name}" for name in job.parameter_names]
     columns = solution_columns(job.parameter_names, len(job.objectives), len(job.requirements))
-    with Checkpoint(
+    with open_checkpoint(
         checkpoint,
         {"machine data": MachineVariants(machine).spec, "settings": settings},
         ["search", *columns, *starts, "termination"],
@@ -285,8 +284,8 @@ class _DesignSearch:
         constraints: Any = [
             {
                 "type": kind,
-                "fun": lambda x, k=k: self._constraint_values(x)[k],
-                "jac": lambda x, k=k: self._constraint_jacobian(x)[k],
+                "fun": lambda x, k=k: self._constraints(x)[0][k],
+                "jac": lambda x, k=k: self._constraints(x)[1][k],
             }
             for kind, k in (
                 ("ineq", np.flatnonzero(~is_equality)),
@@ -313,11 +312,8 @@ class _DesignSearch:
 
     def _shortfall(self, scaled_values: Array) -> float:
         """Return the largest violation of a requirement, as a share of its scale."""
-        slacks = scaled_values[self._objective_count :]
-        if not len(slacks):
-            return 0.0
-        is_equality = np.array(self._job.is_equality, dtype=bool)
-        return max(0.0, -float(np.where(is_equality, -np.abs(slacks), slacks).min()))
+        slacks = self._problem.signed_slacks(scaled_values[self._objective_count :])
+        return max(0.0, -float(slacks.min(initial=0.0)))
 
     def _scaled_values(self, x: Array) -> tuple[Array, Array] | None:
         """Return scaled objectives, then requirements, and their derivatives by x."""
@@ -351,25 +347,19 @@ class _DesignSearch:
             return _INFEASIBLE_COST * worst, np.zeros(len(x))
         return float(scaled[0][0]), scaled[1][0]
 
-    def _constraint_count(self) -> int:
-        return len(self._requirement_scales) + self._has_bound * self._objective_count
+    def _constraints(self, x: Array) -> tuple[Array, Array]:
+        """Return the slacks of several objectives to their bound, then of the requirements.
 
-    def _constraint_values(self, x: Array) -> Array:
-        """Return the slacks of several objectives to their bound, then of the requirements."""
+        Their derivatives by x are the second result.
+        """
         scaled, count = self._scaled_values(x), self._objective_count
         if scaled is None:
-            return np.full(self._constraint_count(), -_INFEASIBLE_COST)
+            size = len(self._requirement_scales) + self._has_bound * count
+            return np.full(size, -_INFEASIBLE_COST), np.zeros((size, len(x)))
+        values, derivatives = scaled
         if not self._has_bound:
-            return scaled[0][count:]
-        return np.concatenate([x[-1] - scaled[0][:count], scaled[0][count:]])
-
-    def _constraint_jacobian(self, x: Array) -> Array:
-        scaled, count = self._scaled_values(x), self._objective_count
-        if scaled is None:
-            return np.zeros((self._constraint_count(), len(x)))
-        if not self._has_bound:
-            return scaled[1][count:]
-        jacobian = np.zeros((self._constraint_count(), len(x)))
-        jacobian[:, :-1] = np.vstack([-scaled[1][:count], scaled[1][count:]])
+            return values[count:], derivatives[count:]
+        jacobian = np.zeros((len(values), len(x)))
+        jacobian[:, :-1] = np.vstack([-derivatives[:count], derivatives[count:]])
         jacobian[:count, -1] = 1.0
-        return jacobian
+        return np.concatenate([x[-1] - values[:count], values[count:]]), jacobian

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from crane.common.errors import InputError
+from crane.common.number_text import parse_expression
 from crane.common.samples import Array
 from crane.machine.machine import Machine
 
@@ -51,66 +52,44 @@ class DualNumber:
 
     def __pow__(self, power: "DualNumber") -> "DualNumber":
         if power.derivatives.any():
-            return exp(power * log(self))
-        value, exponent = self.value**power.value, power.value
-        if not exponent or not self.derivatives.any():
-            return DualNumber(value, np.zeros_like(self.derivatives))
-        return _apply_chain_rule(self, value, exponent * self.value ** (exponent - 1.0))
+            return _exp(power * _log(self))
+        exponent = power.value
+        root = _elementary(
+            lambda x: x**exponent, lambda x: exponent * x ** (exponent - 1.0) if exponent else 0.0
+        )
+        return root(self)
 
     def __abs__(self) -> "DualNumber":
         return -self if self.value < 0 else self
 
 
-def _apply_chain_rule(x: DualNumber, value: float, outer_derivative: float) -> DualNumber:
-    return DualNumber(value, outer_derivative * x.derivatives)
+def _elementary(
+    function: Callable[[float], float], derivative: Callable[[float], float]
+) -> Callable[[DualNumber], DualNumber]:
+    """Return a function of dual numbers, by the chain rule; what is constant stays constant."""
+
+    def apply(x: DualNumber) -> DualNumber:
+        value, varies = function(x.value), x.derivatives != 0
+        slope = derivative(x.value) if varies.any() else 0.0
+        changes = slope * np.where(varies, x.derivatives, 1.0)
+        return DualNumber(value, np.where(varies, changes, 0.0))
+
+    return apply
 
 
-def sqrt(x: DualNumber) -> DualNumber:
-    """Return the square root; at 0 with infinite derivatives."""
-    root = math.sqrt(x.value)
-    if not root:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return DualNumber(0.0, np.where(x.derivatives == 0, 0.0, x.derivatives / 0.0))
-    return _apply_chain_rule(x, root, 0.5 / root)
-
-
-def exp(x: DualNumber) -> DualNumber:
-    """Return the exponential."""
-    value = math.exp(x.value)
-    return _apply_chain_rule(x, value, value)
-
-
-def log(x: DualNumber) -> DualNumber:
-    """Return the natural logarithm."""
-    return _apply_chain_rule(x, math.log(x.value), 1.0 / x.value)
-
-
-def sin(x: DualNumber) -> DualNumber:
-    """Return the sine."""
-    return _apply_chain_rule(x, math.sin(x.value), math.cos(x.value))
-
-
-def cos(x: DualNumber) -> DualNumber:
-    """Return the cosine."""
-    return _apply_chain_rule(x, math.cos(x.value), -math.sin(x.value))
-
-
-def degrees(x: DualNumber) -> DualNumber:
-    """Return an angle [rad] in degrees."""
-    factor = 180.0 / math.pi
-    return _apply_chain_rule(x, x.value * factor, factor)
-
-
+_exp = _elementary(math.exp, math.exp)
+_log = _elementary(math.log, lambda x: 1.0 / x)
 DUAL_FUNCTIONS: dict[str, Callable[..., DualNumber]] = {
-    "sqrt": sqrt, "exp": exp, "log": log, "sin": sin, "cos": cos, "degrees": degrees, "abs": abs,
+    "sqrt": _elementary(math.sqrt, lambda x: 0.5 / math.sqrt(x) if x else math.inf),
+    "exp": _exp,
+    "log": _log,
+    "sin": _elementary(math.sin, math.cos),
+    "cos": _elementary(math.cos, lambda x: -math.sin(x)),
+    "degrees": _elementary(math.degrees, lambda x: math.degrees(1.0)),
+    "abs": abs,
     "min": partial(min, key=operator.attrgetter("value")),
     "max": partial(max, key=operator.attrgetter("value")),
-}  # fmt: skip
-
-
-def constant(value: float, count: int) -> DualNumber:
-    """Return a constant with `count` zero derivatives."""
-    return DualNumber(value, np.zeros(count))
+}
 
 
 _OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
@@ -146,14 +125,12 @@ class MeasureExpression:
                 f"an expression has {len(self.text)} characters, give 1 to {_MAX_LENGTH}"
             )
         try:
-            self._tree = ast.parse(self.text, mode="eval").body
-        except (SyntaxError, ValueError, MemoryError, RecursionError):
-            raise InputError(
-                f"'{self.text[:80]}' is no expression, write such as 2*peak_X + 1"
-            ) from None
+            self._tree = parse_expression(self.text)
+        except ValueError as error:
+            raise InputError(f"{error}, write such as 2*peak_X + 1") from None
         if sum(1 for _ in ast.walk(self._tree)) > _MAX_NODES:
             raise InputError(f"an expression has more than {_MAX_NODES} parts, make it shorter")
-        self._check_node(self._tree)
+        self(lambda name: np.nan, lambda name, arguments: np.nan, lambda number: np.nan)
 
     def __call__(
         self,
@@ -172,20 +149,36 @@ class MeasureExpression:
             InputError: The result is not a number, such as the root of a negative number.
         """
 
+        def invalid(what: str) -> InputError:
+            return InputError(
+                f"'{self.text}' has {what}, write numbers, names, + - * / ** and f(x)"
+            )
+
         def evaluate(node: ast.AST) -> Any:
             match node:
                 case ast.Constant(value=str(word)):
                     return word
-                case ast.Constant(value=int(number) | float(number)):
+                case ast.Constant(value=int(number) | float(number)) if not isinstance(
+                    number, bool
+                ):
+                    if not abs(number) < _MAX_CONSTANT:
+                        raise invalid("a number that is not finite")
                     return constant(float(number))
-                case ast.UnaryOp(op=op, operand=operand):
-                    value = evaluate(operand)
-                    return -value if isinstance(op, ast.USub) else value
-                case ast.BinOp(left=left, op=op, right=right):
+                case ast.Constant(value=value):
+                    raise invalid(f"{value!r}")
+                case ast.UnaryOp(op=ast.USub(), operand=operand):
+                    return -evaluate(operand)
+                case ast.UnaryOp(op=ast.UAdd(), operand=operand):
+                    return evaluate(operand)
+                case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
                     return _OPERATORS[type(op)](evaluate(left), evaluate(right))
-                case ast.Call(func=func, args=args):
-                    return evaluate_call(_dotted_name(func), tuple(map(evaluate, args)))
-            return evaluate_name(_dotted_name(node))
+                case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
+                    return evaluate_call(name, tuple(map(evaluate, args)))
+                case ast.Name() | ast.Attribute():
+                    return evaluate_name(_dotted_name(node))
+                case ast.Starred():
+                    raise invalid("a star")
+            raise invalid(f"'{ast.unparse(node)}'")
 
         try:
             result = evaluate(self._tree)
@@ -195,33 +188,6 @@ class MeasureExpression:
         if isinstance(value, complex | str):
             raise InputError(f"'{self.text}' has no value: it is {value!r}, no number")
         return result
-
-    def _check_node(self, node: ast.AST) -> None:
-        def create_error(what: str) -> InputError:
-            return InputError(
-                f"'{self.text}' has {what}, write numbers, names, + - * / ** and f(x)"
-            )
-
-        match node:
-            case ast.Constant(value=value):
-                if isinstance(value, bool) or not isinstance(value, int | float | str):
-                    raise create_error(f"{value!r}")
-                if not isinstance(value, str) and not abs(value) < _MAX_CONSTANT:
-                    raise create_error("a number that is not finite")
-            case ast.Name() | ast.Attribute():
-                _dotted_name(node)
-            case ast.UnaryOp(op=ast.USub() | ast.UAdd(), operand=operand):
-                self._check_node(operand)
-            case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
-                self._check_node(left)
-                self._check_node(right)
-            case ast.Call(func=ast.Name(), args=args, keywords=[]):
-                for x in args:
-                    self._check_node(x)
-            case ast.Starred():
-                raise create_error("a star")
-            case _:
-                raise create_error(f"'{ast.unparse(node)}'")
 
 
 def parse_requirement(text: str) -> tuple[MeasureExpression, bool]:

@@ -1,12 +1,11 @@
 """Measures of a variant of a machine, and their derivatives by the parameters that vary."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
 
 from crane.common.errors import CraneError, InputError, check_name
 from crane.common.samples import Array
@@ -14,6 +13,8 @@ from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.statics import StaticsEvaluator
 from crane.formats.machine_loading import MachineVariants
 from crane.machine.machine import Machine
+from crane.motion.kinematics import Kinematics
+from crane.motion.workspaces.workspace_extremes import maximize_on_branch
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.lifting_capacity import capacity, torques
 from crane.ratings.rating_rules import Rule
@@ -29,7 +30,6 @@ from crane.studies.optimization.measure_expressions import (
     DualNumber,
     MeasureExpression,
     MeasureFunction,
-    constant,
     evaluate_user_measure,
 )
 
@@ -68,11 +68,11 @@ class VariantEvaluation:
 
     Args:
         variants: Variants of the machine.
-        parameter_names: Parameters that vary, in order.
-        values: (k,) values of these parameters.
-        ranges: (k,) ranges of these parameters, which scale the steps of differences.
+        values: Values of the parameters that vary, by name.
         options: Options of the measures.
         load_positions: All arguments of `load` that are needed, to compute them together.
+        ranges: Ranges of the k parameters by which derivatives are computed, by name; they scale
+            the steps of differences.
 
     Raises:
         CraneError: The machine cannot be assembled with these parameters.
@@ -81,82 +81,77 @@ class VariantEvaluation:
     def __init__(
         self,
         variants: MachineVariants,
-        parameter_names: Sequence[str],
-        values: Array,
-        ranges: Array,
+        values: Mapping[str, float],
         options: MeasureOptions,
         load_positions: Sequence[tuple[float, ...]] = (),
+        ranges: Mapping[str, float] | None = None,
     ):
-        self._variants, self._parameter_names = variants, list(parameter_names)
-        self._values = values
-        self._ranges, self._options, self._load_positions = ranges, options, list(load_positions)
-        self.machine = variants.machine(dict(zip(parameter_names, values.tolist(), strict=True)))
-        self._loads: dict[tuple[bool, tuple[float, ...]], DualNumber] = {}
-        self._measure, self._extreme = cache(self._compute_measure), cache(self._find_extreme)
-        self._perturbed = cache(self._create_neighbour)
+        self._variants, self._values, self._ranges = variants, dict(values), ranges or {}
+        self._options, self._load_positions = options, list(load_positions)
+        self.machine = variants.machine(self._values)
+        self._loads: dict[tuple[float, ...], DualNumber] = {}
+        self._measure, self._neighbour = (
+            cache(self._compute_measure),
+            cache(self._create_neighbour),
+        )
 
-    def evaluate(self, expression: MeasureExpression) -> float:
-        """Return the value of an expression."""
-        return _evaluate(expression, lambda *call: constant(self._measure(*call), 0), 0).value
+    def evaluate(self, expression: MeasureExpression) -> DualNumber:
+        """Return the value of an expression with its derivatives (k,)."""
 
-    def evaluate_dual(self, expression: MeasureExpression) -> DualNumber:
-        """Return the value of an expression with its derivatives."""
-        return _evaluate(expression, self._dual_measure, len(self._parameter_names))
+        def call(name: str, arguments: tuple[Any, ...]) -> DualNumber:
+            if name in DUAL_FUNCTIONS:
+                return DUAL_FUNCTIONS[name](*arguments)
+            return self._measure(name, tuple(getattr(x, "value", x) for x in arguments))
 
-    def _dual_measure(self, name: str, arguments: tuple[Any, ...]) -> DualNumber:
+        result: DualNumber = expression(lambda name: self._measure(name, ()), call, self._constant)
+        return result
+
+    def _constant(self, value: float) -> DualNumber:
+        return DualNumber(value, np.zeros(len(self._ranges)))
+
+    def _compute_measure(self, name: str, arguments: tuple[Any, ...]) -> DualNumber:
         if name == "load":
             return self._rated_load(arguments)
         if name in ("reach", "highest", "lowest", "nearest"):
-            value, q = self._extreme(name, arguments)
-            return DualNumber(value, self._extreme_derivatives(name, arguments, q))
+            return self._find_extreme(name, arguments)
         if name == "mass":
-            derivatives = np.zeros(0)
-            if self._parameter_names:
-                derivatives = self._statics.parameter_derivatives(
-                    self.machine.home[None], self._parameter_names
-                ).total_mass[0]
-            return DualNumber(self._measure(name, ()), derivatives)
+            home = self.machine.home[None]
+            mass = self._constant(float(self._statics.evaluate(home).total_mass[0]))
+            if not self._ranges:
+                return mass
+            slopes = self._statics.parameter_derivatives(home, list(self._ranges))
+            return replace(mass, derivatives=slopes.total_mass[0])
         if name == "number" or (name in self._variants.values and not arguments):
-            parameter = str(arguments[0]) if name == "number" else name
-            derivatives = np.array([float(parameter == other) for other in self._parameter_names])
-            return DualNumber(self._measure(name, arguments), derivatives)
-        return DualNumber(self._measure(name, arguments), self._differences(name, arguments))
+            parameter = str(arguments[0]) if arguments else name
+            derivatives = np.array([float(parameter == other) for other in self._ranges])
+            return DualNumber(self._parameter_value(parameter), derivatives)
+        value = self._measured_value(name, arguments)
+        return DualNumber(value, self._differences(name, arguments, value))
 
-    def _differences(self, name: str, arguments: tuple[Any, ...]) -> Array:
+    def _differences(self, name: str, arguments: tuple[Any, ...], nominal: float) -> Array:
         """Return central differences of a measure; one-sided if one side cannot be assembled."""
-        nominal = self._measure(name, arguments)
-        out = np.zeros(len(self._parameter_names))
-        for i, step in enumerate(_DIFFERENCE_STEP * self._ranges):
-            signed_values = []
+        out = np.zeros(len(self._ranges))
+        for i, (parameter, interval) in enumerate(self._ranges.items()):
+            step, signed_values = _DIFFERENCE_STEP * interval, []
             for sign in (1.0, -1.0):
                 try:
-                    signed_values.append(
-                        (sign, self._perturbed(i, sign * step)._measure(name, arguments))
-                    )
+                    neighbour = self._neighbour(parameter, sign * step)
+                    signed_values.append((sign, neighbour._measure(name, arguments).value))
                 except CraneError:
                     signed_values.append((0.0, nominal))
             (upper_sign, upper_value), (lower_sign, lower_value) = signed_values
             if upper_sign == lower_sign:
-                raise InputError(
-                    f"'{name}' cannot be followed as '{self._parameter_names[i]}' varies"
-                )
+                raise InputError(f"'{name}' cannot be followed as '{parameter}' varies")
             out[i] = (upper_value - lower_value) / ((upper_sign - lower_sign) * step)
         return out
 
-    def _create_neighbour(self, parameter_index: int, step: float) -> "VariantEvaluation":
-        values = self._values.copy()
-        values[parameter_index] += step
-        return VariantEvaluation(
-            self._variants, self._parameter_names, values, self._ranges, self._options,
-            self._load_positions,
-        )  # fmt: skip
+    def _create_neighbour(self, parameter: str, step: float) -> "VariantEvaluation":
+        values = self._values | {parameter: self._values[parameter] + step}
+        return VariantEvaluation(self._variants, values, self._options, self._load_positions)
 
-    def _compute_measure(self, name: str, arguments: tuple[Any, ...]) -> float:
+    def _measured_value(self, name: str, arguments: tuple[Any, ...]) -> float:
+        """Return the value of a measure without exact derivatives."""
         machine = self.machine
-        if name == "load":
-            return self._rated_load(arguments, False).value
-        if name in ("reach", "highest", "lowest", "nearest"):
-            return self._extreme(name, arguments)[0]
         if name == "net_torque":
             return torques(
                 machine, self._options.frame, radius=arguments[0], rule=self._options.rule
@@ -165,10 +160,6 @@ class VariantEvaluation:
             radius = float(np.median(self._configuration_search.section_positions[:, 0]))
             result = torques(machine, self._options.frame, rule=self._options.rule, radius=radius)
             return result.gross_torque if name == "gross_torque" else result.slewing_torque
-        if name == "mass":
-            return float(self._statics.evaluate(machine.home[None]).total_mass[0])
-        if name == "number":
-            return self._parameter_value(str(arguments[0]))
         if name in self._options.user_measures:
             return evaluate_user_measure(name, self._options.user_measures[name], machine)
         if name in task_measures(machine):
@@ -180,9 +171,7 @@ class VariantEvaluation:
         return self._parameter_value(name)
 
     def _parameter_value(self, name: str) -> float:
-        values = self._variants.values | dict(
-            zip(self._parameter_names, self._values, strict=True)
-        )
+        values = self._variants.values | self._values
         if name not in values:
             known = available_measures(self.machine, self._options.user_measures)
             check_name(name, known, f"measure '{name}' is unknown")
@@ -209,30 +198,20 @@ class VariantEvaluation:
     def _stroke_values(self) -> dict[str, float]:
         return measure_strokes(self.machine)
 
-    def _rated_load(
-        self, position: tuple[float, ...], with_derivatives: bool = True
-    ) -> DualNumber:
+    def _rated_load(self, position: tuple[float, ...]) -> DualNumber:
         """Return the rated load at a position, 0 if it is out of reach, with derivatives."""
-        if (with_derivatives, position) not in self._loads:
-            all_positions = [
-                position,
-                *(x for x in self._load_positions if (with_derivatives, x) not in self._loads),
-            ]
+        if position not in self._loads:
             by_slew: dict[tuple[float, ...], list[tuple[float, ...]]] = {}
-            for x in all_positions:
+            for x in (position, *(x for x in self._load_positions if x not in self._loads)):
                 by_slew.setdefault(x[2:], []).append(x)
             for slews, positions in by_slew.items():
-                self._compute_loads(positions, slews, with_derivatives)
-        return self._loads[with_derivatives, position]
+                self._compute_loads(positions, slews)
+        return self._loads[position]
 
     def _compute_loads(
-        self,
-        positions: Sequence[tuple[float, ...]],
-        slews: tuple[float, ...],
-        with_derivatives: bool,
+        self, positions: Sequence[tuple[float, ...]], slews: tuple[float, ...]
     ) -> None:
         radii, heights = (sorted({x[i] for x in positions}) for i in (0, 1))
-        zero = constant(0.0, len(self._parameter_names))
         try:
             chart = capacity(
                 self.machine, self._options.frame, rule=self._options.rule, radii=radii,
@@ -241,21 +220,21 @@ class VariantEvaluation:
         except InputError as error:
             if "reaches none" not in str(error):
                 raise
-            self._loads |= {(with_derivatives, place): zero for place in positions}
+            self._loads |= {place: self._constant(0.0) for place in positions}
             return
-        chart_derivatives = chart.derivatives(self._parameter_names) if with_derivatives else None
+        chart_derivatives = chart.derivatives(list(self._ranges)) if self._ranges else None
         for position in positions:
             a, b = radii.index(position[0]), heights.index(position[1])
             loads = np.nan_to_num(chart.loads[:, b, a], nan=0.0)
             s = int(loads.argmin())
             if not np.isfinite(loads[s]):
                 raise InputError(f"nothing limits the load at {position}, choose another position")
-            load_derivatives = zero.derivatives
-            if chart_derivatives is not None and loads[s] > 0:
-                load_derivatives = chart_derivatives[s, b, a]
-                if np.isnan(load_derivatives).any():  # limited by a pin
-                    load_derivatives = self._differences("load", position)
-            self._loads[with_derivatives, position] = DualNumber(float(loads[s]), load_derivatives)
+            load = self._constant(float(loads[s]))
+            if chart_derivatives is not None and load.value > 0:
+                load = replace(load, derivatives=chart_derivatives[s, b, a])
+            if np.isnan(load.derivatives).any():  # limited by a pin
+                load = replace(load, derivatives=self._differences("load", position, load.value))
+            self._loads[position] = load
 
     def _extreme_objective(
         self, name: str, arguments: tuple[Any, ...], tip: Array
@@ -274,77 +253,39 @@ class VariantEvaluation:
         length = np.linalg.norm(horizontal, axis=1)
         return -length, -horizontal / np.maximum(length, 1e-300)[:, None]
 
-    def _find_extreme(self, name: str, arguments: tuple[Any, ...]) -> tuple[float, Array]:
-        """Return the extreme reach, height or distance of the tip, and its configuration.
+    def _find_extreme(self, name: str, arguments: tuple[Any, ...]) -> DualNumber:
+        """Return the extreme reach, height or distance of the tip.
 
-        It is searched from the best configurations over all strokes, with exact derivatives.
+        It is searched from the best configurations over all strokes, with exact derivatives. Its
+        derivatives are those at its fixed configuration (envelope theorem).
         """
-        search, closure = self._configuration_search, self.machine.closure
-        strokes = search.moving
-        columns = closure.active[strokes]
-        lower, stroke_lengths = search.low[strokes], (search.high - search.low)[strokes]
-        values = self._extreme_objective(
-            name, arguments, search.statics.evaluate(search.configurations).tip_positions
-        )[0]
-        order = np.argsort(values, kind="stable")
-        lowest_cost, best_configuration = np.inf, search.configurations[order[0]]
-        for start_index in order[:: max(1, len(order) // 50)][:_START_COUNT].tolist():
-            start = search.configurations[start_index]
-            last_closed = [start]
-
-            def cost(x: Array, last: list[Array] = last_closed) -> tuple[float, Array]:
-                q = last[0].copy()
-                q[columns] = lower + x * stroke_lengths
-                closed_configurations, is_closed = search.statics.close_loops(q[None])
-                if not is_closed[0]:
-                    return 1e6, np.zeros(len(x))
-                last[0] = closed_configurations[0]
-                statics = search.statics.evaluate(closed_configurations)
-                value, gradient = self._extreme_objective(name, arguments, statics.tip_positions)
-                return float(value[0]), (
-                    gradient[0] @ statics.tip_jacobian[0][:, strokes]
-                ) * stroke_lengths
-
-            result = minimize(
-                cost, (start[columns] - lower) / stroke_lengths, jac=True, method="L-BFGS-B",
-                bounds=[(0.0, 1.0)] * len(strokes), options={"ftol": 1e-15, "gtol": 1e-10},
-            )  # fmt: skip
-            cost(result.x)
-            if result.fun < lowest_cost:
-                lowest_cost, best_configuration = float(result.fun), last_closed[0]
-        sign = -1.0 if name in ("reach", "highest") else 1.0
-        return sign * lowest_cost, best_configuration
-
-    def _extreme_derivatives(self, name: str, arguments: tuple[Any, ...], q: Array) -> Array:
-        """Return the derivatives at the fixed configuration of the extreme (envelope theorem)."""
-        if not self._parameter_names:
-            return np.zeros(0)
-        tip_derivatives = self._statics.parameter_derivatives(
-            q[None], self._parameter_names
-        ).tip_positions[0]
-        _, gradient = self._extreme_objective(
-            name, arguments, self._statics.evaluate(q[None]).tip_positions
+        search, kinematics = (
+            self._configuration_search,
+            Kinematics(self.machine, self._statics.frame),
         )
-        sign = -1.0 if name in ("reach", "highest") else 1.0
-        return np.asarray(sign * gradient[0] @ tip_derivatives)
 
+        def objective(q: Array) -> tuple[float, Array]:
+            tip = kinematics.position_at_configuration(q)[None]
+            values, gradients = self._extreme_objective(name, arguments, tip)
+            return -float(values[0]), -gradients[0] @ kinematics.tree_jacobian(q)
 
-def _evaluate(
-    expression: MeasureExpression,
-    measure: Callable[[str, tuple[Any, ...]], DualNumber],
-    derivative_count: int,
-) -> DualNumber:
-    """Return an expression of measures, each a function of its name and arguments."""
-
-    def call(name: str, arguments: tuple[Any, ...]) -> DualNumber:
-        if name in DUAL_FUNCTIONS:
-            return DUAL_FUNCTIONS[name](*arguments)
-        return measure(name, tuple(getattr(x, "value", x) for x in arguments))
-
-    result: DualNumber = expression(
-        lambda name: measure(name, ()), call, lambda x: constant(x, derivative_count)
-    )
-    return result
+        tips = self._statics.evaluate(search.configurations).tip_positions
+        order = np.argsort(self._extreme_objective(name, arguments, tips)[0], kind="stable")
+        found = [
+            maximize_on_branch(
+                self.machine, q, search.moving, (search.low, search.high), objective
+            )
+            for q in search.configurations[order[:: max(1, len(order) // 50)][:_START_COUNT]]
+        ]
+        value, best = max(found, key=lambda pair: pair[0])
+        sign, q = 1.0 if name in ("reach", "highest") else -1.0, best[None]
+        extreme = self._constant(sign * value)
+        if not self._ranges:
+            return extreme
+        tips = self._statics.evaluate(q).tip_positions
+        gradient = -sign * self._extreme_objective(name, arguments, tips)[1][0]
+        derivatives = self._statics.parameter_derivatives(q, list(self._ranges))
+        return replace(extreme, derivatives=gradient @ derivatives.tip_positions[0])
 
 
 def available_measures(
@@ -368,6 +309,15 @@ def check_unique_names(
     for name in user_measures:
         if name in {*known_measures, *PLAIN_MEASURES, *_ARGUMENT_COUNTS, *DUAL_FUNCTIONS}:
             raise InputError(f"a measure '{name}' exists already, give yours another name")
+
+
+def unique_names(
+    label: str, available: Mapping[str, object], requested: Sequence[str] | None
+) -> tuple[str, ...]:
+    """Return the requested names without repetitions; all by default."""
+    for name in requested or ():
+        check_name(name, available, f"{label} '{name}' is unknown")
+    return tuple(dict.fromkeys(available if requested is None else requested))
 
 
 def load_positions(expressions: Sequence[MeasureExpression]) -> list[tuple[float, ...]]:
