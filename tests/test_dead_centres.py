@@ -48,7 +48,7 @@ def test_gamma_is_judged_in_characteristic_lengths(tmp_path):
     root = np.sqrt(0.6**2 - (0.3 * np.sin(a)) ** 2)
     stroke_per_angle = -0.3 * np.sin(a) * (1 + 0.3 * np.cos(a) / root)
     rod_per_stroke = (1 + 0.3 * np.cos(a) / root) / stroke_per_angle
-    chart = Chart.from_dynamics(Dynamics(machine))
+    chart = Chart.from_dynamics(Dynamics(machine), None, 0)
     expected = rod_per_stroke * machine.closure.characteristic_length
     assert chart.largest_gamma_entry(machine.home) == pytest.approx(expected, rel=1e-12)
 

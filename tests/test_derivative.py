@@ -17,7 +17,7 @@ from crane.codegen.symbolic import (
     symbolic_entries,
     where_positive,
 )
-from crane.studies.optimization.measure_expressions import DualNumber, sqrt
+from crane.studies.optimization.measure_expressions import DUAL_FUNCTIONS, DualNumber
 
 
 def compiled(arrays, outputs):
@@ -152,5 +152,5 @@ def test_a_block_diagonal_matrix_stays_one():
 
 
 def test_a_square_root_at_zero_is_steep_where_its_argument_changes():
-    found = sqrt(DualNumber(0.0, np.array([0.0, 1.0, -2.0])))
+    found = DUAL_FUNCTIONS["sqrt"](DualNumber(0.0, np.array([0.0, 1.0, -2.0])))
     assert found.value == 0.0 and found.derivatives.tolist() == [0.0, np.inf, -np.inf]

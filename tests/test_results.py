@@ -1,7 +1,5 @@
 """Results write themselves into folders, from Python as from the command line."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from writing_commands import read
@@ -11,7 +9,7 @@ from crane.common.errors import OutputError
 from crane.common.result import Result
 from crane.identification.hydraulics.cylinder_equations import EquationSides
 from crane.identification.hydraulics.orifice_coefficients import OrificeCoefficients
-from crane.identification.hydraulics.valve_curve import ValveCurve
+from crane.identification.hydraulics.valve_curve import ValveCurve, _valve_parameters
 from crane.recordings.measured_recordings import read_run
 from crane.simulation.linear.linearization import linear_models
 from crane.view.result_files import RESULT_FILES, plot_result, result_summary
@@ -46,7 +44,8 @@ def power_comparison(folder):
 def valve_curve(_):
     samples = np.linspace(-4.0, 4.0, 9)
     values = np.array([0.5, -0.5, 0.1, 0.1])
-    return ValveCurve("x", values, np.eye(4), 5.0, 4.0, (1e-3, 8e-4), samples, samples, 0.01)
+    values = np.append(values, _valve_parameters(values, 4.0, (1e-3, 8e-4))[0])
+    return ValveCurve("x", values, np.eye(9), 5.0, 4.0, samples, samples, 0.01)
 
 
 def orifices(folder):
@@ -163,13 +162,11 @@ SLOW = "Calibration", "SignalExcitation"
 @pytest.mark.parametrize("signal_range", [5.0, -5.0])
 def test_slopes_of_what_a_valve_curve_gives_a_machine_file(signal_range):
     """Beside central differences, for valves that extend at high and at low signals."""
-    curve = dataclasses.replace(valve_curve(None), signal_range=signal_range)
-    curve.values[:] = [0.7, -0.4, 0.11, 0.09]
-    _, _, slopes = curve.valve_parameters()
+    values, areas = np.array([0.7, -0.4, 0.11, 0.09]), (1e-3, 8e-4)
+    _, slopes = _valve_parameters(values, signal_range, areas)
     for i, step in enumerate(1e-6 * np.eye(4)):
         more, less = (
-            dataclasses.replace(curve, values=curve.values + sign * step).valve_parameters()[1]
-            for sign in (1, -1)
+            _valve_parameters(values + sign * step, signal_range, areas)[0] for sign in (1, -1)
         )
         np.testing.assert_allclose(slopes[:, i], (more - less) / 2e-6, rtol=1e-7, atol=1e-12)
 
