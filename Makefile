@@ -13,7 +13,7 @@ export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test slow long lint docs bench referee reproduce clean
+.PHONY: help setup demo test slow long mutants lint docs bench referee reproduce clean
 
 help:
 	@echo "make setup   create .venv and install the package with its extras and development tools"
@@ -21,6 +21,7 @@ help:
 	@echo "make test    fast tests"
 	@echo "make slow    slow tests: browser, MuJoCo, long simulations"
 	@echo "make long    more of the same for an hour, before a release"
+	@echo "make mutants   100 random faults in the code, and which of them fast tests notice; an hour"
 	@echo "make lint    ruff and mypy"
 	@echo "make docs    the site, its tutorials executed and its links followed; build/site/index.html"
 	@echo "make bench   measure speed; results in docs/performance.md"
@@ -69,6 +70,12 @@ slow: $(READY_DEV)
 
 long: $(READY_DEV)
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m long
+
+# faults and the start of the random numbers: make mutants N=20 SEED=2
+N ?= 100
+SEED ?= 1
+mutants: $(READY_DEV)
+	$(BIN)/python scripts/mutants.py --number $(N) --seed $(SEED)
 
 lint: $(READY_DEV)
 	$(BIN)/python -m ruff check .

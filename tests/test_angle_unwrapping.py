@@ -66,6 +66,8 @@ def test_nothing_else_is_unwrapped(arm):
         assert unwrap_angles(arm, time, {"jb": saw, "other": saw}) == {}
         for angle in (0.7 * saw, np.where(time > 5, 3.0, -1.0) + 0.1 * np.sin(time), 1.3 * saw):
             assert unwrap_angles(arm, time, {"ja": angle}) == {}
+        back = np.where(time < 5, time * (2 * np.pi + 0.5) / 5, 0.5)  # after more than one
+        assert unwrap_angles(arm, time, {"ja": back}) == {}
         # a jolt of a revolution in an angle of several
         jolted = 3 * time + np.where((time > 4) & (time < 4.02), 2 * np.pi, 0.0)
         assert unwrap_angles(arm, time, {"ja": jolted}) == {}

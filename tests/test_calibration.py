@@ -13,13 +13,10 @@ from warned import quiet
 
 import crane
 from crane.common.errors import CraneError, CraneWarning, InputError
-from crane.description.parameter_changes import parameters
 from crane.description.sensors import Sensor
-from crane.formats.machine_loading import MachineVariants
 from crane.identification.calibration.calibration_result import residual_dependences
 from crane.identification.calibration.calibration_statistics import estimate_with_profiles
 from crane.identification.calibration.recording_case import noise_std
-from crane.identification.calibration.unknowns import build_unknowns
 from crane.recordings import table_reader, timeseries
 
 pytestmark = pytest.mark.slow
@@ -315,17 +312,6 @@ def test_a_measured_crane_lifts_as_it_did(tmp_path):
     near = slice(peak - 3, peak + 4)
     share = np.linalg.norm(simulated[near]) / np.linalg.norm(measured[near])
     assert 0.5 < share < 1.3
-
-
-def test_numbers_keep_their_sign():
-    """A piston that drives its joint backwards has a negative area."""
-    spec = MachineVariants(crane.load("kr300")).spec
-    numbers = parameters(spec)
-    names = ["gas_spring.stroke.area", "gas_spring.stroke.pressure", "link2_anchor.x"]
-    area, pressure, pin = build_unknowns(names, spec, numbers, {})
-    assert area.start < area.high < 0 and area.low == -np.inf
-    assert 0 < pressure.low < pressure.start and pressure.high == np.inf
-    assert (pin.low, pin.high) == (-np.inf, np.inf)
 
 
 @pytest.mark.long

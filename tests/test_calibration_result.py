@@ -1,9 +1,16 @@
 """Results of a calibration: ends of intervals, correlated directions, remaining errors."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from hydraulic_rig import AREA_A, AREA_B, COMPENSATED, HOSE, STROKE, rig
 
+import crane
+from crane.description.parameter_changes import parameters
+from crane.formats.machine_loading import MachineVariants
 from crane.identification.calibration.calibration_result import (
+    Calibration,
     FittedParameter,
     correlation_ratio,
     group_samples,
@@ -15,6 +22,47 @@ from crane.identification.calibration.calibration_statistics import (
     estimate_with_profiles,
     evaluate_profile_ends,
 )
+from crane.identification.calibration.unknowns import build_unknowns, candidate_parameters
+
+
+def test_numbers_keep_their_sign():
+    """A piston that drives its joint backwards has a negative area."""
+    spec = MachineVariants(crane.load("kr300")).spec
+    numbers = parameters(spec)
+    names = ["gas_spring.stroke.area", "gas_spring.stroke.pressure", "link2_anchor.x"]
+    area, pressure, pin = build_unknowns(names, spec, numbers, {})
+    assert area.start < area.high < 0 and area.low == -np.inf
+    assert 0 < pressure.low < pressure.start and pressure.high == np.inf
+    assert (pin.low, pin.high) == (-np.inf, np.inf)
+
+
+def test_what_may_be_fitted_of_a_cylinder(tmp_path):
+    """Its stiffness is at first that of its oil, K A^2 / V; some of V may be gas."""
+    machine = rig(tmp_path, COMPENSATED, friction={"viscous": 300.0})
+    valve = machine.hydraulics.valves["x"]
+    signals = {"x": np.array([valve.neutral, valve.full])}
+    case = SimpleNamespace(sensors=(), inputs=SimpleNamespace(signals=signals))
+    numbers = parameters(MachineVariants(machine).spec)
+    found = {x.name: x for x in candidate_parameters(machine, [case], numbers)}
+    volumes = AREA_A * STROKE + HOSE, AREA_B * STROKE + HOSE
+    stiffness = 1.2e9 * (AREA_A**2 / volumes[0] + AREA_B**2 / volumes[1])
+    assert found["cylinder.x.stiffness"].start == pytest.approx(stiffness, rel=1e-12)
+    for side, volume in zip("ab", volumes, strict=True):
+        assert found[f"cylinder.x.gas_{side}"].scale == pytest.approx(5e-3 * volume, rel=1e-12)
+
+
+def test_channels_that_fit_worse_than_before():
+    """By a tenth more than before, and by more than their noise."""
+
+    def channel(name, before, after, noise):
+        return SimpleNamespace(
+            name=name, recording="one", simulated_before=before, simulated_after=after,
+            noise=noise, rms=lambda residual, training: residual,
+        )  # fmt: skip
+
+    channels = [channel("better", 2.0, 1.0, 0.1), channel("alike", 2.0, 2.1, 0.1)]
+    channels += [channel("worse", 2.0, 2.3, 0.1), channel("noise", 0.01, 0.09, 0.1)]
+    assert Calibration.degraded_channels.fget(SimpleNamespace(channels=channels)) == ["worse"]
 
 
 class Fake:

@@ -96,6 +96,13 @@ def test_the_table_has_the_cells_of_the_chart(chart):
     assert chart.rule.description in text and "X_boom 350 bar (working pressure)" in text
 
 
+def test_the_largest_radius_lies_beyond_the_last_column(excavator):
+    chart = crane.capacity(excavator, radii=[7.0, 9.0], heights=[0.0], slews=[0.0])
+    (far,) = load_table(chart).max_radii
+    there = chart.at_positions([far, far + 2.0 / 25], [0.0])
+    assert far > 9.0 and np.isfinite(there.loads[0, 0]).tolist() == [True, False]
+
+
 def test_where_nothing_tips_nothing_is_marked():
     table = load_table(crane.capacity(crane.load("mini_forwarder"), step=0.02))
     assert not table.can_tip and table.limited_by_drives.any()

@@ -12,7 +12,9 @@ from warned import told
 import crane
 from crane.closure import change_points, home_search
 from crane.common.errors import CraneWarning, SimulationError
+from crane.dynamics.dynamics import Dynamics
 from crane.motion.trajectory import point_to_point
+from crane.simulation.integration.charts import Chart
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 GRAVITY = 9.81
@@ -38,6 +40,17 @@ def run(machine, joint, speed, duration, **settings):
         duration=duration,
         **settings,
     )
+
+
+def test_gamma_is_judged_in_characteristic_lengths(tmp_path):
+    """The rod's angle per stroke, of s = r cos a + sqrt(l^2 - r^2 sin^2 a)."""
+    machine, a = singular_linkages.slider_crank(tmp_path, "s", 0.3, 0.6), -np.pi / 4
+    root = np.sqrt(0.6**2 - (0.3 * np.sin(a)) ** 2)
+    stroke_per_angle = -0.3 * np.sin(a) * (1 + 0.3 * np.cos(a) / root)
+    rod_per_stroke = (1 + 0.3 * np.cos(a) / root) / stroke_per_angle
+    chart = Chart.from_dynamics(Dynamics(machine), None, 0)
+    expected = rod_per_stroke * machine.closure.characteristic_length
+    assert chart.largest_gamma_entry(machine.home) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("method, step", [("rk4", 2e-4), ("DOP853", 1e-3)])

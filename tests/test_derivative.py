@@ -17,6 +17,7 @@ from crane.codegen.symbolic import (
     symbolic_entries,
     where_positive,
 )
+from crane.studies.optimization.measure_expressions import DUAL_FUNCTIONS, DualNumber
 
 
 def compiled(arrays, outputs):
@@ -148,3 +149,8 @@ def test_a_block_diagonal_matrix_stays_one():
     a, b, c, d, e = tape.load_vector(0, 0, 5)
     factors = lu_factorize([[a, b, 0.0], [c, d, 0.0], [0.0, 0.0, e]])
     assert factors[0][2] == factors[1][2] == factors[2][0] == factors[2][1] == 0.0
+
+
+def test_a_square_root_at_zero_is_steep_where_its_argument_changes():
+    found = DUAL_FUNCTIONS["sqrt"](DualNumber(0.0, np.array([0.0, 1.0, -2.0])))
+    assert found.value == 0.0 and found.derivatives.tolist() == [0.0, np.inf, -np.inf]

@@ -171,6 +171,24 @@ def test_every_place_is_what_statics_by_hand_give(excavator, direction):
         assert field.forces[s, b, a] == pytest.approx(min(hand.values()), rel=1e-8)
 
 
+def test_directions_beside_the_plane_through_the_slewing_axis(excavator):
+    """A lip 0.5 m beside the plane: outwards at a radius r is asin(0.5 m / r) off the plane."""
+    beside = MachineVariants(excavator).machine({"bucket_lip.z": 0.5})
+    field = crane.ratings.tool_force(
+        beside, (1.0, 0.0, -1.0), radii=[4.0, 8.0], heights=[-4.0, 0.5], slews=[0.0, 1.2]
+    )
+    horizontal = np.sqrt(0.5 - 0.5 * (0.5 / field.radii) ** 2)
+    expected = np.stack([horizontal, np.full(2, -np.sqrt(0.5))], axis=1)
+    assert np.isfinite(field.forces).all()
+    assert np.abs(field.section_directions() - expected).max() < 1e-9
+
+
+def test_a_quarter_turn_is_rated_where_the_machine_can_tip(excavator):
+    given = {"direction": "up", "radii": [6.0], "heights": [0.0]}
+    assert np.ptp(crane.ratings.tool_force(excavator, **given).slews) == pytest.approx(np.pi / 2)
+    assert len(crane.ratings.tool_force(excavator, **given, weights=False).slews) == 1
+
+
 @pytest.mark.parametrize(
     ("given", "gap"),
     [

@@ -1,11 +1,14 @@
 """Estimators: closed forms, robustness, coverage of their intervals, and the jackknife."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter, sosfiltfilt
 from scipy.stats import f, t
 
 from crane.common.errors import InputError
+from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt
 from crane.identification.estimation.estimators import (
     huber,
     instrumental_variables,
@@ -14,6 +17,7 @@ from crane.identification.estimation.estimators import (
 )
 from crane.identification.estimation.noise_model import Jackknife, NoiseModel
 from crane.identification.mechanics.identifiability import essential_parameters
+from crane.identification.mechanics.identify_payload import _widen_covariance
 
 
 def white(count=800, size=4, seed=0, noise=0.5):
@@ -222,6 +226,43 @@ def test_how_long_noise_is_correlated():
         e[k] += 0.9 * e[k - 1]
     long, white = (NoiseModel.fit(x, np.arange(len(x))).correlation_time for x in (e, u))
     assert long == pytest.approx(1.81 / 0.19, rel=0.1) and white == pytest.approx(1, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("decay", "count", "expected"),
+    [
+        (0.9, 1000, 4 * 0.02 * (1 - 0.9**29) / 0.1),  # correlations down to 0.9^28 = 0.052
+        (0.0, 1000, (9.99 + 19.98) / 40),
+        (0.99, 1000, (9.99 + 19.98) / 8),
+    ],
+)
+def test_blocks_of_a_calibration_last_four_correlation_times(decay, count, expected):
+    """Residuals decay^k, whose autocorrelation is decay^k; at least 8 blocks, at most 40."""
+    residuals, cases = [], []
+    for step, its_decay in ((0.01, 0.0), (0.02, decay)):
+        time = step * np.arange(count)
+        inputs = SimpleNamespace(time=time)
+        mask = np.full(count, True)
+        cases.append(SimpleNamespace(inputs=inputs, train_mask=mask, sensors=("x", "p")))
+        columns = [np.zeros(count), its_decay ** np.arange(count)]
+        residuals.append(np.column_stack(columns).ravel())
+    fit = SimpleNamespace(training_cases=cases, residual=np.concatenate(residuals))
+    assert LevenbergMarquardt._block_duration(fit) == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("inflation", [0.5, 1.5, 4.0])
+def test_payloads_are_as_uncertain_as_their_segments_differ(inflation):
+    """A mean of ten segments, whose jackknife gives sum (m_i - m)^2 / (K (K - 1))."""
+    means = np.random.default_rng(3).normal(size=10)
+    variance = np.square(means - means.mean()).sum() / 90
+    segments = np.array([[[1.0, m], [0.0, 0.0]] for m in means])
+    equations = SimpleNamespace(segment_factors=lambda count: segments[:count])
+    estimate = SimpleNamespace(
+        noise=np.ones(10), covariance=np.array([[variance / inflation]]), degrees_of_freedom=77.0
+    )
+    covariance, freedom = _widen_covariance(equations, np.eye(1), estimate, np.eye(1))
+    assert covariance[0, 0] == pytest.approx(variance / min(inflation, 1.0), rel=1e-12)
+    assert freedom.tolist() == [9.0 if inflation > 1 else 77.0]
 
 
 @pytest.mark.parametrize("estimator", [least_squares, weighted_least_squares, huber])

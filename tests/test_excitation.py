@@ -1,7 +1,10 @@
 """Excitation trajectories: limits are kept, and the information that they carry."""
 
+import dataclasses
+
 import numpy as np
 import pytest
+import urdf_text
 from command_line import typed
 
 import crane
@@ -9,7 +12,10 @@ from crane.common.errors import InputError
 from crane.identification.excitation.fisher_information import FisherInformation
 from crane.identification.excitation.fourier_trajectory import FourierTrajectory, fourier_basis
 from crane.identification.excitation.periodic_excitation import excite
-from crane.identification.excitation.trajectory_optimizer import singularity_proximity
+from crane.identification.excitation.trajectory_optimizer import (
+    singularity_proximity,
+    trajectory_limits,
+)
 from crane.identification.mechanics.base_parameters import base_parameters, random_samples
 from crane.identification.mechanics.identification_model import IdentificationModel
 
@@ -319,6 +325,30 @@ def test_command(tmp_path):
         result = typed(*arguments, *extra)
         assert result.returncode == 2 and result.stdout == ""
         assert len(result.stderr.splitlines()) == 1 and text in result.stderr
+
+
+def test_joints_without_limits_stay_near_home(tmp_path):
+    """Within 1 rad, and within the 0.4 m between the joints."""
+    parts = [
+        urdf_text.body("beam", 1.0), urdf_text.joint("h", "base", "beam", axis=(0, 1, 0)),
+        urdf_text.body("slider", 1.0),
+        urdf_text.joint("s", "beam", "slider", (0.4, 0, 0), "prismatic", (1, 0, 0)),
+    ]  # fmt: skip
+    machine = crane.load(urdf_text.write(tmp_path, "two", "base", *parts))
+    limits = trajectory_limits(machine, margin=0.1)
+    np.testing.assert_allclose(limits.half_stroke, [0.9, 0.36], rtol=1e-12)
+
+
+@pytest.mark.parametrize(("pump", "through"), [(1.6667e-3, 6.6667e-4), (4e-4, 4e-4)])
+def test_valves_and_pumps_limit_velocities(patu, pump, through):
+    """By the larger side of each cylinder."""
+    hydraulics = patu.hydraulics
+    supply = dataclasses.replace(hydraulics.supply, flow=pump)
+    machine = patu.replace(hydraulics=dataclasses.replace(hydraulics, supply=supply))
+    limits = trajectory_limits(machine, margin=0.1)
+    for name, cylinder in hydraulics.cylinders.items():
+        expected = 0.9 * through / max(cylinder.area_a, cylinder.area_b)
+        assert limits.velocity[machine.active.index(name)] == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.slow

@@ -36,6 +36,13 @@ def test_forces_that_are_late_or_early_are_told(arm, seconds):
         assert values[f"{joint}.viscous"] == pytest.approx(spinning_arm.VISCOUS[i], rel=0.05)
 
 
+def test_each_recording_is_told_apart(arm):
+    given = [spinning_arm.recording(arm), spinning_arm.recording(arm, 0.03, seed=1)]
+    result, (line,) = told(lambda: crane.identify(arm, given))
+    assert "behind its motion" in line and line == result.delays[1].warning
+    assert not result.delays[0].warning
+
+
 def test_forces_on_time_are_not(arm):
     for seed in range(5):
         assert (

@@ -1,6 +1,7 @@
 """Identification from motions with known parameters, and how often samples are evaluated."""
 
 import dataclasses
+import re
 from functools import partial
 
 import forwarder_motions
@@ -69,7 +70,10 @@ def test_noise_is_all_that_is_left(mini, method):
     joints = slice(1, 3) if method == "ols" else slice(0, 3)
     assert np.all(result.training.rmse[joints] < 1.1 * floor[joints])
     assert np.all(result.validation.rmse[joints] < 1.1 * floor[joints])
-    assert "validation, samples near standstill excluded" in result.to_text()
+    text = result.to_text()
+    assert "validation, samples near standstill excluded" in text
+    for joint, unit in (("q1", "N m"), ("X1", "N"), ("X2", "N")):
+        assert len(re.findall(rf"^{joint} +\S+ +{unit} +\d", text, re.M)) == 2
 
 
 @pytest.mark.slow

@@ -130,6 +130,8 @@ def test_a_mass_on_a_spring_under_a_force(tmp_path):
     s = 2j * np.pi * 0.7
     wanted = 1.0 / (2000 * s * s + 300 * s + 5e4)
     np.testing.assert_allclose(model.response([0.7])[0, 0, 0], wanted, rtol=1e-12)
+    rising = crane.linearize(machine, drive="forces", velocity={"x": 0.2})
+    assert rising.u[0] - model.u[0] == pytest.approx(300.0 * 0.2, rel=1e-9)
 
 
 def deviations(machine, model, controller, start, moved, times):
@@ -181,6 +183,14 @@ def test_small_motions_under_forces_are_the_simulation(patu, velocity):
         assert gaps[1] < 1e-5 and gaps[1] < 0.2 * gaps[0]
     else:
         assert gaps[1] < 2e-2
+
+
+@pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+@pytest.mark.parametrize(("name", "joint"), [("patu655", "X_lift"), ("excavator_ls", "X_boom")])
+def test_in_motion_the_pump_keeps_its_pressure(name, joint):
+    model = crane.linearize(crane.load(name), velocity={joint: 0.03})
+    rate = model.rate[list(model.states).index("pressure_supply")]
+    assert abs(rate) < 1.0  # of 1e8 Pa/s where the pump's flow is not taken
 
 
 def test_small_motions_on_the_valves_are_the_simulation(patu):

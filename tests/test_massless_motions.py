@@ -278,6 +278,12 @@ def test_a_force_on_an_idle_motion_is_refused(tmp_path):
     tau[machine.held[0]] = 0.5
     with pytest.raises(InputError, match=r"a force of 0\.5 acts on the idle motion of 'b_rz'"):
         crane.Dynamics(machine).forward(start(machine), np.zeros(4), tau)
+    several = np.array([0 * tau, tau, 0 * tau])  # a stack of three postures
+    places = np.tile(start(machine), (3, 1))
+    with pytest.raises(InputError, match=r"a force of 0\.5 acts on the idle motion of 'b_rz'"):
+        crane.Dynamics(machine).forward(places, 0 * places, several)
+    a_a = crane.Dynamics(machine).forward(places, 0 * places, 0 * several)
+    assert a_a.shape == (3, 4) and np.ptp(a_a, axis=0).max() < 1e-12 * np.abs(a_a).max()
 
 
 def test_driven_and_rubbed_motions_need_an_inertia(tmp_path):

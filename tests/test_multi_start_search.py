@@ -4,10 +4,17 @@ import numpy as np
 import pytest
 from closing_from_anywhere import Task, rows, table
 
-from crane.closure.multi_start_search import remove_revolutions
+from crane.closure.multi_start_search import periodic_coordinates, remove_revolutions
 from crane.formats import check
 
 NAMED = 0.05  # difference of distances from the start that counts [rad], or machine's size
+
+
+def test_angles_alone_are_periodic(mini, slider_crank):
+    for machine in (mini, slider_crank):
+        turns = [machine.unit(joint) == "rad" for joint in machine.joints]
+        assert periodic_coordinates(machine.closure.equations).tolist() == turns
+        assert set(turns) == {True, False}
 
 
 def assert_closed(count):

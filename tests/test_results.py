@@ -9,7 +9,7 @@ from crane.common.errors import OutputError
 from crane.common.result import Result
 from crane.identification.hydraulics.cylinder_equations import EquationSides
 from crane.identification.hydraulics.orifice_coefficients import OrificeCoefficients
-from crane.identification.hydraulics.valve_curve import ValveCurve
+from crane.identification.hydraulics.valve_curve import ValveCurve, _valve_parameters
 from crane.recordings.measured_recordings import read_run
 from crane.simulation.linear.linearization import linear_models
 from crane.view.result_files import RESULT_FILES, plot_result, result_summary
@@ -44,7 +44,8 @@ def power_comparison(folder):
 def valve_curve(_):
     samples = np.linspace(-4.0, 4.0, 9)
     values = np.array([0.5, -0.5, 0.1, 0.1])
-    return ValveCurve("x", values, np.eye(4), 5.0, 4.0, (1e-3, 8e-4), samples, samples, 0.01)
+    values = np.append(values, _valve_parameters(values, 4.0, (1e-3, 8e-4))[0])
+    return ValveCurve("x", values, np.eye(9), 5.0, 4.0, samples, samples, 0.01)
 
 
 def orifices(folder):
@@ -158,6 +159,18 @@ CASES = {
 SLOW = "Calibration", "SignalExcitation"
 
 
+@pytest.mark.parametrize("signal_range", [5.0, -5.0])
+def test_slopes_of_what_a_valve_curve_gives_a_machine_file(signal_range):
+    """Beside central differences, for valves that extend at high and at low signals."""
+    values, areas = np.array([0.7, -0.4, 0.11, 0.09]), (1e-3, 8e-4)
+    _, slopes = _valve_parameters(values, signal_range, areas)
+    for i, step in enumerate(1e-6 * np.eye(4)):
+        more, less = (
+            _valve_parameters(values + sign * step, signal_range, areas)[0] for sign in (1, -1)
+        )
+        np.testing.assert_allclose(slopes[:, i], (more - less) / 2e-6, rtol=1e-7, atol=1e-12)
+
+
 def test_every_result_has_a_case():
     def subclasses(of):
         return {x for one in of.__subclasses__() for x in {one, *subclasses(one)}}
@@ -178,6 +191,7 @@ def test_written_from_python(name, folder, tmp_path):
     make, options, names = CASES[name]
     result = make(folder)
     assert type(result).__name__ == name
+    assert len(repr(result)) <= 200 and "\n" not in repr(result)
     options = {key: x(folder) if callable(x) else x for key, x in options.items()}
     target = tmp_path / "new" / "result"
     text = result.write(target, **options)

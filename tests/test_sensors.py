@@ -18,7 +18,7 @@ from crane.recordings import table_reader, timeseries
 from crane.recordings.measured_recordings import dead_length
 from crane.recordings.recording import Recording
 from crane.recordings.recording_reader import correct_readings, read_quantities, select_time_span
-from crane.recordings.sensor_kinematics import ideal_readings
+from crane.recordings.sensor_kinematics import ideal_readings, pin_derivatives
 from crane.recordings.timeseries import Table
 
 LIFTING = Path(__file__).parents[2] / "shared" / "data" / "patu655" / "lifting_first_half.csv"
@@ -480,6 +480,19 @@ def test_commands_take_windows(tmp_path, motion, machine):
     ):
         done = typed(*words)
         assert done.returncode == 2 and said in done.stderr, done.stderr
+
+
+def test_configurations_by_positions_of_pins():
+    """Beside the closed loops of machines with pins elsewhere."""
+    mini = crane.load("mini_forwarder")
+    found, variants = pin_derivatives(mini, mini.home[None]), MachineVariants(mini)
+    active = mini.home[mini.closure.active]
+    for name in ("A1_eye.x", "link3_G.x", "link5_J.x"):
+        more, less = (
+            variants.machine({name: variants.values[name] + step}).closure.solve(active)
+            for step in (1e-6, -1e-6)
+        )
+        np.testing.assert_allclose(found[name][0], (more - less) / 2e-6, rtol=0, atol=1e-6)
 
 
 def test_lengths_from_pin_to_pin_are_not_strokes(machine, motion, tmp_path):

@@ -12,10 +12,12 @@ from crane.common.errors import CraneWarning, InputError, RecordingError
 from crane.identification.mechanics.force_comparison import check_forces
 from crane.identification.mechanics.smoothed_motion import (
     check_recording,
+    signal_delay,
 )
 from crane.identification.signals import kalman_smoother
 from crane.identification.signals import signal_processing as signals
 from crane.identification.signals.signal_processing import Motion, differentiate
+from crane.identification.signals.signal_quality import spectral_edge_frequency
 
 JOINTS, UNITS = ("q1", "X1"), {"q1": "rad", "X1": "m"}
 
@@ -412,3 +414,26 @@ def test_forces_come_late():
     )
     with pytest.raises(RecordingError, match="'q1_force' is 200 ms behind its model"):
         check_forces(late, modelled[50:], JOINTS)
+
+
+@pytest.mark.parametrize(("amplitude", "edge"), [(0.05, 1.03), (0.1, 4.0)])
+def test_a_spectral_edge_leaves_out_half_a_percent_of_the_power(amplitude, edge):
+    """Of 20.6 and 80 periods, so that the first one leaks; its Hann window holds it together."""
+    time = 0.02 * np.arange(1000)
+    x = np.sin(2 * np.pi * 1.03 * time) + amplitude * np.sin(2 * np.pi * 4.0 * time)
+    found = spectral_edge_frequency(np.column_stack([np.ones(1000), 1e3 * x + 7.0]), 0.02)
+    assert found == pytest.approx(edge, abs=2 / 20.0)
+    held = spectral_edge_frequency(np.sin(2 * np.pi * 1.03 * time)[:, None], 0.02, 0.9999)
+    assert held == pytest.approx(1.03, abs=4 / 20.0)
+
+
+@pytest.mark.parametrize("delay", [-0.1234, -0.004, 0.0, 0.003, 0.2468])
+def test_delays_of_parts_of_a_sample(delay):
+    """Of a smooth signal that does not repeat; a parabola errs by a hundredth of a sample."""
+    time = 0.01 * np.arange(1000)
+
+    def signal(t):
+        return sum(np.sin(rate * t + rate) for rate in (2.0, 3.3, 5.1, 7.7))
+
+    found = signal_delay(time, signal(time), signal(time - delay))
+    assert found == pytest.approx(delay, abs=2e-4)

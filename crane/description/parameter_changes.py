@@ -427,7 +427,7 @@ def _check_lock_coordinate(joint: Joint, value: float) -> None:
 def _fix_joint(joint: Joint, value: float) -> Joint:
     from scipy.spatial.transform import Rotation
 
-    fixed_joint = dataclasses.replace(joint, kind="fixed", limits=Limits(), rotor_inertia=0.0)
+    fixed_joint = dataclasses.replace(joint, kind="fixed", limits=Limits())
     rotation, axis = Rotation.from_euler("xyz", joint.rpy), np.array(joint.axis)
     if joint.kind == "prismatic":
         x, y, z = (np.array(joint.xyz) + rotation.apply(value * axis)).tolist()

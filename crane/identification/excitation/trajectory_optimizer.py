@@ -81,8 +81,9 @@ def trajectory_limits(
 ) -> TrajectoryLimits:
     """Limits of the active joints: strokes, velocities, forces, and flows of pumps.
 
-    An unlimited joint stays within 1 rad (1 m) of home. Accelerations need no separate limit: for
-    a velocity below V with harmonics up to K w they are below K w V (Bernstein).
+    An unlimited joint stays within 1 rad, or the characteristic length, of home. Accelerations
+    need no separate limit: for a velocity below V with harmonics up to K w they are below K w V
+    (Bernstein).
 
     Args:
         machine: The machine.
