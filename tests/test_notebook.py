@@ -17,7 +17,7 @@ import pytest
 import crane
 from crane.common import one_line_repr, progress
 from crane.common.one_line_repr import OneLineRepr
-from crane.common.progress import PROGRESS, progress_reporter
+from crane.common.progress import PROGRESS, ignore_progress, progress_reporter
 from crane.identification.calibration.calibration_result import CalibrationChannel as Sensed
 from crane.identification.calibration.calibration_result import FittedParameter
 from crane.simulation.recording_replay import ChannelComparison
@@ -356,7 +356,7 @@ def test_only_the_outermost_call_tells_its_share(heard):
         assert progress_reporter(given) is given
 
     def inner():
-        assert progress_reporter(None) is None
+        assert progress_reporter(None) is ignore_progress
         assert heard.finished_share(sys._getframe()) == 0.25
 
     outer()
@@ -366,7 +366,7 @@ def test_only_the_outermost_call_tells_its_share(heard):
 
 
 def test_nobody_is_told_where_nobody_listens():
-    assert not PROGRESS.is_enabled and progress_reporter(None) is None
+    assert not PROGRESS.is_enabled and progress_reporter(None) is ignore_progress
 
 
 def test_calls_tell_shares_to_who_listens(heard, mini, monkeypatch):

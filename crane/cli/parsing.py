@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import crane
-from crane.common.errors import InputError, check_name
+from crane.common.errors import InputError
 from crane.common.number_text import parse_float
 from crane.common.unit_conversions import UnitError, is_quantity, parse_number
 
@@ -431,8 +431,9 @@ def parse_load(text: str) -> "crane.Wrench":
         raise InputError(f"{what} is no FRAME=WRENCH, give one such as tip=0,0,-1000")
     axes = axes or "world"
     if Path(wrench).suffix.lower() in (".csv", ".npz"):
-        times, force, moment = _read_wrenches(Path(wrench))
-        return crane.Wrench(frame, force, moment, times, axes)
+        from crane.recordings.wrench_file import read_wrench  # slow to import
+
+        return read_wrench(Path(wrench), frame, axes)
     message = f"{what}: give 3 or 6 numbers with commas, or a CSV file"
     words = wrench.split(",")
     numbers = parse_numbers(words[:3], message, ("N",))
@@ -440,22 +441,3 @@ def parse_load(text: str) -> "crane.Wrench":
     if len(numbers) not in (3, 6):
         raise InputError(message)
     return crane.Wrench(frame, numbers[:3], numbers[3:] or (0.0, 0.0, 0.0), axes=axes)
-
-
-def _read_wrenches(path: Path) -> "tuple[Array, Array, Array]":
-    """Times (N,), forces (N, 3) and moments (N, 3) of a file."""
-    import numpy as np
-
-    from crane.description.external_forces import WRENCH_COMPONENTS
-    from crane.recordings.table_reader import read_table
-
-    table = read_table(path)
-    columns = dict(zip(table.units, table.values.T, strict=True))
-    times = columns.pop("time")
-    for name in columns:
-        check_name(name, WRENCH_COMPONENTS, f"{path}: '{name}' is no part of a wrench")
-    if not columns:
-        raise InputError(f"{path}: has no force, add columns such as force_z")
-    zero = np.zeros(len(table.values))
-    wrenches = np.stack([columns.get(part, zero) for part in WRENCH_COMPONENTS], axis=1)
-    return times, wrenches[:, :3], wrenches[:, 3:]
