@@ -5,6 +5,7 @@ from contextlib import suppress
 
 import numpy as np
 
+from crane.closure.coordinates import Indices
 from crane.codegen import Tape
 from crane.common.errors import InputError
 from crane.common.progress import ignore_progress
@@ -126,7 +127,7 @@ class ChartSwitchingIntegrator:
             if next_index is None:
                 next_index = self._pass_branch_crossing(times, i, state, step, rows)
             if next_index is None and halt is not None:
-                raise self._explain_by_mass_matrix(times[0] + i * step, state) or halt
+                raise self._explain_by_mass_matrix(times[0] + i * step, state) or halt.explained()
             if next_index is not None:
                 i = next_index
             else:
@@ -207,25 +208,15 @@ class ChartSwitchingIntegrator:
         Returns:
             Index of the first instant behind the crossing; None without a crossing.
         """
-        chart, integrator, size, recent = (
-            self._chart,
-            self._integrator,
-            len(state),
-            self._recent_states,
-        )
-        machine, now = chart.machine, times[0] + i * step + integrator.offset
+        integrator, recent = self._integrator, self._recent_states
+        now = times[0] + i * step + integrator.offset
         prediction = self._predict_crossing(state)
         if prediction is None or np.prod(prediction) >= 3.0 * MAX_MOTION_PER_STEP:
             return None
         crossing, speed = now + prediction[0], prediction[1]
-        share = max(1, int(np.ceil(step * speed / MAX_MOTION_PER_STEP)))
-        stride = max(
-            1,
-            min(
-                int(np.ceil(MAX_MOTION_PER_STEP / (step * speed))),
-                len(recent) // (NODES_BEFORE + STEPS_BEFORE),
-            ),
-        )
+        share = int(np.ceil(step * speed / MAX_MOTION_PER_STEP))
+        stride = int(np.ceil(MAX_MOTION_PER_STEP / (step * speed)))
+        stride = max(1, min(stride, len(recent) // (NODES_BEFORE + STEPS_BEFORE)))
         fine_step = step / share
         last_node_time = crossing - STEPS_BEFORE * stride * fine_step
         first = int((last_node_time - NODES_BEFORE * stride * fine_step - times[0]) // step)
@@ -245,17 +236,12 @@ class ChartSwitchingIntegrator:
         if steps_made == len(instants):
             nodes = slice(len(instants) - 1 - (NODES_BEFORE - 1) * stride, None, stride)
             path = extrapolate_states(
-                instants[nodes], fine_rows[nodes, :size], integrator.python_stepper.observe
+                instants[nodes], fine_rows[nodes, : len(state)], integrator.python_stepper.observe
             )
-            q = chart.state_layout.view(path.state_at(behind_time)).q
-            crossed_chart = chart.chart_with_columns(q, machine.closure.active)
-            units = machine.closure.units
-            if (
-                crossed_chart is not None
-                and np.abs((crossed_chart.machine.home - q) / units).max()
-                < _CONFIGURATION_TOLERANCE
-            ):
-                self._enter_chart(self._find_integrator(crossed_chart, q), 0.0)
+            q = self._chart.state_layout.view(path.state_at(behind_time)).q
+            behind = self._chart_behind_crossing(q)
+            if behind is not None:
+                self._enter_chart(behind, 0.0)
                 path = correct_polynomial(
                     path, behind_time, self._integrator.python_stepper.observe
                 )
@@ -329,9 +315,8 @@ class ChartSwitchingIntegrator:
             return None
         time = determinant / (determinant_before - determinant) * time_back
         home = self._known_integrators[0][0].machine
-        is_singular = relative_rank(chart.machine, at.q + time * v) < (
-            MAX_RELATIVE_RANK * relative_rank(home, home.home)
-        )
+        least_rank = MAX_RELATIVE_RANK * relative_rank(home, home.home)
+        is_singular = relative_rank(chart.machine, at.q + time * v) < least_rank
         return (time, speed) if is_singular else None
 
     def _record_crossing(
@@ -367,29 +352,52 @@ class ChartSwitchingIntegrator:
         self.notes.add(
             behind_time,
             "",
-            " the linkage passes a configuration from which it could go on in several ways: it "
-            "goes on as it moves",
+            " the linkage passes a configuration from which it could go on in several ways: it goes "
+            "on as it moves",
         )
         return i
 
-    def _enter_chart(
-        self, chart_and_integrator: tuple[Chart, StickSlipIntegrator], offset: float
-    ) -> None:
+    def _enter_chart(self, known: tuple[Chart, StickSlipIntegrator], offset: float) -> None:
         """Continue in a chart, at an offset after the next instant [s]."""
-        self._chart, self._integrator = chart_and_integrator
+        self._chart, self._integrator = known
         self._chart_limits, self._integrator.offset = self._chart.chart_limits, offset
         self._integrator.set_chart_limits(self._chart_limits)
 
+    def _chart_behind_crossing(self, q: Array) -> tuple[Chart, StickSlipIntegrator] | None:
+        """A chart of the same coordinates at a predicted configuration (nq,), and its integrator.
+
+        None if it is singular there, or if the prediction is not closed.
+        """
+        closure = self._chart.machine.closure
+        known = self._known_integrator(closure.active, q)
+        if known is not None:
+            closed = known[0].machine.closure.solve(q[closure.active], initial_guess=q)
+        else:
+            chart = self._chart.chart_with_columns(q, closure.active)
+            if chart is None:
+                return None
+            closed = chart.machine.home
+        if np.abs((closed - q) / closure.units).max() >= _CONFIGURATION_TOLERANCE:
+            return None
+        return known or self._find_integrator(chart, q)
+
     def _find_integrator(self, chart: Chart, q: Array) -> tuple[Chart, StickSlipIntegrator]:
         """A known chart of the same coordinates and branch with its integrator, or this one."""
-        active = chart.machine.closure.active
-        for known_chart, integrator in self._known_integrators:
-            closure = known_chart.machine.closure
+        known = self._known_integrator(chart.machine.closure.active, q)
+        if known is None:
+            known = chart, self._make_integrator(chart)
+            self._known_integrators.append(known)
+        return known
+
+    def _known_integrator(
+        self, active: Indices, q: Array
+    ) -> tuple[Chart, StickSlipIntegrator] | None:
+        """A known chart of some coordinates, on whose branch a configuration (nq,) lies."""
+        for known in self._known_integrators:
+            closure = known[0].machine.closure
             if np.array_equal(closure.active, active) and closure.is_on_branch(q):
-                return known_chart, integrator
-        chart_and_integrator = chart, self._make_integrator(chart)
-        self._known_integrators.append(chart_and_integrator)
-        return chart_and_integrator
+                return known
+        return None
 
     def _orientation_at(self, q: Array) -> float:
         """Sign of det C at a closed configuration (nq,); it changes at dead centres."""

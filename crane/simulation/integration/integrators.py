@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 
 import numpy as np
 
@@ -409,6 +410,11 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
             self._find_modes(time + (_TIME_TOLERANCE * min(step, MAX_REFERENCE_SPACING)), state)
         elif count < len(chunk) or self.offset < 0:
             if not self.python_stepper.exceeds_chart_limits(state):
-                raise self.python_stepper.halt_error(time, state)
+                raise IntegrationHaltError(
+                    time,
+                    self.python_stepper.user_coordinates(state),
+                    "",
+                    explain=partial(self.python_stepper.halt_error, time, state.copy()),
+                )
             return False
         return True

@@ -30,6 +30,7 @@ class IntegrationHaltError(SimulationError):
         description: The cause, a continuation of the message after the time.
         default_remedy: Remedy if no joint passed a limit and no shorter step helps; empty where
             the cause names the remedy.
+        explain: Finds the cause, which takes long, where the motion does not go on in another way.
 
     Attributes:
         time: Time of the halt [s].
@@ -44,9 +45,15 @@ class IntegrationHaltError(SimulationError):
         description: str,
         default_remedy: str = ", with all active joints within their limits: keep away "
         "from there, 'crane workspace' shows where the loops close",
+        explain: "Callable[[], IntegrationHaltError] | None" = None,
     ):
         super().__init__(f"at t = {time:.6g} s{description}")
         self.time, self.q_a, self.default_remedy = time, np.array(q_a), default_remedy
+        self._explain = explain
+
+    def explained(self) -> "IntegrationHaltError":
+        """The halt with its cause."""
+        return self if self._explain is None else self._explain()
 
 
 def explain_halt(
