@@ -352,8 +352,8 @@ class ChartSwitchingIntegrator:
         self.notes.add(
             behind_time,
             "",
-            " the linkage passes a configuration from which it could go on in several ways: it goes "
-            "on as it moves",
+            " the linkage passes a configuration from which it could go on in several ways: it "
+            "goes on as it moves",
         )
         return i
 
