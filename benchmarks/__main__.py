@@ -72,7 +72,8 @@ def run_work_precision(chosen: list[Problem]) -> list[Point]:
         print(line)
     points: list[Point] = []
     for problem in chosen:
-        points += measure(problem, engines)
+        for engine in engines:
+            points += measure(problem, engine)
         print(f"{problem.name}: {sum(point.problem == problem.name for point in points)} runs",
               flush=True)  # fmt: skip
     return points

@@ -1,7 +1,11 @@
 """Error against time: every engine on every trajectory problem, over a sweep of its settings."""
 
+import json
 import statistics
+import subprocess
+import sys
 import time
+import warnings
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -9,10 +13,13 @@ from typing import Any
 import numpy as np
 from engines import ENGINES
 from engines.engine import Engine, UnsupportedError
-from problem import Problem
+from problem import Problem, problems
 
+import crane
+
+MARK = "point "  # before the lines of a point, beside what engines print
 ROUNDS = 3  # runs of a setting, whose median counts
-LONGEST_RUN = 2.0  # CPU time [s] after which finer settings are left out
+LONGEST_RUN = 1.0  # CPU time [s] after which finer settings are left out
 
 
 @dataclass(frozen=True)
@@ -47,21 +54,28 @@ class Point:
                 if value != "" and (isinstance(value, str) or np.isfinite(value))}  # fmt: skip
 
 
-def measure(problem: Problem, engines: Iterable[Engine]) -> list[Point]:
-    """Points of all engines on a problem; engines take turns setting by setting."""
-    points: list[Point] = []
-    queues = {engine: list(engine.settings(problem)) for engine in engines}
-    while queues:
-        for engine in list(queues):
-            if not queues[engine]:
-                del queues[engine]
-                continue
-            setting = queues[engine].pop(0)
-            point = measure_setting(problem, engine, setting)
-            points.append(point)
-            if point.time > LONGEST_RUN and not point.failure:
-                del queues[engine]
+def measure(problem: Problem, engine: Engine) -> list[Point]:
+    """Points of an engine on a problem, in a process of its own: engines may crash."""
+    command = [sys.executable, __file__, problem.name, engine.name]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    lines = [line[len(MARK) :] for line in done.stdout.splitlines() if line.startswith(MARK)]
+    points = [Point(**json.loads(line)) for line in lines]
+    if done.returncode:
+        cause = f"the process ended with {done.returncode}"
+        points.append(Point(problem.name, engine.name, failure=cause))
     return points
+
+
+def main() -> None:
+    """Print the points of one engine on one problem."""
+    problem, name = problems([sys.argv[1]])[0], sys.argv[2]
+    engine = next(engine for engine in ENGINES if engine.name == name)
+    warnings.simplefilter("ignore", crane.CraneWarning)
+    for setting in engine.settings(problem):
+        point = measure_setting(problem, engine, setting)
+        print(MARK + json.dumps(point.as_json()), flush=True)
+        if point.time > LONGEST_RUN and not point.failure:
+            break
 
 
 def measure_setting(problem: Problem, engine: Engine, setting: Any) -> Point:
@@ -129,3 +143,7 @@ def available_engines() -> tuple[list[Engine], list[str]]:
         if not engine.version()
     ]
     return [engine for engine in ENGINES if engine.version()], missing
+
+
+if __name__ == "__main__":
+    main()
