@@ -59,6 +59,11 @@ def processor() -> str:
     return names[0] if names else platform.processor() or "unknown processor"
 
 
+def sentence(text: str) -> str:
+    """A text with a capital at its begin."""
+    return text[0].upper() + text[1:]
+
+
 def work_precision_tables(problems: Sequence[Problem], points: Sequence[Point]) -> list[str]:
     """For each problem: times of all engines at equal errors, and their best."""
     parts = []
@@ -85,7 +90,7 @@ def work_precision_tables(problems: Sequence[Problem], points: Sequence[Point]) 
             "engine", *(f"{error:.0e} m [ms]" for error in ERRORS), "least error [m]",
             "loops open [m]", "energy [J]", "setting of that",
         ]  # fmt: skip
-        title = f"#### {problem.title[0].upper()}{problem.title[1:]}"
+        title = f"#### {sentence(problem.title)}"
         about = f"{problem.duration:g} s. Source: {problem.source.strip()}."
         parts += [title, about, table(head, rows)]
     return parts
@@ -111,7 +116,7 @@ def draw_work_precision(problems: Sequence[Problem], points: Sequence[Point], pa
                         [1e3 * p.time for p in best], [max(p.error, 1e-16) for p in best], style,
                         color=colour, ms=4, label=name,
                     )  # fmt: skip
-            panel.set(title=problem.title, xlabel="CPU time [ms]", ylabel="error [m]")
+            panel.set(title=sentence(problem.title), xlabel="CPU time [ms]", ylabel="error [m]")
         for panel in panels[len(problems) :]:
             panel.set_axis_off()
         handles = {
@@ -183,7 +188,10 @@ def draw_forward_dynamics(results: Sequence[dict[str, Any]], path: Path) -> None
                 pairs = [(result["joints"], 1e6 * result["times"][name]) for result in own
                          if name in result["times"]]  # fmt: skip
                 panel.loglog(*zip(*pairs, strict=True), style, color=colour, ms=4, label=name)
-            panel.set(title=family, xlabel="joints")
+            sizes = sorted({result["joints"] for result in own})
+            panel.set_xticks(sizes, [str(size) for size in sizes])
+            panel.minorticks_off()
+            panel.set(title=family.capitalize(), xlabel="joints")
         panels[0].set_ylabel("CPU time of a call [us]")
         figure.legend(
             *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(CALLS)

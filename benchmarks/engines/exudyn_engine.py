@@ -147,7 +147,7 @@ class ExudynSimulator(Simulator):
         ]
         normal = np.array([-axis[1], axis[0], 0.0])
         mbs.AddObject(
-            item_interface.JointPrismatic2D(
+            item_interface.ObjectJointPrismatic2D(
                 markerNumbers=markers, axisMarker0=axis, normalMarker1=normal,
                 constrainRotation=True,
             )
@@ -164,7 +164,7 @@ class ExudynSimulator(Simulator):
             )
             for k in (one, two)
         ]
-        self._mbs.AddObject(item_interface.RevoluteJoint2D(markerNumbers=markers))
+        self._mbs.AddObject(item_interface.ObjectJointRevolute2D(markerNumbers=markers))
 
     def _add_loop(self, loop: Any) -> None:
         one, two = loop.predecessor, loop.successor
