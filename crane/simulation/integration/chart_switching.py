@@ -370,13 +370,12 @@ class ChartSwitchingIntegrator:
         """
         closure = self._chart.machine.closure
         known = self._known_integrator(closure.active, q)
+        chart = known[0] if known else self._chart.chart_with_columns(q, closure.active)
+        if chart is None:
+            return None
+        closed = chart.machine.home
         if known is not None:
-            closed = known[0].machine.closure.solve(q[closure.active], initial_guess=q)
-        else:
-            chart = self._chart.chart_with_columns(q, closure.active)
-            if chart is None:
-                return None
-            closed = chart.machine.home
+            closed = chart.machine.closure.solve(q[closure.active], initial_guess=q)
         if np.abs((closed - q) / closure.units).max() >= _CONFIGURATION_TOLERANCE:
             return None
         return known or self._find_integrator(chart, q)

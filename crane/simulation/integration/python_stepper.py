@@ -1,6 +1,7 @@
 """Observation and steps of a controlled machine in Python, and halts of an integration."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -270,7 +271,7 @@ class PythonStepper:
 
     def _closure_halt(self, time: float, state: Array, error: CraneError) -> IntegrationHaltError:
         """The halt of a machine that does not close there, or whose mass matrix is singular."""
-        remedy = {"default_remedy": ""} if isinstance(error, SingularMassMatrixError) else {}
+        remedy: Any = {"default_remedy": ""} if isinstance(error, SingularMassMatrixError) else {}
         return IntegrationHaltError(time, self.user_coordinates(state), f": {error}", **remedy)
 
     def state_rate(
