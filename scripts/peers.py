@@ -80,29 +80,6 @@ class ConstraintDynamics:
             self.model, self.data, q, v, tau, self._models, self._datas, self._settings
         )
 
-    def run(self, q: Array, v: Array, step: float, steps: int) -> Array:
-        """Posture after `steps` steps of the fourth-order Runge-Kutta method.
-
-        After each, the posture goes back on the loops and the velocities along them; without
-        that the loops open.
-        """
-        closure, half = self.machine.closure, step / 2
-        active = closure.active
-        rest, dynamics = np.zeros(len(active)), crane.Dynamics(self.machine)
-        for _ in range(steps):
-            a1 = self.acceleration(q, v).copy()
-            v2 = v + half * a1
-            a2 = self.acceleration(q + half * v, v2).copy()
-            v3 = v + half * a2
-            a3 = self.acceleration(q + half * v2, v3).copy()
-            v4 = v + step * a3
-            a4 = self.acceleration(q + step * v3, v4)
-            q = q + step / 6 * (v + 2 * (v2 + v3) + v4)
-            v = v + step / 6 * (a1 + 2 * (a2 + a3) + a4)
-            q = closure.solve(q[active], initial_guess=q)
-            v = dynamics.evaluate_closed("rates", q, v[active], rest)[: len(v)]  # gamma v_A, fast
-        return q
-
 
 # Time constant of MuJoCo's connections in steps, and their impedance: what gives the least errors
 # on the mini forwarder. Smaller time constants are stiffer, then unstable; MuJoCo takes impedances
@@ -129,7 +106,7 @@ class MuJoCo:
         import mujoco
 
         self._mujoco: Any = mujoco
-        mujoco.set_mju_user_warning(lambda text: None)  # `stable` tells
+        mujoco.set_mju_user_warning(lambda text: None)
         constant, best = BEST[integrator]
         impedance = impedance or best
         solref = [constant * step, 1.0]
@@ -139,7 +116,6 @@ class MuJoCo:
         joints = [self.model.joint(name) for name in machine.joints]
         self._q = np.array([joint.qposadr[0] for joint in joints])
         self._v = np.array([joint.dofadr[0] for joint in joints])
-        self._tip = machine.tip
 
     @property
     def mass(self) -> float:
@@ -159,16 +135,6 @@ class MuJoCo:
     def run(self, steps: int) -> None:
         """Make steps, in MuJoCo's own loop."""
         self._mujoco.mj_step(self.model, self.data, steps)
-
-    @property
-    def stable(self) -> bool:
-        """Whether no step since the start has gone wrong."""
-        return not any(warning.number for warning in self.data.warning)
-
-    def tip(self) -> Array:
-        """Position of the tip (3,) [m]."""
-        self._mujoco.mj_kinematics(self.model, self.data)
-        return self.data.site(self._tip).xpos.copy()
 
 
 def mjcf(
