@@ -341,9 +341,7 @@ class CrossingPolynomial:
         powers = np.arange(len(nodes))
         values = at[:, None] ** powers
         integrals = unit * values * at[:, None] / (powers + 1)
-        weights = np.linalg.solve(
-            (nodes[:, None] ** powers).T, np.vstack([integrals, values]).T
-        ).T
+        weights = np.linalg.solve((nodes[:, None] ** powers).T, np.vstack([integrals, values]).T).T
         states = self.start_state + weights[: len(at)] @ self.rates
         return np.hstack([states, weights[len(at) :] @ self.outputs])
 
