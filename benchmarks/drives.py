@@ -43,6 +43,7 @@ SCIPY_TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-10)
 RK4_STEPS = (0.02, 0.01, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4)  # [s]
 ERRORS = (1e-3, 1e-4, 1e-5, 1e-6, 1e-8)
 REFERENCE_TOLERANCE = 1e-12
+MAX_STEP_TO_STOP = 0.02  # shorter than a contact, whose begin and end are events [s]
 MAX_DIFFERENCE = 1e-10  # between the two computations of a reference [m]
 
 
@@ -144,12 +145,15 @@ def solve_by_scipy(problem: DriveProblem, method: str, tolerance: float) -> Arra
     options = {"method": method, "rtol": tolerance, "atol": tolerance * equations.scales}
     while begin < problem.duration:
         end = min(t for t in (*equations.corners, problem.duration) if t > begin)
-        events = [touches(equations.lower, y)] if isinstance(equations, FallOnStop) else None
+        events, longest = None, np.inf
+        if isinstance(equations, FallOnStop):
+            events, longest = touches(equations.lower, y), MAX_STEP_TO_STOP
         run = integrate.solve_ivp(
-            equations.rate, (begin, end), y, events=events, dense_output=True, **options
-        )
-        if not run.success:
-            raise RuntimeError(run.message)
+            equations.rate, (begin, end), y, events=events, dense_output=True, max_step=longest,
+            **options,
+        )  # fmt: skip
+        if not run.success or not run.t[-1] > begin + 1e-12:
+            raise RuntimeError(f"{method} stops at {begin:g} s")
         inside = problem.times[(problem.times > begin) & (problem.times <= run.t[-1])]
         found += [equations.outputs(run.sol(t)) for t in inside]
         y, begin = run.y[:, -1], float(run.t[-1])
