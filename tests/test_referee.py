@@ -1,6 +1,5 @@
 """The referee of `benchmarks/`: reference solutions, engines, and what it makes of them."""
 
-import hydraulic_crane
 import numpy as np
 import pytest
 from engines import ENGINES
@@ -85,13 +84,3 @@ def test_time_at_an_error_is_that_of_the_frontier():
 def test_names_of_engines_and_problems_are_unique():
     assert len({engine.name for engine in ENGINES}) == len(ENGINES)
     assert all(isinstance(problem, Problem) and problem.source for problem in PROBLEMS.values())
-
-
-@pytest.mark.slow
-def test_the_two_arm_crane_follows_equations_by_hand():
-    machine, state = quiet(hydraulic_crane.start)
-    assert (state[4:] > 0.99e5).all()
-    found = quiet(hydraulic_crane.simulate_crane, machine, 1e-8)
-    strokes = found.q[1:]
-    assert np.ptp(strokes, axis=0).min() > 0.01
-    np.testing.assert_allclose(strokes, hydraulic_crane.reference(), rtol=0, atol=2e-9)

@@ -40,6 +40,7 @@ _DORMAND_PRINCE_MAX_STEP_RATIO = 5.0
 _SAFETY_FACTOR = 0.9  # of proposed step sizes
 _MAX_ROTATION_PER_STEP = 2.5  # largest rotation of floating bodies in a step [rad]
 _MAX_REFERENCE_PAIRS = 1000  # pairs of references of a call
+_REFERENCE_PAIRS_AFTER_EVENT = 60  # of the first call after an event, which may not be the last
 _STEP_REDUCTION_AFTER_EVENT = 0.2  # ratio of the first step size after an event
 _TIME_TOLERANCE = 1e-9  # share of the output interval: difference of equal instants
 
@@ -110,7 +111,7 @@ class ErrorControlledStepper(MachineCodeStepper):
         self._steps_end_at_outputs = isinstance(chart.control, ValveDrive)
         super().__init__(chart, method, fold_settings)
         self.tolerance = np.ascontiguousarray(tolerance)
-        self._step_state = np.zeros(6)
+        self._step_state, self._reference_pairs = np.zeros(6), _MAX_REFERENCE_PAIRS
         # of the controller, or its reference, and of external forces [s]
         sources = [x for x in (self._control, self._control.reference) if hasattr(x, "breaks")]
         breaks = [x.breaks() for x in (*chart.machine.external_forces, *sources[:1])]
@@ -149,7 +150,8 @@ class ErrorControlledStepper(MachineCodeStepper):
         while done < len(rows) or offset < 0:
             count = min(max_rows, len(rows) - done)
             now, segment_start = first + step * done, offset
-            segment_end = min(count * step, segment_start + _MAX_REFERENCE_PAIRS * pair)
+            segment_end = min(count * step, segment_start + self._reference_pairs * pair)
+            self._reference_pairs = min(2 * self._reference_pairs, _MAX_REFERENCE_PAIRS)
             next_time = now + segment_start + _TIME_TOLERANCE * step
             time_to_break = self._break_times[np.searchsorted(self._break_times, next_time)] - now
             if isinstance(self._control, ValveDrive) and self._control.period:
@@ -184,6 +186,7 @@ class ErrorControlledStepper(MachineCodeStepper):
                 offset = 0.0
             if lengths[5]:
                 lengths[1] *= _STEP_REDUCTION_AFTER_EVENT
+                self._reference_pairs = _REFERENCE_PAIRS_AFTER_EVENT
                 break
             if time_left > _TIME_TOLERANCE * step:
                 lengths[0] = 0.0  # the step size may have become minimal

@@ -14,7 +14,7 @@ MIN_STEP_RATIO = 0.2  # least ratio of a step size to the one before
 _MIN_CLOSABLE_MOVE = 0.02  # displacement in coordinate units up to which the loops have to close
 _MIN_STEP_SHARE = 1e-9  # least step size, as a share of the output interval
 _MIN_TRIAL_SHARE = 0.02  # least share of a step that is tried to locate an event
-_SECANT_TRIALS = 8  # trials before bisection
+_SECANT_TRIALS = 24  # trials of the Illinois method before bisection
 _END_SHARE = 1.0 - 2.0**-41  # share of the remaining time from which a step ends at its goal
 
 StepWriter = Callable[[RoutineValue, RoutineValue], None]
@@ -104,6 +104,7 @@ class StepLoop:
         self.call("rate", self._time, r.state, self.start_rate)
         # event location: time to the event, and margins before and behind it
         self._time_to_event, self._trial_count = r.new_variable(0.0), r.new_variable(0)
+        self._last_trial = r.new_variable(0)  # 1 beyond the event, -1 before it
         self._margin_before, self._margin_behind = r.new_variable(1.0), r.new_variable(0.0)
         self._event_signs = r.local_array("event_signs", max(1, self._event_distance_count))
         self._signed_distance = r.local_array("least_distance", 1)
@@ -219,8 +220,16 @@ class StepLoop:
             with r.if_then((least_margin < -2.0 * EVENT_TOLERANCE) & (self._is_located < 1)):
                 r.assign(is_beyond_event, 1)
                 r.assign(event, 0)
-                r.assign(self._time_to_event, self._step_size)
-                r.assign(self._margin_behind, least_margin)
+                self._bring_nearer(self._step_size, least_margin)
+
+    def _bring_nearer(self, time_to_event: RoutineValue, margin: RoutineValue) -> None:
+        """Note a step beyond the event: its size and margin."""
+        r = self.routine
+        halved = r.new_variable(self._margin_before * 0.5)
+        r.assign(self._margin_before, select(self._last_trial > 0, halved, self._margin_before))
+        r.assign(self._time_to_event, time_to_event)
+        r.assign(self._margin_behind, margin)
+        r.assign(self._last_trial, 1)
 
     def _record_outputs(self, is_beyond_event: RoutineValue, event: RoutineValue) -> None:
         """Write the rows of the output instants within the step."""
@@ -246,8 +255,7 @@ class StepLoop:
                     (margin < -2.0 * EVENT_TOLERANCE) & (output_time > self._time) & (event < 1)
                 ):
                     r.assign(is_beyond_event, 1)
-                    r.assign(self._time_to_event, output_time - self._time)
-                    r.assign(self._margin_behind, margin)
+                    self._bring_nearer(output_time - self._time, margin)
                     r.assign(self._recorded_count, count)
                     r.assign(output_time, first_time)
                     r.break_loop()
@@ -278,11 +286,15 @@ class StepLoop:
         with r.if_then(time_to_event > 0.0):
             r.assign(time_to_event, time_to_event - length)
             r.assign(self._margin_before, least_margin)
+            halved = r.new_variable(self._margin_behind * 0.5)
+            r.assign(self._margin_behind, select(self._last_trial < 0, halved, self._margin_behind))
+            r.assign(self._last_trial, -1)
         if self._event_distance_count:
             r.call("event_signs", self.end_rate, self._event_signs)
             with r.if_then(least_margin < -EVENT_TOLERANCE):  # a passed event distance
                 r.assign(time_to_event, 0.0)
                 r.assign(self._trial_count, 0)
+                r.assign(self._last_trial, 0)
                 r.assign(self._margin_before, 1.0)
         with r.if_then(exceeds_chart_limits(r, self._closure_result)):
             self._write_return()
