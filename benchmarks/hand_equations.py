@@ -179,6 +179,7 @@ class Function:
         self.stroke = upper - self.lower
         self.tank, self.supply = (float(circuit["supply"][key]) for key in ("tank", "pressure"))
         self.modulus = float(circuit["oil"]["bulk_modulus"])
+        self.vapour = float(circuit["oil"].get("vapour_pressure", 1e3))
 
     def opening(self, u: float, functions: Functions) -> tuple[float, float]:
         """Openings for positive and negative positions of the spool, beyond the dead band."""
@@ -221,21 +222,33 @@ class Function:
             return 0.0
         return 1.0 / (edge**-2 + holding**-2) ** 0.5
 
+    def pressures(self, y: Sequence[float], functions: Functions) -> list[float]:
+        """Pressures in A and B of their states, which are less than that of vapour in a void."""
+        return [self.vapour + functions.positive(state - self.vapour) for state in y]
+
     def chamber_rates(
-        self, x: float, v: float, a: float, b: float, inflows: Sequence[float], f: Functions
+        self, x: float, v: float, y: Sequence[float], inflows: Sequence[float], f: Functions
     ) -> list[float]:
-        """p' = K / V (Q - V') of both chambers, with leakage and shock valves."""
-        c, stroke = self.cylinder, x - self.lower
+        """p' = K / V (Q - V') of both chambers, with leakage and shock valves.
+
+        A void has V of the piston in the middle. Its size is (p_vapour - state) V / K.
+        """
+        (a, b), c, stroke = self.pressures(y, f), self.cylinder, x - self.lower
         leak = c.get("leakage", 0.0) * (a - b)
         relief = [0.0, 0.0]
         if "relief" in c:
             relief = [c["relief_gain"] * f.positive(p - c["relief"]) for p in (a, b)]
-        volume_a = c["hose_a"] + c["area_a"] * stroke
-        volume_b = c["hose_b"] + c["area_b"] * (self.stroke - stroke)
+        middle = 0.5 * self.stroke
+        x_a, x_b = (
+            middle if f.sign(state - self.vapour) < 0 else length
+            for state, length in zip(y, (stroke, self.stroke - stroke), strict=True)
+        )
         return [
-            self.modulus / volume_a * (inflows[0] - leak - relief[0] - c["area_a"] * v),
-            self.modulus / volume_b * (inflows[1] + leak - relief[1] + c["area_b"] * v),
-        ]
+            self.modulus / (c["hose_a"] + c["area_a"] * x_a)
+            * (inflows[0] - leak - relief[0] - c["area_a"] * v),
+            self.modulus / (c["hose_b"] + c["area_b"] * x_b)
+            * (inflows[1] + leak - relief[1] + c["area_b"] * v),
+        ]  # fmt: skip
 
     def force(self, a: float, b: float) -> float:
         """Force of the cylinder [N]."""
@@ -283,7 +296,11 @@ class LoadsOnCylinders(HandEquations):
         """See `HandEquations.outputs`."""
         per_function = [y[i : i + 6] for i in range(0, 6 * len(self.joints), 6)]
         strokes = [part[0] for part in per_function]
-        pressures = [p for part in per_function for p in part[2:4]]
+        pressures = [
+            p
+            for function, part in zip(self.functions, per_function, strict=True)
+            for p in function.pressures(part[2:4], PLAIN)
+        ]
         if "flow" in self.pump:
             pressures.append(y[6 * len(self.joints)])
         return np.array(strokes + pressures)
@@ -295,13 +312,14 @@ class LoadsOnCylinders(HandEquations):
         rates: list[float] = []
         drawn, load = 0.0, self.pump["tank"]
         for i, function in enumerate(self.functions):
-            x, v, a, b, u, speed = y[6 * i : 6 * i + 6]
+            x, v, *states, u, speed = y[6 * i : 6 * i + 6]
+            a, b = function.pressures(states, functions)
             openings = function.opening(u, functions)
             into_a, into_b, supplied = function.flows(openings, p, a, b, functions)
             drawn += supplied
             force = function.force(a, b) - self.viscous[i] * v
             rates += [v, force / self.masses[self.joints[i]] - GRAVITY]
-            rates += function.chamber_rates(x, v, a, b, (into_a, into_b), functions)
+            rates += function.chamber_rates(x, v, states, (into_a, into_b), functions)
             rates += function.spool_rate(t, u, speed)
             if self.senses:
                 load = self.largest_load(load, openings, (a, b), functions)

@@ -66,13 +66,14 @@ class TwoArms(HandEquations):
         q1, q2, v1, v2 = y[:4]
         moments, pressure_rates = [], []
         for i, function in enumerate(self.functions):
-            a, b = y[4 + 2 * i : 6 + 2 * i]
+            states = y[4 + 2 * i : 6 + 2 * i]
+            a, b = function.pressures(states, functions)
             length, slope = self.length(i, y[i])
             speed = slope * y[2 + i]
             moments.append(slope * (function.force(a, b) - self.viscous[i] * speed))
             openings = function.opening(function.signal(t), functions)
             flows = function.flows(openings, function.supply, a, b, functions)[:2]
-            pressure_rates += function.chamber_rates(length, speed, a, b, flows, functions)
+            pressure_rates += function.chamber_rates(length, speed, states, flows, functions)
         half = LENGTH / 2
         coupling = MASS * LENGTH * half * float(np.cos(q2))
         m22 = INERTIA + MASS * half**2
