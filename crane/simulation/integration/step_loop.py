@@ -13,6 +13,8 @@ from crane.simulation.integration.stick_slip_modes import EVENT_TOLERANCE
 MIN_STEP_RATIO = 0.2  # least ratio of a step size to the one before
 _MIN_CLOSABLE_MOVE = 0.02  # displacement in coordinate units up to which the loops have to close
 _MIN_STEP_SHARE = 1e-9  # least step size, as a share of the output interval
+_MAX_JUMP_SHARE = 1e-6  # step size from which on rejected steps are searched for jumps, likewise
+_MAX_JUMP_ERROR = 1e9  # largest error of a step over a located jump, over its tolerance
 _MIN_TRIAL_SHARE = 0.02  # least share of a step that is tried to locate an event
 _SECANT_TRIALS = 24  # trials of the Illinois method before bisection
 _END_SHARE = 1.0 - 2.0**-41  # share of the remaining time from which a step ends at its goal
@@ -130,16 +132,33 @@ class StepLoop:
         change = self.step_result["change"]
         # NaN: slower
         next_length = r.new_variable(length * select(change > 0.0, change, MIN_STEP_RATIO))
-        with r.if_then(self.step_result["error"] <= 1.0):
+        error = self.step_result["error"]
+        # no step over a jump is short enough for its tolerance
+        with r.if_then((error <= 1.0) | ((self._is_located > 0) & (error < _MAX_JUMP_ERROR))):
             with r.if_then(self._close_loops(self.step_result, self._closure_result) < 1):
                 # a shorter step, which comes nearer to the end of a branch
                 r.store(r.h, 1, length * MIN_STEP_RATIO)
                 with r.if_then(self.step_result["move"] < _MIN_CLOSABLE_MOVE):
                     self._write_return()
             with r.if_else():
+                # behind a jump the error of the step over it says nothing
+                restart = r.new_variable(self._output_interval * _MAX_JUMP_SHARE)
+                is_short = (self._is_located > 0) & (next_length < restart)
+                r.assign(next_length, select(is_short, restart, next_length))
                 self._finish_step(next_length)
         with r.if_else():
             r.store(r.h, 1, next_length)
+            if self._event_distance_count:
+                self._detect_jump()
+
+    def _detect_jump(self) -> None:
+        """Detect an event at which rates jump, in a step that has become short for that."""
+        r, size = self.routine, self._step_size
+        with r.if_then(size < self._output_interval * _MAX_JUMP_SHARE):
+            self.call("rate", self._time + size, self.step_result, self.end_rate)
+            r.call("least_distance", self.end_rate, self._event_signs, self._signed_distance)
+            with r.if_then(self._signed_distance[0] < -2.0 * EVENT_TOLERANCE):
+                self._bring_nearer(size, r.new_variable(self._signed_distance[0]))
 
     def _close_loops(self, state: ArrayPointer, result: ArrayPointer) -> RoutineValue:
         """Close the loops of a state; returns 1 if they close."""
