@@ -1,8 +1,9 @@
 """Problems of hydraulics, friction and stops: references, and errors over time of all candidates.
 
-References are scipy's Radau or DOP853 on the equations by hand (`hand_equations`), whose kinks are
-located, or closed forms. Candidates are crane, scipy on the same equations in Python, which is what
-one writes without a simulator, and Exudyn where it has the elements.
+References are scipy's DOP853, compared with its Radau, on the equations by hand
+(`hand_equations`), with steps that end at their kinks; or a closed form. Candidates are crane,
+scipy on the same equations in Python, which is what one writes without a simulator, and Exudyn
+where it has the elements.
 
 python benchmarks/drives.py                # all problems
 python benchmarks/drives.py --references   # compute the reference solutions again
@@ -167,12 +168,13 @@ def touches(height: float, y: Array) -> Callable[[float, Array], float]:
         return float(y[0] - height)
 
     has_touched = y[1] < 0 and y[0] < height + 1e-9
-    event.terminal, event.direction = True, 1.0 if has_touched else -1.0  # type: ignore[attr-defined]
+    direction = 1.0 if has_touched else -1.0
+    event.terminal, event.direction = True, direction  # type: ignore[attr-defined]
     return event
 
 
 def solve_slips(equations: StickSlip, times: Array, method: str, tolerance: float) -> Array:
-    """x (k, 1) at times by scipy with an event where the block stops; it rests in closed form."""
+    """Positions (k, 1) by scipy, with an event where the block stops; it rests in closed form."""
 
     def stops(_: float, y: Array) -> float:
         return float(y[1])
@@ -225,7 +227,7 @@ def _solve_to(
         crossed = np.flatnonzero(before * after < 0)
         kink = min((_crossing(equations, inside, t, solver.t, i) for i in crossed), default=end)
         before = after
-        if 1e-11 < kink - t and kink < solver.t - 1e-11:
+        if t + 1e-11 < kink < solver.t - 1e-11:
             step = kind(equations.rate, t, y, kink, **options)
             while step.status == "running":
                 step.step()

@@ -56,7 +56,7 @@ class Mass:
         self.items: Any = items
         self.container = exudyn.SystemContainer()
         self.mbs: Any = self.container.AddSystem()
-        self.start, self.step = float(equations.start[0]), step
+        self.start, self.spring = float(equations.start[0]), None
         node = self.mbs.AddNode(items.Node1D(referenceCoordinates=[self.start]))
         self.mbs.AddObject(items.Mass1D(physicsMass=equations.mass, nodeNumber=node))
         ground = self.mbs.AddNode(items.NodePointGround())
@@ -73,7 +73,7 @@ class Mass:
 
     def pull(self, equations: StickSlip, stiffness: float) -> None:
         """Add a spring with a moving end, and friction by bristles, as Exudyn's pages advise."""
-        spring = self.mbs.AddObject(
+        self.spring = spring = self.mbs.AddObject(
             self.items.CoordinateSpringDamper(
                 markerNumbers=self.markers, stiffness=equations.spring
             )
@@ -114,6 +114,8 @@ class Mass:
 
     def run(self) -> Array:
         """Coordinate (k, 1) at the outputs [m]."""
+        if self.spring is not None:  # an earlier run has moved its end
+            self.mbs.SetObjectParameter(self.spring, "offset", 0.0)
         self.mbs.Assemble()
         self.mbs.SolveDynamic(self.settings)
         return np.asarray(self.start + stored_outputs(self.mbs, [self.sensor]))

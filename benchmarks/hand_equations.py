@@ -5,6 +5,7 @@ are those of the textbooks, as docs/hydraulics.md has them.
 """
 
 from abc import ABC, abstractmethod
+from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -141,16 +142,14 @@ class HandEquations(ABC):
     def signal(self, name: str) -> Callable[[float], float]:
         """A signal over time, linear between its corners."""
         times, values = self.data["time"], self.data["signals"][name]
-        pieces = [
-            (t1, t0, u0, (u1 - u0) / (t1 - t0))
+        slopes = [
+            (u1 - u0) / (t1 - t0)
             for t0, t1, u0, u1 in zip(times, times[1:], values, values[1:], strict=False)
         ]
 
         def evaluate(t: float) -> float:
-            for end, begin, value, slope in pieces:
-                if t <= end:
-                    break
-            return value + slope * (t - begin)
+            i = min(max(bisect_left(times, t) - 1, 0), len(slopes) - 1)
+            return values[i] + slopes[i] * (t - times[i])
 
         return evaluate
 
@@ -190,7 +189,7 @@ class Function:
         )
 
     def spool_rate(self, t: float, u: float, speed: float) -> list[float]:
-        """u'' = w^2 (signal - u) - 2 D w u'."""
+        """Rate u'' = w^2 (signal - u) - 2 D w u'."""
         w, damping = self.valve["bandwidth"], self.valve["damping"]
         return [speed, w * w * (self.signal(t) - u) - 2.0 * damping * w * speed]
 
@@ -229,7 +228,7 @@ class Function:
     def chamber_rates(
         self, x: float, v: float, y: Sequence[float], inflows: Sequence[float], f: Functions
     ) -> list[float]:
-        """p' = K / V (Q - V') of both chambers, with leakage and shock valves.
+        """Rates p' = K / V (Q - V') of both chambers, with leakage and shock valves.
 
         A void has V of the piston in the middle. Its size is (p_vapour - state) V / K.
         """

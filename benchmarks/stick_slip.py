@@ -24,7 +24,7 @@ class Slip:
     frequency: float
 
     def evaluate(self, t: float) -> tuple[float, float]:
-        """z and z' at a time since the begin of the slip."""
+        """Both z and z' at a time since the begin of the slip."""
         w, g = self.frequency, self.growth
         b = (-self.speed - g * self.z0) / w
         wave, slope = self.z0 * cos(w * t) + b * sin(w * t), b * cos(w * t) - self.z0 * sin(w * t)
@@ -80,7 +80,7 @@ class StickSlip(HandEquations):
             x = position(end)
 
     def closed_form(self, times: Array) -> Array:
-        """x (N,) at times (N,) [m]."""
+        """Positions x (N,) at times (N,) [m]."""
         found = []
         for t in times:
             begin, _, x, position = next(slip for slip in self.slips() if t <= slip[1])

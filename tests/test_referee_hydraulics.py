@@ -23,9 +23,17 @@ def test_crane_converges_to_equations_by_hand(name, method):
     problem = PROBLEMS[name]
     tolerance = 1e-10 if "signals" in problem.data else 1e-12
     error, pressure_error = problem.errors(quiet(problem.simulate, method, tolerance))
-    assert error < 3e-11
-    assert ("signals" in problem.data) == (pressure_error < 1e-7)
+    # jumps, as of a void, are located to 1e-9 of the interval of outputs
+    assert error < (2e-10 if name == "valve_and_cylinder" else 3e-11)
+    assert ("signals" in problem.data) == (pressure_error < 1e-6)
     assert np.ptp(problem.reference[:, : problem.stroke_count], axis=0).min() > 0.01
+
+
+@pytest.mark.parametrize(("tolerance", "error"), [(1e-8, 6e-9), (1e-12, 2e-10)])
+def test_voids_are_located_at_any_tolerance(tolerance, error):
+    """The compliance of a chamber jumps where a void forms and closes."""
+    problem = PROBLEMS["valve_and_cylinder"]
+    assert problem.errors(problem.simulate("rosenbrock", tolerance))[0] < error
 
 
 @pytest.mark.parametrize(
@@ -63,9 +71,7 @@ def channels(name):
     problem = PROBLEMS[name]
     machine = problem.machine
     start = [problem.data["start"][joint] for joint in machine.active]
-    run = quiet(
-        drives.crane.simulate, machine, problem.command(), start, problem.duration, 2e-3
-    )
+    run = quiet(drives.crane.simulate, machine, problem.command(), start, problem.duration, 2e-3)
     return run, run.channels
 
 
@@ -74,16 +80,16 @@ def test_problems_visit_what_they_are_about():
     circuit = PROBLEMS["valve_and_cylinder"].machine.hydraulics
     assert found["pressure_lift_a"].max() > circuit.cylinders["lift"].relief
     assert np.abs(found["spool_lift"] - found["voltage_lift"]).max() > 0.3  # the spool lags
+    assert (found["pressure_lift_b"] <= 1e3).sum() > 10  # a void
     _, found = channels("load_sensing_pair")
     assert found["share_supply"].max() > 0.999 and found["share_supply"].min() == 0
-    loads = found["pressure_boom_a"] - found["pressure_arm_a"]
-    assert loads.max() > 0 > loads.min()  # either senses the higher load
+    assert found["pressure_supply"].max() > 2.1e7  # cut off
     _, found = channels("counterbalance_lowering")
     valve = PROBLEMS["counterbalance_lowering"].machine.hydraulics.cylinders["lift"]
     valve = valve.counterbalance_a
     a, b = (found[f"pressure_lift_{side}"] for side in "ab")
     opening = (a + valve.pilot_ratio * b - valve.pressure) / valve.range
-    assert opening.min() < 0 and 0.1 < np.median(opening[opening > 0]) < 1
+    assert opening.min() < 0 < np.median(opening) < opening.max() < 0.5  # it throttles
     run, _ = channels("stick_slip")
     starts = np.flatnonzero((run.v[1:, 0] != 0) & (run.v[:-1, 0] == 0))
     assert len(starts) >= 5

@@ -30,8 +30,10 @@ class StepLoop:
     the first output instant before, and to the next one behind; spacing of references; end;
     whether a stick-slip transition is there.
 
-    A step that passes an event is rejected. The secant method locates the event; steps that end
-    before it are accepted.
+    A step that passes an event is rejected. The Illinois method locates the event (a secant method
+    that halves the margin of an end that stays); steps that end before it are accepted. Where
+    rates jump, as where a void forms, no step over the event meets its tolerance: it is located by
+    the rejected steps, and passed by one of a billionth of the output interval.
 
     Args:
         stepper: The method with its machine and controller.
@@ -194,7 +196,7 @@ class StepLoop:
             self._write_return()
 
     def _locate_event(self, time_left: RoutineValue) -> None:
-        """Shorten the remaining time to where the secant method expects the event."""
+        """Shorten the remaining time to where the Illinois method expects the event."""
         r, time_to_event = self.routine, self._time_to_event
         share = r.new_variable(
             (self._margin_before + 1.5 * EVENT_TOLERANCE)
@@ -306,7 +308,9 @@ class StepLoop:
             r.assign(time_to_event, time_to_event - length)
             r.assign(self._margin_before, least_margin)
             halved = r.new_variable(self._margin_behind * 0.5)
-            r.assign(self._margin_behind, select(self._last_trial < 0, halved, self._margin_behind))
+            r.assign(
+                self._margin_behind, select(self._last_trial < 0, halved, self._margin_behind)
+            )
             r.assign(self._last_trial, -1)
         if self._event_distance_count:
             r.call("event_signs", self.end_rate, self._event_signs)

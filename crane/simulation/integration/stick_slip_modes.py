@@ -191,9 +191,7 @@ class StickSlipModes:
         impulse_directions = whitening @ rows.T
         rates = closure.characteristic_time / closure.units[closure.active]
         sizes = np.maximum((impulse_directions**2).sum(0), 1e-300)
-        velocity_changes = (
-            whitening.T @ (impulse_directions * (v / sizes)) * rates[:, None]
-        )
+        velocity_changes = whitening.T @ (impulse_directions * (v / sizes)) * rates[:, None]
         is_resting = np.abs(velocity_changes).max(0) <= _MAX_VELOCITY_CHANGE
         candidates, impulse_directions = candidates[is_resting], impulse_directions[:, is_resting]
         if not len(candidates):
