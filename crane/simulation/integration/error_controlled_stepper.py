@@ -40,7 +40,6 @@ _DORMAND_PRINCE_MAX_STEP_RATIO = 5.0
 _SAFETY_FACTOR = 0.9  # of proposed step sizes
 _MAX_ROTATION_PER_STEP = 2.5  # largest rotation of floating bodies in a step [rad]
 _MAX_REFERENCE_PAIRS = 1000  # pairs of references of a call
-_REFERENCE_PAIRS_AFTER_EVENT = 60  # of the first call after an event, which may not be the last
 _STEP_REDUCTION_AFTER_EVENT = 0.2  # ratio of the first step size after an event
 _TIME_TOLERANCE = 1e-9  # share of the output interval: difference of equal instants
 
@@ -112,7 +111,6 @@ class ErrorControlledStepper(MachineCodeStepper):
         super().__init__(chart, method, fold_settings)
         self.tolerance = np.ascontiguousarray(tolerance)
         self._step_state = np.array([0.0] * 5 + [np.inf, 0.0])
-        self._reference_pairs = _MAX_REFERENCE_PAIRS
         # of the controller, or its reference, and of external forces [s]
         sources = [x for x in (self._control, self._control.reference) if hasattr(x, "breaks")]
         breaks = [x.breaks() for x in (*chart.machine.external_forces, *sources[:1])]
@@ -151,8 +149,7 @@ class ErrorControlledStepper(MachineCodeStepper):
         while done < len(rows) or offset < 0:
             count = min(max_rows, len(rows) - done)
             now, segment_start = first + step * done, offset
-            segment_end = min(count * step, segment_start + self._reference_pairs * pair)
-            self._reference_pairs = min(2 * self._reference_pairs, _MAX_REFERENCE_PAIRS)
+            segment_end = min(count * step, segment_start + _MAX_REFERENCE_PAIRS * pair)
             difference = _TIME_TOLERANCE * step
             next_time = now + segment_start + difference
             breaks, following = self._break_times, np.searchsorted(self._break_times, next_time)
@@ -194,7 +191,6 @@ class ErrorControlledStepper(MachineCodeStepper):
                 offset = 0.0
             if lengths[6]:
                 lengths[1] *= _STEP_REDUCTION_AFTER_EVENT
-                self._reference_pairs = _REFERENCE_PAIRS_AFTER_EVENT
                 break
             if time_left > _TIME_TOLERANCE * step:
                 lengths[0] = 0.0  # the step size may have become minimal
