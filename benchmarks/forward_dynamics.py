@@ -24,6 +24,7 @@ from engines.mujoco_engine import MuJoCo
 from engines.pinocchio_engine import best_forward, sample_states
 from multibody import Array, Multibody
 from problem import load_machine
+from timing import Call, in_turns
 
 import crane
 
@@ -36,7 +37,6 @@ SIZES = {
 MAX_SAMPLES = 200
 SHARE = 0.05  # [s] of a round for each candidate, about
 LIMIT = 300  # of a process [s]
-Call = Callable[[], object]
 
 
 def measure(machine: str, rounds: int) -> dict[str, Any]:
@@ -126,18 +126,6 @@ def largest_difference(found: list[Array], expected: list[Array]) -> float:
         float(np.abs(one - other).max() / np.abs(other).max())
         for one, other in zip(found, expected, strict=True)
     )
-
-
-def in_turns(calls: dict[str, Call], rounds: int) -> dict[str, list[float]]:
-    """CPU times of each call [s]; they take turns, after one turn that does not count."""
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for turn in range(rounds + 1):
-        for name, call in calls.items():
-            start = time.process_time()
-            call()
-            if turn:
-                times[name].append(time.process_time() - start)
-    return times
 
 
 def main() -> None:

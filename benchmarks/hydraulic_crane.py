@@ -8,7 +8,7 @@ concerns the first instants of the motion and changes the reference by 1e-8 m.
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from engines.exudyn_engine import Exudyn
 from multibody import Array
+from page_text import table
 from problem import load_machine
 from scipy.integrate import solve_ivp
 
@@ -312,6 +313,19 @@ class ExudynCrane:
         return np.column_stack(columns)
 
 
-def measure(rounds: int = 3) -> list[Run]:
+def measure(quick: bool) -> list[Run]:
     """Runs of crane and, where it is installed, of Exudyn."""
+    rounds = 1 if quick else 3
     return crane_runs(rounds) + (exudyn_runs(rounds) if Exudyn.version() else [])
+
+
+def tables(runs: Sequence[Run]) -> list[str]:
+    """Errors and times of all settings."""
+    head = ["engine", "step [s] or tolerance", "error of the strokes [m]", "time [ms]",
+            "times real time"]  # fmt: skip
+    rows = [
+        [run.engine, f"{run.setting:g}", f"{run.error:.1e}", f"{1e3 * run.time:.3g}",
+         f"{DURATION / run.time:.0f}"]
+        for run in runs
+    ]  # fmt: skip
+    return [table(head, rows)]

@@ -1,46 +1,30 @@
-"""Tables, figures and page of the referee's results."""
+"""The pages of the referee: conditions, a summary, and the tables of all parts."""
 
 import importlib.metadata
 import os
 import platform
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import hydraulic_crane
-import matplotlib as mpl
+import calls_over_size
 from engines import ENGINES
-from matplotlib.figure import Figure
-from problem import Problem
+from page_text import paragraph, sentence, table
+from parts import PARTS
+from pictures import draw_calls, draw_time_at_error, draw_work_precision, family
+from problem import problems
 from trajectories import Point, time_at_error
 
-from crane.view.plots.figure_style import FIGURE_STYLE
-
-ERRORS = (1e-2, 1e-3, 1e-4, 1e-6, 1e-8)
-STYLES = {
-    "crane DOP853": ("#1f5fa8", "o-"),
-    "crane Radau": ("#1f5fa8", "o:"),
-    "crane rk4": ("#7fb0e0", "s-"),
-    "pin.constraintDynamics": ("#3c8c4a", "^-"),
-    "pin.lcaba": ("#7cc18a", "v-"),
-    "MuJoCo Euler": ("#b9b9b9", "v-"),
-    "MuJoCo implicitfast": ("#e0a060", "D-"),
-    "MuJoCo RK4": ("#c8501a", "P-"),
-    "Exudyn GeneralizedAlpha": ("#8a4fa0", "X-"),
-    "Exudyn TrapezoidalIndex2": ("#b98cc9", "X:"),
-    "Drake SAP": ("#444444", "*-"),
-}
-COLUMNS = 3  # of figures
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table in Markdown, with numbers on the right."""
-    marks = ["---", *["---:"] * (len(head) - 1)]
-    return "\n".join(f"| {' | '.join(row)} |" for row in (head, marks, *rows))
+BEGIN, END = "<!-- referee: written by `make referee` -->", "<!-- end of referee -->"
+SUMMARY_ERRORS = (1e-3, 1e-6)  # [m]
+REQUIRED_ERROR = 1e-6  # that crane has to reach on each problem [m]
+REQUIRED_AGREEMENT = 1e-8  # of accelerations of machines of the families, relative
+Results = dict[str, dict[str, Any]]  # by part: conditions, rows, tables
 
 
 def conditions() -> str:
-    """Machine and versions of a run."""
+    """Computer and versions of a run."""
     packages = sorted({(engine.package, engine.version()) for engine in ENGINES})
     packages += [(name, importlib.metadata.version(name)) for name in ("numpy", "llvmlite")]
     versions = ", ".join(f"{name} {version}" for name, version in packages if version)
@@ -59,150 +43,134 @@ def processor() -> str:
     return names[0] if names else platform.processor() or "unknown processor"
 
 
-def sentence(text: str) -> str:
-    """A text with a capital at its begin."""
-    return text[0].upper() + text[1:]
+def points(results: Results, part: str = "trajectories") -> list[Point]:
+    """Points of a part that measures errors against times."""
+    return [Point(**row) for row in results.get(part, {"rows": []})["rows"]]
 
 
-def work_precision_tables(problems: Sequence[Problem], points: Sequence[Point]) -> list[str]:
-    """For each problem: times of all engines at equal errors, and their best."""
-    parts = []
-    for problem in problems:
-        own = [point for point in points if point.problem == problem.name]
-        engines = [engine.name for engine in ENGINES if any(p.engine == engine.name for p in own)]
-        rows = []
-        for name in engines:
-            of_engine = [point for point in own if point.engine == name]
-            reached = [point for point in of_engine if not point.failure]
-            if not reached:
-                rows.append([name, *["-"] * (len(ERRORS) + 3), of_engine[-1].failure])
-                continue
-            times = [time_at_error(reached, error) for error in ERRORS]
-            best = min(reached, key=lambda point: point.error)
-            rows.append([
-                name,
-                *("-" if time is None else f"{1e3 * time:.3g}" for time in times),
-                f"{best.error:.0e}", f"{best.loop_error:.0e}",
-                "-" if best.energy_drift != best.energy_drift else f"{best.energy_drift:.0e}",
-                f"{best.setting}",
-            ])  # fmt: skip
-        head = [
-            "engine", *(f"{error:.0e} m [ms]" for error in ERRORS), "least error [m]",
-            "loops open [m]", "energy [J]", "setting of that",
-        ]  # fmt: skip
-        title = f"#### {sentence(problem.title)}"
-        about = f"{problem.duration:g} s. Source: {problem.source.strip()}."
-        parts += [title, about, table(head, rows)]
-    return parts
+def faults(results: Results) -> list[str]:
+    """What crane should have reached and did not, one line each."""
+    found = points(results)
+    lines = [
+        f"crane does not reach {REQUIRED_ERROR:g} m on {name}"
+        for name in dict.fromkeys(point.problem for point in found)
+        if own_and_peers(found, name, REQUIRED_ERROR)[0] is None
+    ]
+    for row in results.get("forward_dynamics", {"rows": []})["rows"]:
+        difference = row.get("settings", {}).get("crane difference", 0.0)
+        if "failure" in row:
+            lines.append(f"no forward dynamics of {row['machine']}: {row['failure']}")
+        elif not difference < REQUIRED_AGREEMENT:
+            lines.append(f"accelerations of {row['machine']} differ by {difference:.0e}")
+    return lines
 
 
-def draw_work_precision(problems: Sequence[Problem], points: Sequence[Point], path: Path) -> None:
-    """Error over CPU time, one panel for each problem."""
-    rows = -(-len(problems) // COLUMNS)
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(11.0, 3.1 * rows + 0.8), layout="constrained")
-        panels = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
-        for panel, problem in zip(panels, problems, strict=False):
-            for name, (colour, style) in STYLES.items():
-                found = sorted(
-                    (p for p in points
-                     if (p.problem, p.engine) == (problem.name, name) and not p.failure),
-                    key=lambda p: p.time,
-                )  # fmt: skip
-                best = [p for i, p in enumerate(found)
-                        if all(p.error < other.error for other in found[:i])]  # fmt: skip
-                if best:
-                    panel.loglog(
-                        [1e3 * p.time for p in best], [max(p.error, 1e-16) for p in best], style,
-                        color=colour, ms=4, label=name,
-                    )  # fmt: skip
-            panel.set(title=sentence(problem.title), xlabel="CPU time [ms]", ylabel="error [m]")
-        for panel in panels[len(problems) :]:
-            panel.set_axis_off()
-        handles = {
-            label: handle
-            for panel in panels
-            for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)
-        }
-        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=150)
+def own_and_peers(
+    found: Sequence[Point], problem: str, error: float
+) -> tuple[float | None, dict[str, float]]:
+    """Least times [s] to an error: of crane's methods, and of each other engine's."""
+    times: dict[str, float] = {}
+    for engine in dict.fromkeys(point.engine for point in found if point.problem == problem):
+        own = [p for p in found if (p.problem, p.engine) == (problem, engine)]
+        time = time_at_error(own, error)
+        if time is not None:
+            times[engine] = time
+    own_times = [times.pop(name) for name in list(times) if family(name) == "crane"]
+    return min(own_times, default=None), times
 
 
-CALLS = (
-    "crane, one call", "crane, a stack", "crane, closed stack", "pin.constraintDynamics",
-    "pin.lcaba", "mj_forward",
-)  # fmt: skip
-
-
-def forward_dynamics_table(results: Sequence[dict[str, Any]]) -> str:
-    """Times of forward dynamics over the number of joints."""
-    head = [
-        "machine", "joints", "loops", "degrees of freedom", *(f"{name} [us]" for name in CALLS),
-        "best peer / one call", "best peer / stack", "load [s]", "first call [s]", "cached [s]",
-    ]  # fmt: skip
+def trajectory_summary(found: Sequence[Point]) -> str:
+    """Per problem: crane, the best other engine and their ratio, at two errors."""
+    head = ["problem"]
+    for error in SUMMARY_ERRORS:
+        head += [f"crane, {error:.0e} m [ms]", "best other [ms]", "ratio"]
     rows = []
-    for found in results:
-        if "failure" in found:
-            rows.append([found["machine"], *["-"] * (len(head) - 2), found["failure"]])
-            continue
-        times = found["times"]
-        peers = [times[name] for name in CALLS[3:5] if name in times]
-        ratios = [
-            f"{min(peers) / times[name]:.1f}" if peers else "-"
-            for name in ("crane, one call", "crane, a stack")
-        ]
-        rows.append([
-            found["machine"], *(str(found[key]) for key in ("joints", "loops", "freedoms")),
-            *(f"{1e6 * times[name]:.2f}" if name in times else "-" for name in CALLS), *ratios,
-            *(f"{found[key]:.2f}" for key in ("load", "first", "cached")),
+    for problem in problems(list(dict.fromkeys(point.problem for point in found))):
+        cells = [sentence(problem.title)]
+        for error in SUMMARY_ERRORS:
+            own, peers = own_and_peers(found, problem.name, error)
+            best = min(peers, key=lambda name: peers[name], default=None)
+            cells += [
+                "not reached" if own is None else f"{1e3 * own:.3g}",
+                "not reached" if best is None else f"{best} {1e3 * peers[best]:.3g}",
+                "" if own is None or best is None else ratio(peers[best] / own),
+            ]
+        rows.append(cells)
+    return table(head, rows)
+
+
+def ratio(value: float) -> str:
+    """A ratio of times, bold where crane is the slower one."""
+    text = f"{value:.2g}" if value < 10 else f"{value:.0f}"
+    return f"**{text}**" if value < 1 else text
+
+
+def families_summary(rows: Sequence[dict[str, Any]]) -> str:
+    """Per family of machines: times of a call and ratio, from the fewest to the most joints."""
+    lines = []
+    for name, own in machine_families(rows).items():
+        pairs = [(row, calls_over_size.best_peer(row["times"])) for row in own]
+        pairs = [(row, peer) for row, peer in pairs if peer]
+        ratios = [peer[1] / row["times"][calls_over_size.OWN[0]] for row, peer in pairs if peer]
+        (first, fast), (last, slow) = pairs[0], pairs[-1]
+        assert fast and slow
+        lines.append([
+            name, f"{first['joints']} to {last['joints']}",
+            *(f"{1e6 * one:.2g} to {1e6 * other:.2g}" for one, other in (
+                (first["times"][calls_over_size.OWN[0]], last["times"][calls_over_size.OWN[0]]),
+                (fast[1], slow[1]),
+            )),
+            f"{ratio(min(ratios))} to {ratio(max(ratios))}",
         ])  # fmt: skip
-    return table(head, rows)
+    head = ["family", "joints", "crane, one call [us]", "best of Pinocchio [us]", "ratio"]
+    return table(head, lines)
 
 
-def hydraulics_table(runs: Sequence[hydraulic_crane.Run]) -> str:
-    """Errors and times of the hydraulic crane."""
-    head = ["engine", "step [s] or tolerance", "error of the strokes [m]", "time [ms]",
-            "times real time"]  # fmt: skip
-    rows = [
-        [run.engine, f"{run.setting:g}", f"{run.error:.1e}", f"{1e3 * run.time:.3g}",
-         f"{hydraulic_crane.DURATION / run.time:.0f}"]
-        for run in runs
+def machine_families(rows: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    """Results of machines without failure by family, machines of files aside."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        name = row["machine"].rpartition(" ")[0]
+        if name and "failure" not in row:
+            found.setdefault(sentence(name), []).append(row)
+    return found
+
+
+def write_pages(page: Path, results: Results) -> None:
+    """Write the summary between the marks of a page, its tables beside it, and the pictures."""
+    images = page.parent / "images"
+    found, rows = points(results), results["forward_dynamics"]["rows"]
+    draw_time_at_error(found, SUMMARY_ERRORS, images / "time_at_error.png")
+    draw_work_precision(found, images / "work_precision.png")
+    draw_calls(machine_families(rows), images / "forward_dynamics.png")
+    draw_work_precision(points(results, "stiff"), images / "stiff_precision.png")
+    parts = [
+        BEGIN, paragraph(results["trajectories"]["conditions"]),
+        trajectory_summary(found), families_summary(rows), END,
     ]  # fmt: skip
-    return table(head, rows)
+    text = page.read_text(encoding="utf-8")
+    before, rest = text.split(BEGIN)
+    after = rest.split(END)[1]
+    page.write_text(before + "\n\n".join(parts) + after, encoding="utf-8")
+    tables = page.with_name(f"{page.stem}-tables.md")
+    tables.write_text("\n\n".join(tables_page(results)) + "\n", encoding="utf-8")
 
 
-def draw_forward_dynamics(results: Sequence[dict[str, Any]], path: Path) -> None:
-    """Time of a call over the number of joints, one panel for each family."""
-    found = [result for result in results if "failure" not in result]
-    families = list(dict.fromkeys(result["machine"].rpartition(" ")[0] for result in found))
-    families = [family for family in families if family]
-    colours = ("#1f5fa8", "#7fb0e0", "#1f5fa8", "#3c8c4a", "#7cc18a", "#c8501a")
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(11.0, 3.6), layout="constrained")
-        panels = figure.subplots(1, max(len(families), 1), squeeze=False, sharey=True).ravel()
-        for panel, family in zip(panels, families, strict=False):
-            own = [result for result in found if result["machine"].startswith(f"{family} ")]
-            for name, colour, style in zip(CALLS, colours, ("o-", "s-", "o:", "^-", "v-", "P-"),
-                                           strict=True):  # fmt: skip
-                pairs = [(result["joints"], 1e6 * result["times"][name]) for result in own
-                         if name in result["times"]]  # fmt: skip
-                panel.loglog(*zip(*pairs, strict=True), style, color=colour, ms=4, label=name)
-            sizes = sorted({result["joints"] for result in own})
-            panel.set_xticks(sizes, [str(size) for size in sizes])
-            panel.minorticks_off()
-            panel.set(title=family.capitalize(), xlabel="joints")
-        panels[0].set_ylabel("CPU time of a call [us]")
-        figure.legend(
-            *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(CALLS)
-        )
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=150)
-
-
-def write_section(page: Path, parts: Sequence[str]) -> None:
-    """Put paragraphs between the two marks of a page, in place of what is there."""
-    begin, end = "<!-- referee: written by `make referee` -->", "<!-- end of referee -->"
-    before, rest = page.read_text(encoding="utf-8").split(begin)
-    after = rest.split(end)[1]
-    page.write_text("\n\n".join([before + begin, *parts, end + after]), encoding="utf-8")
+def tables_page(results: Results) -> Iterator[str]:
+    """Paragraphs of the page with the tables of all parts."""
+    yield "# Tables of the referee"
+    yield paragraph(
+        "All that `make referee` measures; [performance.md](performance.md) has the summary, and "
+        "says where crane loses. Written by the run."
+    )
+    told = ""
+    for name, part in PARTS.items():
+        if name not in results:
+            continue
+        yield f"## {part.title}"
+        yield paragraph(part.about)
+        if results[name]["conditions"] != told:
+            told = results[name]["conditions"]
+            yield paragraph(told)
+        for text in results[name]["tables"]:
+            yield re.sub(r"^#+ ", "### ", text, flags=re.MULTILINE)

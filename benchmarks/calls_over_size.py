@@ -1,0 +1,53 @@
+"""Part: forward dynamics of all engines over the number of joints."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import forward_dynamics
+from page_text import table
+
+QUICK = ("chain 10", "ring 7", "mini_forwarder/mini_forwarder.yaml")
+OWN = ("crane, one call", "crane, a stack", "crane, closed stack")
+PEERS = ("pin.constraintDynamics", "pin.lcaba", "mj_forward")
+RIGID = PEERS[:2]  # mj_forward gives the accelerations of soft loops
+
+
+def measure(quick: bool) -> list[dict[str, Any]]:
+    """Forward dynamics of all machines, each in a process of its own."""
+    families = (
+        f"{family} {joints}" for family, sizes in forward_dynamics.SIZES.items()
+        for joints in sizes
+    )  # fmt: skip
+    results = []
+    for machine in QUICK if quick else (QUICK[-1], *families):
+        results.append(forward_dynamics.measure(machine, 5 if quick else 15))
+        print(f"{machine}: {results[-1].get('failure', 'done')}", flush=True)
+    return results
+
+
+def best_peer(times: dict[str, float]) -> tuple[str, float] | None:
+    """Name and time [s] of the fastest engine with rigid loops; None if there is none."""
+    found = [(times[name], name) for name in RIGID if name in times]
+    return min(found)[::-1] if found else None
+
+
+def tables(results: Sequence[dict[str, Any]]) -> list[str]:
+    """Times of a call, and of the first one."""
+    head = [
+        "machine", "joints", "loops", "degrees of freedom",
+        *(f"{name} [us]" for name in (*OWN, *PEERS)), "best peer / one call",
+        "best peer / stack", "load [s]", "first call [s]", "cached [s]",
+    ]  # fmt: skip
+    rows = []
+    for found in results:
+        if "failure" in found:
+            rows.append([found["machine"], *["-"] * (len(head) - 2), found["failure"]])
+            continue
+        times, peer = found["times"], best_peer(found["times"])
+        rows.append([
+            found["machine"], *(str(found[key]) for key in ("joints", "loops", "freedoms")),
+            *(f"{1e6 * times[name]:.2f}" if name in times else "-" for name in (*OWN, *PEERS)),
+            *(f"{peer[1] / times[name]:.1f}" if peer else "-" for name in OWN[:2]),
+            *(f"{found[key]:.2f}" for key in ("load", "first", "cached")),
+        ])  # fmt: skip
+    return [table(head, rows)]
