@@ -16,10 +16,10 @@ import warnings
 from pathlib import Path
 
 import work_precision
+from pages import Results, conditions, faults, write_pages
 from parts import PARTS
 from problem import Problem, problems
 from reference import write_reference
-from report import Results, conditions, faults, write_pages
 
 import crane
 

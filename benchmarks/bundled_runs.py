@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from page_text import table
+from report import table
 from timing import medians
 
 import crane

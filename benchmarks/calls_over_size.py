@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import forward_dynamics
-from page_text import table
+from report import table
 
 QUICK = ("chain 10", "ring 7", "mini_forwarder/mini_forwarder.yaml")
 OWN = ("crane, one call", "crane, a stack", "crane, closed stack")

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import mechanisms
 import numpy as np
-from page_text import table
+from report import table
 from scipy.optimize import least_squares
 
 from crane.closure.constraint_tolerances import FILE_PRECISION

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 from multibody import Array
-from page_text import table
+from report import table
 from timing import Call, medians
 
 import crane

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from engines.exudyn_engine import Exudyn
 from multibody import Array
-from page_text import table
 from problem import load_machine
+from report import table
 from scipy.integrate import solve_ivp
 
 import crane

@@ -16,8 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
-from page_text import sentence
 from problem import problems
+from report import sentence
 from trajectories import Point, time_at_error
 
 from crane.view.plots.figure_style import FIGURE_STYLE
@@ -45,6 +45,22 @@ def family(engine: str) -> str:
     """Family of an engine's name, such as `pin.lcaba` or `MuJoCo RK4`."""
     first = engine.partition(" ")[0].partition(".")[0]
     return "Pinocchio" if first == "pin" else first
+
+
+def title(problem: str) -> str:
+    """What a problem is called."""
+    titles = {known.name: known.title for known in problems()}
+    return sentence(titles.get(problem, problem.replace("_", " ")))
+
+
+def times_to_error(points: Sequence[Point], problem: str, error: float) -> dict[str, float]:
+    """Least time [s] of each engine to an error, of those that reach it."""
+    own = [point for point in points if point.problem == problem]
+    times = {
+        name: time_at_error([point for point in own if point.engine == name], error)
+        for name in dict.fromkeys(point.engine for point in own)
+    }
+    return {name: time for name, time in times.items() if time is not None}
 
 
 def frontier(points: Iterable[Point]) -> list[Point]:
@@ -85,7 +101,7 @@ def save(figure: Figure, path: Path) -> None:
 
 def draw_time_at_error(points: Sequence[Point], errors: Sequence[float], path: Path) -> None:
     """CPU time of each family to an error, a row for each problem, a panel for each error."""
-    chosen = problems(list(dict.fromkeys(point.problem for point in points)))
+    chosen = list(dict.fromkeys(point.problem for point in points))
     names = {family(point.engine) for point in points}
     height = 0.31 * len(chosen) + 0.62
     with mpl.rc_context(STYLE):
@@ -93,16 +109,12 @@ def draw_time_at_error(points: Sequence[Point], errors: Sequence[float], path: P
         panels = figure.subplots(len(errors), 1, sharex=True, squeeze=False).ravel()
         for panel, error in zip(panels, errors, strict=True):
             for row, problem in enumerate(chosen):
-                own = [point for point in points if point.problem == problem.name]
-                _draw_row(panel, row, {
-                    name: time_at_error([p for p in own if family(p.engine) == name], error)
-                    for name in names
-                })  # fmt: skip
-            panel.set_yticks(range(len(chosen)), [wrapped(one.title, 22) for one in chosen])
+                _draw_row(panel, row, times_to_error(points, problem, error))
+            panel.set_yticks(range(len(chosen)), [textwrap.fill(title(one), 22) for one in chosen])
             panel.set(ylim=(len(chosen) - 0.5, -0.5), xscale="log")
             power = round(np.log10(error))
-            title = f"CPU time [ms] to an error of $\\mathbf{{10^{{{power}}}}}$ m"
-            panel.set_title(title, loc="left", weight="bold")
+            text = f"CPU time [ms] to an error of $\\mathbf{{10^{{{power}}}}}$ m"
+            panel.set_title(text, loc="left", weight="bold")
             _note(panel, -0.85, "ratio", "#333333")
             panel.tick_params(axis="y", length=0)
             panel.tick_params(axis="x", labelbottom=True)
@@ -112,10 +124,15 @@ def draw_time_at_error(points: Sequence[Point], errors: Sequence[float], path: P
         save(figure, path)
 
 
-def _draw_row(panel: Axes, row: int, times: dict[str, float | None]) -> None:
-    """Discs of the families; those that would cover each other move up and down."""
+def _draw_row(panel: Axes, row: int, times: dict[str, float]) -> None:
+    """Discs of the families at the times of their best engines [s].
+
+    Those that would cover each other move up and down.
+    """
     panel.axhline(row, color="#f0f0f0", lw=5, zorder=0)
-    found = {name: 1e3 * time for name, time in times.items() if time is not None}
+    found: dict[str, float] = {}
+    for engine, time in times.items():
+        found[family(engine)] = min(1e3 * time, found.get(family(engine), np.inf))
     placed: list[tuple[float, float]] = []
     for name, time in sorted(found.items(), key=lambda pair: pair[1]):
         near = {other for x, other in placed if abs(np.log10(time / x)) < SPREAD}
@@ -142,14 +159,8 @@ def _note(panel: Axes, row: float, text: str, colour: str) -> None:
     )  # fmt: skip
 
 
-def wrapped(title: str, width: int) -> str:
-    """A title in lines of at most some letters."""
-    return textwrap.fill(sentence(title), width)
-
-
 def draw_work_precision(points: Sequence[Point], path: Path) -> None:
     """Error over CPU time, one panel for each problem, one line for each family."""
-    titles = {problem.name: problem.title for problem in problems()}
     chosen = list(dict.fromkeys(point.problem for point in points))
     names = [name for name in FAMILIES if any(family(p.engine) == name for p in points)]
     rows = -(-len(chosen) // 2)
@@ -166,7 +177,7 @@ def draw_work_precision(points: Sequence[Point], path: Path) -> None:
                     y = [max(p.error, LEAST_ERROR) for p in best]
                     panel.loglog(x, y, ".-", color=FAMILIES[name][1], ms=4)
                     initial(panel, x[-1], y[-1], name)
-            panel.set_title(wrapped(titles.get(problem, problem), 24), weight="bold")
+            panel.set_title(textwrap.fill(title(problem), 24), weight="bold")
             panel.xaxis.set_major_locator(LogLocator(numticks=6))
             panel.yaxis.set_major_locator(LogLocator(numticks=6))
             panel.xaxis.set_minor_formatter(NullFormatter())
@@ -196,10 +207,10 @@ def draw_calls(families: dict[str, list[dict[str, Any]]], path: Path) -> None:
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 2.2 * rows + 0.6), layout="constrained")
         panels = figure.subplots(rows, 2, squeeze=False, sharey=True).ravel()
-        for panel, (title, results) in zip(panels, families.items(), strict=False):
-            for name, (group, style, _) in LINES.items():
+        for panel, (name, results) in zip(panels, families.items(), strict=False):
+            for call, (group, style, _) in LINES.items():
                 pairs = [(result["joints"], 1e6 * time) for result in results
-                         if (time := _time(result["times"], name))]  # fmt: skip
+                         if (time := _time(result["times"], call))]  # fmt: skip
                 if pairs:
                     colour = FAMILIES[group][1]
                     panel.loglog(*zip(*pairs, strict=True), style, marker=".", color=colour, ms=4)
@@ -207,7 +218,7 @@ def draw_calls(families: dict[str, list[dict[str, Any]]], path: Path) -> None:
             sizes = sorted({result["joints"] for result in results})
             panel.set_xticks(sizes, [str(size) for size in sizes])
             panel.minorticks_off()
-            panel.set_title(title, weight="bold")
+            panel.set_title(name, weight="bold")
             panel.yaxis.set_major_formatter(lambda x, _: f"{x:g}")
         for panel in panels[len(families) :]:
             panel.set_axis_off()

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from page_text import table
+from report import table
 
 import crane
 from crane.description import example_robots

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 from engines import ENGINES
-from page_text import paragraph, sentence, table
 from problem import problems
+from report import paragraph, sentence, table
 from trajectories import Point, available_engines, time_at_error
 from trajectories import measure as measure_engine
 
