@@ -14,7 +14,6 @@ from crane.control import PI, ComputedTorque, ValveDrive, ValvePD
 
 MINUTE = 60.0  # of levers [s]
 TASK = 10.0  # of a task [s]
-SHORT = 1.0  # of the minute, for what takes long [s]
 PAYLOAD = {"payload.mass": 200.0}
 FEET = ((1.6, 2.0), (1.6, -2.0), (-1.6, -2.0), (-1.6, 2.0))  # below the carrier, x and y [m]
 CARRIER = """\
@@ -73,15 +72,10 @@ def minutes() -> dict[str, Run]:
     """A minute under levers: all functions to and fro every 6 s, recorded every 10 ms."""
     with tempfile.TemporaryDirectory() as folder:
         machines = on_the_ground(Path(folder))
-    runs: dict[str, Run] = {
+    return {
         f"{name}, a minute under levers": (MINUTE, partial(_minute, machine))
         for name, machine in machines.items()
     }
-    first = next(iter(machines.values()))
-    runs["the first of these by scipy's BDF on Pinocchio's algorithms"] = (
-        SHORT, partial(_minute, first, SHORT, backend="pinocchio"),
-    )  # fmt: skip
-    return runs
 
 
 def on_the_ground(folder: Path) -> dict[str, crane.Machine]:
@@ -108,14 +102,15 @@ def on_the_ground(folder: Path) -> dict[str, crane.Machine]:
     return found
 
 
-def _minute(machine: crane.Machine, duration: float = MINUTE, **options: Any) -> crane.Recording:
+def _minute(machine: crane.Machine) -> crane.Recording:
+    assert machine.hydraulics is not None
     levers = {
         joint: [(0, 0), (1, 0.2 * (-1) ** k)]
         + [(t, 0.2 * (-1) ** (i + k)) for i, t in enumerate(range(4, 58, 6), 1)]
         for k, joint in enumerate(machine.hydraulics.joints)
     }
     command = crane.joystick(machine, levers)
-    return crane.simulate(machine, command, duration=duration, step=1e-2, **options)
+    return crane.simulate(machine, command, duration=MINUTE, step=1e-2)
 
 
 def tables(results: Sequence[dict[str, Any]]) -> list[str]:

@@ -8,8 +8,7 @@ from report import table
 
 QUICK = ("chain 10", "ring 7", "mini_forwarder/mini_forwarder.yaml")
 OWN = ("crane, one call", "crane, a stack", "crane, closed stack")
-PEERS = ("pin.constraintDynamics", "pin.lcaba", "mj_forward")
-RIGID = PEERS[:2]  # mj_forward gives the accelerations of soft loops
+SOFT = ("mj_forward",)  # gives the accelerations of soft loops: no peer
 
 
 def measure(quick: bool) -> list[dict[str, Any]]:
@@ -26,17 +25,17 @@ def measure(quick: bool) -> list[dict[str, Any]]:
 
 
 def best_peer(times: dict[str, float]) -> tuple[str, float] | None:
-    """Name and time [s] of the fastest engine with rigid loops; None if there is none."""
-    found = [(times[name], name) for name in RIGID if name in times]
+    """Name and time [s] of the fastest other engine with rigid loops; None if there is none."""
+    found = [(time, name) for name, time in times.items() if name not in (*OWN, *SOFT)]
     return min(found)[::-1] if found else None
 
 
 def tables(results: Sequence[dict[str, Any]]) -> list[str]:
     """Times of a call, and of the first one."""
+    names = list(dict.fromkeys(name for found in results for name in found.get("times", ())))
     head = [
-        "machine", "joints", "loops", "degrees of freedom",
-        *(f"{name} [us]" for name in (*OWN, *PEERS)), "best peer / one call",
-        "best peer / stack", "load [s]", "first call [s]", "cached [s]",
+        "machine", "joints", "loops", "degrees of freedom", *(f"{name} [us]" for name in names),
+        "best peer / one call", "best peer / stack", "load [s]", "first call [s]", "cached [s]",
     ]  # fmt: skip
     rows = []
     for found in results:
@@ -46,7 +45,7 @@ def tables(results: Sequence[dict[str, Any]]) -> list[str]:
         times, peer = found["times"], best_peer(found["times"])
         rows.append([
             found["machine"], *(str(found[key]) for key in ("joints", "loops", "freedoms")),
-            *(f"{1e6 * times[name]:.2f}" if name in times else "-" for name in (*OWN, *PEERS)),
+            *(f"{1e6 * times[name]:.2f}" if name in times else "-" for name in names),
             *(f"{peer[1] / times[name]:.1f}" if peer else "-" for name in OWN[:2]),
             *(f"{found[key]:.2f}" for key in ("load", "first", "cached")),
         ])  # fmt: skip

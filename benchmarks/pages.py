@@ -24,9 +24,14 @@ from trajectories import Point
 
 BEGIN, END = "<!-- referee: written by `make referee` -->", "<!-- end of referee -->"
 SUMMARY_ERRORS = (1e-3, 1e-6)  # [m]
+CAPTION = (
+    "*Ratio* is the time of the best other engine over that of crane: in red, crane is slower. "
+    "An engine without a disc does not reach the error."
+)
 REQUIRED_ERROR = 1e-6  # that crane has to reach on each problem [m]
 REQUIRED_AGREEMENT = 1e-8  # of accelerations of machines of the families, relative
 RACES = "trajectories", "hydraulics"  # parts with errors of all engines over time
+SIZES = "forward_dynamics", "inverse_dynamics"  # parts with calls over the number of joints
 Results = dict[str, dict[str, Any]]  # by part: conditions, rows, tables
 
 
@@ -51,10 +56,10 @@ def processor() -> str:
 
 
 def points(results: Results, *parts: str) -> list[Point]:
-    """Points of parts that measure errors against times; what is not given a problem is one."""
+    """Points of parts that measure errors against times; one without problems is one problem."""
     kept = ("problem", "engine", "error", "time", "failure")
     return [
-        Point(**({"problem": part} | {key: row[key] for key in kept if key in row}))
+        Point(**({"problem": PARTS[part].title} | {key: row[key] for key in kept if key in row}))
         for part in parts
         for row in results.get(part, {"rows": []})["rows"]
     ]
@@ -129,7 +134,7 @@ def families_summary(rows: Sequence[dict[str, Any]]) -> str:
             )),
             f"{ratio(min(ratios))} to {ratio(max(ratios))}",
         ])  # fmt: skip
-    head = ["family", "joints", "crane, one call [us]", "best of Pinocchio [us]", "ratio"]
+    head = ["family", "joints", "crane, one call [us]", "best other engine [us]", "ratio"]
     return table(head, lines)
 
 
@@ -144,24 +149,45 @@ def machine_families(rows: Sequence[dict[str, Any]]) -> dict[str, list[dict[str,
 
 
 def write_pages(page: Path, results: Results) -> None:
-    """Write the summary between the marks of a page, its tables beside it, and the pictures."""
-    images = page.parent / "images"
-    found, rows = points(results, *RACES), results["forward_dynamics"]["rows"]
-    draw_time_at_error(found, SUMMARY_ERRORS, images / "time_at_error.png")
-    draw_work_precision(found, images / "work_precision.png")
-    draw_calls(machine_families(rows), images / "forward_dynamics.png")
-    if "stiff" in results:
-        draw_work_precision(points(results, "stiff"), images / "stiff_precision.png")
-    parts = [
-        BEGIN, paragraph(results["trajectories"]["conditions"]),
-        trajectory_summary(found), families_summary(rows), END,
-    ]  # fmt: skip
+    """Write pictures and summary between the marks of a page, and its tables beside it."""
+    parts = [BEGIN, *pictures(page.parent / "images", results), *summary(results), END]
     text = page.read_text(encoding="utf-8")
     before, rest = text.split(BEGIN)
     after = rest.split(END)[1]
     page.write_text(before + "\n\n".join(parts) + after, encoding="utf-8")
     tables = page.with_name(f"{page.stem}-tables.md")
     tables.write_text("\n\n".join(tables_page(results)) + "\n", encoding="utf-8")
+
+
+def pictures(images: Path, results: Results) -> Iterator[str]:
+    """Draw all pictures; their paragraphs in the page."""
+    for part in RACES:
+        found = points(results, part)
+        if found:
+            draw_time_at_error(found, SUMMARY_ERRORS, images / f"times_{part}.png")
+            yield f"![{PARTS[part].title}: CPU times to two errors](images/times_{part}.png)"
+            if part == RACES[0]:
+                yield paragraph(CAPTION)
+            draw_work_precision(found, images / f"work_precision_{part}.png")
+            yield f"![{PARTS[part].title}: all settings](images/work_precision_{part}.png)"
+    for part in SIZES:
+        if part in results:
+            draw_calls(machine_families(results[part]["rows"]), images / f"{part}.png")
+            yield f"![{PARTS[part].title}](images/{part}.png)"
+    if "stiff" in results:
+        stiff = points(results, "stiff")
+        draw_work_precision(stiff, images / "stiff_precision.png", "error")
+
+
+def summary(results: Results) -> Iterator[str]:
+    """Paragraphs of the summary."""
+    yield "## Summary"
+    yield paragraph(results[RACES[0]]["conditions"])
+    yield trajectory_summary(points(results, *RACES))
+    for part in SIZES:
+        if part in results:
+            yield f"{PARTS[part].title}, closed configurations given to the other engines:"
+            yield families_summary(results[part]["rows"])
 
 
 def tables_page(results: Results) -> Iterator[str]:

@@ -11,7 +11,6 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from calls_over_size import RIGID
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -159,7 +158,7 @@ def _note(panel: Axes, row: float, text: str, colour: str) -> None:
     )  # fmt: skip
 
 
-def draw_work_precision(points: Sequence[Point], path: Path) -> None:
+def draw_work_precision(points: Sequence[Point], path: Path, label: str = "error [m]") -> None:
     """Error over CPU time, one panel for each problem, one line for each family."""
     chosen = list(dict.fromkeys(point.problem for point in points))
     names = [name for name in FAMILIES if any(family(p.engine) == name for p in points)]
@@ -186,18 +185,18 @@ def draw_work_precision(points: Sequence[Point], path: Path) -> None:
         for panel in panels[len(chosen) :]:
             panel.set_axis_off()
         for panel in panels[::2]:
-            panel.set_ylabel("error [m]")
+            panel.set_ylabel(label)
         for panel in panels[max(len(chosen) - 2, 0) : len(chosen)]:
             panel.set_xlabel("CPU time [ms]")
         legend(figure, names)
         save(figure, path)
 
 
-LINES = {  # of the calls: family, style and text
-    "crane, one call": ("crane", "-", "closes the loop first"),
-    "crane, closed stack": ("crane", ":", "closed configuration given"),
-    "Pinocchio": ("Pinocchio", "-", "best of constraintDynamics and LCABA"),
-    "mj_forward": ("MuJoCo", "-", "soft loops"),
+LINES = {  # of the calls: begin of their names, style and text
+    "crane, one call": ("crane", "-", "crane, closes the loops first"),
+    "crane, closed stack": ("crane", ":", "crane, loops closed before"),
+    "pin.": ("Pinocchio", "-", "Pinocchio, its best algorithm"),
+    "mj_": ("MuJoCo", "-", "MuJoCo"),
 }
 
 
@@ -208,9 +207,9 @@ def draw_calls(families: dict[str, list[dict[str, Any]]], path: Path) -> None:
         figure = Figure(figsize=(WIDTH, 2.2 * rows + 0.6), layout="constrained")
         panels = figure.subplots(rows, 2, squeeze=False, sharey=True).ravel()
         for panel, (name, results) in zip(panels, families.items(), strict=False):
-            for call, (group, style, _) in LINES.items():
+            for begin, (group, style, _) in LINES.items():
                 pairs = [(result["joints"], 1e6 * time) for result in results
-                         if (time := _time(result["times"], call))]  # fmt: skip
+                         if (time := _time(result["times"], begin))]  # fmt: skip
                 if pairs:
                     colour = FAMILIES[group][1]
                     panel.loglog(*zip(*pairs, strict=True), style, marker=".", color=colour, ms=4)
@@ -229,14 +228,11 @@ def draw_calls(families: dict[str, list[dict[str, Any]]], path: Path) -> None:
         figure.legend(
             [Line2D([], [], color=FAMILIES[group][1], ls=style) for group, style, _ in
              LINES.values()],
-            [f"{group}, {text}" for group, _, text in LINES.values()],
-            loc="outside upper center", ncols=1 if WIDTH < 4 else 2, fontsize=8,
-            columnspacing=1.0, handlelength=1.5,
+            [text for _, _, text in LINES.values()],
+            loc="outside upper center", ncols=2, fontsize=8, columnspacing=1.0, handlelength=1.4,
         )  # fmt: skip
         save(figure, path)
 
 
-def _time(times: dict[str, float], name: str) -> float | None:
-    if name == "Pinocchio":
-        return min((times[one] for one in RIGID if one in times), default=None)
-    return times.get(name)
+def _time(times: dict[str, float], begin: str) -> float | None:
+    return min((time for name, time in times.items() if name.startswith(begin)), default=None)

@@ -51,12 +51,17 @@ def test_pages_keep_what_is_written_by_hand(results, tmp_path):
     page.write_text(HAND_WRITTEN.format(begin=pages.BEGIN, end=pages.END))
     pages.write_pages(page, results)
     text = page.read_text()
-    assert text.startswith(f"# Title\n\n{pages.BEGIN}\n\nHere.\n\n| problem |")
+    assert (
+        text.startswith(f"# Title\n\n{pages.BEGIN}\n\n![") and "\n\nHere.\n\n| problem |" in text
+    )
     assert text.endswith(f"{pages.END}\n\n## What crane loses\n\nA lot.\n") and "old" not in text
     tables = (tmp_path / "performance-tables.md").read_text()
     assert tables.count("Here.") == 1 and "\n### Deep\n" in tables
     names = {path.name for path in (tmp_path / "images").glob("*.png")}
-    assert names == {"time_at_error.png", "work_precision.png", "forward_dynamics.png"}
+    assert names == {
+        "times_trajectories.png", "work_precision_trajectories.png", "forward_dynamics.png",
+    }  # fmt: skip
+    assert all(f"](images/{name})" in text for name in names)
 
 
 def test_faults_are_crane_failing_or_disagreeing(results):
