@@ -52,6 +52,9 @@ def main() -> None:
     kept = json.loads(ROWS.read_text()) if ROWS.exists() and not options.quick else {}
     chosen = [] if options.kept else options.parts or list(PARTS)
     results = kept | run(chosen, options.quick, kept)
+    missing = [name for name in PARTS if name not in results]
+    if options.write and missing:
+        raise SystemExit(f"error: not written, there are no rows yet of {', '.join(missing)}")
     if options.write:
         write_pages(options.write, results)
     lines = faults(results)

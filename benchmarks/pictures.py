@@ -37,6 +37,7 @@ STYLE = FIGURE_STYLE | {
     "ytick.labelsize": 8.5,
 }  # fmt: skip
 SPREAD = 0.19  # of two discs beside each other, in decades
+HIGH = 0.25  # of two discs above each other, in decades of the calls
 LEAST_ERROR = 1e-15  # of the axes [m]
 
 
@@ -118,6 +119,7 @@ def draw_time_at_error(points: Sequence[Point], errors: Sequence[float], path: P
             panel.tick_params(axis="y", length=0)
             panel.tick_params(axis="x", labelbottom=True)
             panel.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
+            panel.xaxis.set_minor_formatter(NullFormatter())
             panel.grid(axis="y", visible=False)
         legend(figure, names)
         save(figure, path)
@@ -207,13 +209,18 @@ def draw_calls(families: dict[str, list[dict[str, Any]]], path: Path) -> None:
         figure = Figure(figsize=(WIDTH, 2.2 * rows + 0.6), layout="constrained")
         panels = figure.subplots(rows, 2, squeeze=False, sharey=True).ravel()
         for panel, (name, results) in zip(panels, families.items(), strict=False):
+            placed: list[tuple[float, float]] = []
             for begin, (group, style, _) in LINES.items():
                 pairs = [(result["joints"], 1e6 * time) for result in results
                          if (time := _time(result["times"], begin))]  # fmt: skip
                 if pairs:
                     colour = FAMILIES[group][1]
                     panel.loglog(*zip(*pairs, strict=True), style, marker=".", color=colour, ms=4)
-                    initial(panel, *pairs[-1], group)
+                    place = next(
+                        (pair for pair in pairs[::-1] if not is_near(pair, placed)), pairs[-1]
+                    )
+                    placed.append(place)
+                    initial(panel, *place, group)
             sizes = sorted({result["joints"] for result in results})
             panel.set_xticks(sizes, [str(size) for size in sizes])
             panel.minorticks_off()
@@ -232,6 +239,11 @@ def draw_calls(families: dict[str, list[dict[str, Any]]], path: Path) -> None:
             loc="outside upper center", ncols=2, fontsize=8, columnspacing=1.0, handlelength=1.4,
         )  # fmt: skip
         save(figure, path)
+
+
+def is_near(pair: tuple[float, float], placed: Iterable[tuple[float, float]]) -> bool:
+    """Whether a disc at a number of joints and a time would cover another one."""
+    return any(pair[0] == x and abs(np.log10(pair[1] / y)) < HIGH for x, y in placed)
 
 
 def _time(times: dict[str, float], begin: str) -> float | None:
