@@ -1,7 +1,7 @@
-"""Routines: functions with loops and conditions around formulas, written in LLVM IR.
+"""Routines: functions with loops and conditions around formulas, as statements.
 
-Statements are written where they are built; variables live in memory, and LLVM moves them to
-registers.
+A routine is built by calls of its methods, which record statements; `crane.codegen.llvm` and the
+other targets write them in their languages.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,20 +10,9 @@ from dataclasses import dataclass, field
 from functools import partialmethod
 from typing import Any, Literal
 
-from crane.codegen.llvm.vector_functions import format_real
 from crane.codegen.vector_layout import ArgumentKind, Formula, Layout
 
 ValueKind = Literal["real", "integer", "truth"]
-
-_TYPES = {"real": "double", "integer": "i64", "truth": "i1"}
-_ARITHMETIC = {
-    "real": {"+": "fadd", "-": "fsub", "*": "fmul", "/": "fdiv"},
-    "integer": {"+": "add", "-": "sub", "*": "mul"},
-}
-_COMPARISONS = {
-    "real": {"<": "fcmp olt", "<=": "fcmp ole", ">": "fcmp ogt", ">=": "fcmp oge"},
-    "integer": {"<": "icmp slt", "<=": "icmp sle", ">": "icmp sgt", ">=": "icmp sge"},
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,11 +115,95 @@ class ArrayPointer:
         return as_value(index, "integer")
 
 
+@dataclass(frozen=True, eq=False)
+class AssignmentStatement:
+    """variable = value."""
+
+    variable: RoutineValue
+    value: RoutineValue
+
+
+@dataclass(frozen=True, eq=False)
+class StoreStatement:
+    """pointer[0] = value."""
+
+    pointer: ArrayPointer
+    value: RoutineValue
+
+
+@dataclass(frozen=True, eq=False)
+class CopyStatement:
+    """target[:count] = source[:count]."""
+
+    target: ArrayPointer
+    source: ArrayPointer
+    count: int
+
+
+@dataclass(frozen=True, eq=False)
+class CallStatement:
+    """result = function(arguments); a formula has no result.
+
+    Attributes:
+        function: Name of a formula, a routine or a function argument.
+        arguments: Arrays and integers.
+        result: Variable of the returned integer.
+        is_argument: Whether the function is an argument of the routine.
+    """
+
+    function: str
+    arguments: tuple[RoutineValue | ArrayPointer, ...]
+    result: RoutineValue | None
+    is_argument: bool
+
+
+@dataclass(frozen=True, eq=False)
+class LoopStatement:
+    """Statements for each index from 0 to count - 1, or without an end if there is no index."""
+
+    index: RoutineValue | None
+    count: RoutineValue | None
+    body: "list[Statement]"
+
+
+@dataclass(frozen=True, eq=False)
+class ConditionStatement:
+    """Statements for a true condition, and for a false one."""
+
+    test: RoutineValue
+    body: "list[Statement]"
+    otherwise: "list[Statement]"
+
+
+@dataclass(frozen=True, eq=False)
+class BreakStatement:
+    """End of the innermost loop."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReturnStatement:
+    """End of the routine."""
+
+    value: RoutineValue
+
+
+Statement = (
+    AssignmentStatement
+    | StoreStatement
+    | CopyStatement
+    | CallStatement
+    | LoopStatement
+    | ConditionStatement
+    | BreakStatement
+    | ReturnStatement
+)
+
+
 class Routine:
     """f(counts, functions, arrays) -> integer, built by the methods below.
 
     The arguments are attributes. Local arrays (`local_array`) are uninitialized and live until it
-    returns, so that any number of threads may execute it.
+    returns, so that any number of threads may execute it. It returns 0 where no statement returns.
 
     Args:
         name: Its name.
@@ -142,6 +215,10 @@ class Routine:
     Attributes:
         name: Its name.
         argument_kinds: Kinds of the arguments, in their order.
+        arguments: Arguments by name, in their order.
+        local_arrays: Lengths of local arrays by name.
+        variables: Variables, in the order of their first use.
+        statements: What it does.
     """
 
     def __init__(
@@ -153,55 +230,32 @@ class Routine:
         arrays: Mapping[str, Layout | None],
     ):
         self.name, self._callees, self._functions = name, callees, functions
-        self._arguments: dict[str, RoutineValue | ArrayPointer] = {
+        self.arguments: dict[str, RoutineValue | ArrayPointer] = {
             **{count: RoutineValue("integer", "argument", (count,)) for count in counts},
             **{function: ArrayPointer(function) for function in functions},
             **{array: ArrayPointer(array, layout=layout) for array, layout in arrays.items()},
         }
         self.argument_kinds: tuple[ArgumentKind, ...] = tuple(
-            "count" if isinstance(x, RoutineValue) else "array" for x in self._arguments.values()
+            "count" if isinstance(x, RoutineValue) else "array" for x in self.arguments.values()
         )
-        self._local_arrays: dict[str, int] = {}
-        self._variables: list[RoutineValue] = []
-        self._lines: list[str] = []
-        self._number = 0  # of the next register or label
-        self._loop_end_labels: list[str] = []  # of the enclosing loops
-        self._open_condition: str | None = None  # end label of a condition that may have an `else`
+        self.local_arrays: dict[str, int] = {}
+        self.variables: list[RoutineValue] = []
+        self.statements: list[Statement] = []
+        self._blocks = [self.statements]  # the statements that are being built, innermost last
 
     def __getattr__(self, name: str) -> Any:
         try:
-            return self.__dict__["_arguments"][name]
+            return self.__dict__["arguments"][name]
         except KeyError:
             raise AttributeError(f"'{self.name}' has no argument '{name}'") from None
 
-    def text(self) -> str:
-        """The routine as a function."""
-        arguments = ", ".join(
-            f"{'i64' if isinstance(x, RoutineValue) else 'ptr'} %{name}"
-            for name, x in self._arguments.items()
-        )
-        self._close_condition()
-        lines = [
-            f"define i64 @{self.name}({arguments}) {{",
-            "entry:",
-            *(
-                f"  %{name} = alloca [{size} x double], align 64"
-                for name, size in self._local_arrays.items()
-            ),
-            *(f"  %{v.operands[0]} = alloca {_TYPES[v.kind]}" for v in self._variables),
-            *self._lines,
-            "  ret i64 0",  # unreachable, or 0 items done
-            "}",
-        ]
-        return "\n".join(lines)
-
     def local_array(self, name: str, layout: Layout | int) -> ArrayPointer:
         """Add a local array."""
-        if name in self._local_arrays or name in self._arguments:
+        if name in self.local_arrays or name in self.arguments:
             raise ValueError(f"'{self.name}' has two arrays '{name}'")
         if isinstance(layout, int):
             layout = Layout(all=layout)
-        self._local_arrays[name] = layout.size
+        self.local_arrays[name] = layout.size
         return ArrayPointer(name, layout=layout)
 
     def new_variable(self, value: Operand) -> RoutineValue:
@@ -214,19 +268,15 @@ class Routine:
 
     def assign(self, variable: RoutineValue, value: Operand) -> None:
         """Assign a value to a variable."""
-        self._emit_assignment(variable, self._evaluate(as_value(value, variable.kind)))
+        self._add(AssignmentStatement(variable, as_value(value, variable.kind)))
 
     def store(self, array: ArrayPointer, index: int | RoutineValue | str, value: Operand) -> None:
         """array[index] = value."""
-        word = self._evaluate(as_value(value, "real"))
-        self._emit_line(
-            f"store double {word}, ptr {self._emit_pointer(array.element_pointer(index))}"
-        )
+        self._add(StoreStatement(array.element_pointer(index), as_value(value, "real")))
 
     def copy(self, target: ArrayPointer, source: ArrayPointer, count: int) -> None:
         """target[:count] = source[:count], of arrays that do not overlap."""
-        pointers = f"ptr {self._emit_pointer(target)}, ptr {self._emit_pointer(source)}"
-        self._emit_line(f"call void @llvm.memcpy.p0.p0.i64({pointers}, i64 {8 * count}, i1 false)")
+        self._add(CopyStatement(target, source, count))
 
     def call(self, function: str, *arguments: RoutineValue | ArrayPointer | int) -> RoutineValue:
         """Call a formula, an earlier routine, or a function argument; returns its integer."""
@@ -235,134 +285,65 @@ class Routine:
             raise ValueError(f"'{self.name}' calls '{function}', which is not there yet")
         if callee is not None and len(arguments) != len(callee.argument_kinds):
             raise ValueError(f"'{function}' takes {len(callee.argument_kinds)} arguments")
-        answer = None if isinstance(callee, Formula) else self._add_variable("integer")
-        words = [
-            f"ptr {self._emit_pointer(x)}"
-            if isinstance(x, ArrayPointer)
-            else f"i64 {self._evaluate(as_value(x, 'integer'))}"
-            for x in arguments
-        ]
-        call = f"{'@' if callee else '%'}{function}({', '.join(words)})"
-        if answer is None:
-            self._emit_line(f"call void {call}")
-            return as_value(0, "integer")
-        self._emit_assignment(answer, self._emit_value(f"call i64 {call}"))
-        return answer
+        result = None if isinstance(callee, Formula) else self._add_variable("integer")
+        values = tuple(
+            x if isinstance(x, ArrayPointer) else as_value(x, "integer") for x in arguments
+        )
+        self._add(CallStatement(function, values, result, callee is None))
+        return as_value(0, "integer") if result is None else result
 
     @contextmanager
     def loop(self, count: RoutineValue) -> Iterator[RoutineValue]:
         """Context of a loop with an index from 0 to count - 1."""
-        index = self._add_variable("integer")
-        start, end = self._new_label(), self._new_label()
-        self._emit_assignment(index, "0")
-        self._end_block(f"br label %{start}", start)
-        inside = self._new_label()
-        more = self._evaluate(index < count)
-        self._end_block(f"br i1 {more}, label %{inside}, label %{end}", inside)
-        self._loop_end_labels.append(end)
-        yield index
-        self._loop_end_labels.pop()
-        self._emit_assignment(index, self._evaluate(index + 1))
-        self._end_block(f"br label %{start}", end)
+        loop = LoopStatement(self._add_variable("integer"), count, [])
+        self._add(loop)
+        with self._block(loop.body):
+            assert loop.index is not None
+            yield loop.index
 
     @contextmanager
     def loop_forever(self) -> Iterator[None]:
         """Context of an infinite loop."""
-        start, end = self._new_label(), self._new_label()
-        self._end_block(f"br label %{start}", start)
-        self._loop_end_labels.append(end)
-        yield
-        self._loop_end_labels.pop()
-        self._end_block(f"br label %{start}", end)
+        loop = LoopStatement(None, None, [])
+        self._add(loop)
+        with self._block(loop.body):
+            yield
 
     @contextmanager
     def if_then(self, condition: RoutineValue) -> Iterator[None]:
         """Context of the statements for a true condition."""
-        yes, no, end = self._new_label(), self._new_label(), self._new_label()
-        self._end_block(f"br i1 {self._evaluate(condition)}, label %{yes}, label %{no}", yes)
-        yield
-        self._end_block(f"br label %{end}", no)
-        self._open_condition = end
+        statement = ConditionStatement(condition, [], [])
+        self._add(statement)
+        with self._block(statement.body):
+            yield
 
     @contextmanager
     def if_else(self) -> Iterator[None]:
         """Context of the statements for a false condition of the preceding `if_then`."""
-        end, self._open_condition = self._open_condition, None
-        assert end is not None
-        yield
-        self._end_block(f"br label %{end}", end)
+        statement = self._blocks[-1][-1]
+        assert isinstance(statement, ConditionStatement)
+        with self._block(statement.otherwise):
+            yield
 
     def break_loop(self) -> None:
         """Leave the innermost loop."""
-        # unreachable code needs a block
-        self._end_block(f"br label %{self._loop_end_labels[-1]}", self._new_label())
+        self._add(BreakStatement())
 
     def return_value(self, value: Operand) -> None:
         """Return an integer."""
-        word = self._evaluate(as_value(value, "integer"))
-        self._end_block(f"ret i64 {word}", self._new_label())
+        self._add(ReturnStatement(as_value(value, "integer")))
 
     def _add_variable(self, kind: ValueKind) -> RoutineValue:
-        variable = RoutineValue(kind, "variable", (f"x{len(self._variables)}",))
-        self._variables.append(variable)
+        variable = RoutineValue(kind, "variable", (f"x{len(self.variables)}",))
+        self.variables.append(variable)
         return variable
 
-    def _new_label(self) -> str:
-        self._number += 1
-        return f"l{self._number}"
+    def _add(self, statement: Statement) -> None:
+        self._blocks[-1].append(statement)
 
-    def _end_block(self, terminator: str, next_label: str) -> None:
-        self._emit_line(terminator)
-        self._lines.append(f"{next_label}:")
-
-    def _close_condition(self) -> None:
-        """Continue after a condition that has no `else`."""
-        end, self._open_condition = self._open_condition, None
-        if end is not None:
-            self._end_block(f"br label %{end}", end)
-
-    def _emit_line(self, text: str) -> None:
-        self._close_condition()
-        self._lines.append(f"  {text}")
-
-    def _emit_assignment(self, variable: RoutineValue, word: str) -> None:
-        self._emit_line(f"store {_TYPES[variable.kind]} {word}, ptr %{variable.operands[0]}")
-
-    def _emit_value(self, text: str) -> str:
-        self._number += 1
-        name = f"%t{self._number - 1}"
-        self._emit_line(f"{name} = {text}")
-        return name
-
-    def _emit_pointer(self, array: ArrayPointer) -> str:
-        offset = self._evaluate(array.offset)
-        if offset == "0":
-            return f"%{array.name}"
-        return self._emit_value(f"getelementptr double, ptr %{array.name}, i64 {offset}")
-
-    def _evaluate(self, value: RoutineValue) -> str:
-        """Emit the computation of a value; returns its register or constant."""
-        kind, operands = _TYPES[value.kind], value.operands
-        match value.operation:
-            case "constant":
-                return format_real(operands[0]) if value.kind == "real" else str(operands[0])
-            case "argument":
-                return f"%{operands[0]}"
-            case "variable":
-                return self._emit_value(f"load {kind}, ptr %{operands[0]}")
-            case "element":
-                array, index = operands
-                pointer = self._emit_pointer(array.element_pointer(index))
-                return self._emit_value(f"load double, ptr {pointer}")
-            case "select":
-                test, yes, no = (self._evaluate(x) for x in operands)
-                return self._emit_value(f"select i1 {test}, double {yes}, double {no}")
-            case "not":
-                return self._emit_value(f"xor i1 {self._evaluate(operands[0])}, true")
-            case "and" | "or":
-                a, b = (self._evaluate(x) for x in operands)
-                return self._emit_value(f"{value.operation} i1 {a}, {b}")
-        a, b = (self._evaluate(x) for x in operands)
-        of = operands[0].kind
-        word = (_COMPARISONS if value.kind == "truth" else _ARITHMETIC)[of][value.operation]
-        return self._emit_value(f"{word} {_TYPES[of]} {a}, {b}")
+    @contextmanager
+    def _block(self, statements: list[Statement]) -> Iterator[None]:
+        """Context in which statements are added to a block."""
+        self._blocks.append(statements)
+        yield
+        self._blocks.pop()
