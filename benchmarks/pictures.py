@@ -6,16 +6,18 @@ family beats in both error and time. Discs with the initial of the family mark t
 
 import textwrap
 from collections.abc import Iterable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+import yaml
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
-from problem import problems
+from problem import FOLDER
 from report import sentence
 from trajectories import Point, time_at_error
 
@@ -47,10 +49,14 @@ def family(engine: str) -> str:
     return "Pinocchio" if first == "pin" else first
 
 
+@cache
 def title(problem: str) -> str:
-    """What a problem is called."""
-    titles = {known.name: known.title for known in problems()}
-    return sentence(titles.get(problem, problem.replace("_", " ")))
+    """What a problem is called: a title in its file, of whatever kind it is."""
+    for path in FOLDER.rglob(f"{problem}.yaml"):
+        name = yaml.safe_load(path.read_text(encoding="utf-8")).get("title")
+        if name:
+            return sentence(name)
+    return sentence(problem.replace("_", " "))
 
 
 def times_to_error(points: Sequence[Point], problem: str, error: float) -> dict[str, float]:
@@ -103,14 +109,16 @@ def draw_time_at_error(points: Sequence[Point], errors: Sequence[float], path: P
     """CPU time of each family to an error, a row for each problem, a panel for each error."""
     chosen = list(dict.fromkeys(point.problem for point in points))
     names = {family(point.engine) for point in points}
-    height = 0.31 * len(chosen) + 0.62
+    labels = [textwrap.fill(title(problem), 22) for problem in chosen]
+    lines = max(label.count("\n") + 1 for label in labels)
+    height = max(0.31, 0.16 * lines) * len(chosen) + 0.62
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, height * len(errors) + 0.4), layout="constrained")
         panels = figure.subplots(len(errors), 1, sharex=True, squeeze=False).ravel()
         for panel, error in zip(panels, errors, strict=True):
             for row, problem in enumerate(chosen):
                 _draw_row(panel, row, times_to_error(points, problem, error))
-            panel.set_yticks(range(len(chosen)), [textwrap.fill(title(one), 22) for one in chosen])
+            panel.set_yticks(range(len(chosen)), labels)
             panel.set(ylim=(len(chosen) - 0.5, -0.5), xscale="log")
             power = round(np.log10(error))
             text = f"CPU time [ms] to an error of $\\mathbf{{10^{{{power}}}}}$ m"
