@@ -115,33 +115,77 @@ class ArrayPointer:
         return as_value(index, "integer")
 
 
+class RoutineStatement:
+    """Base class of statements."""
+
+    @property
+    def reads(self) -> tuple[RoutineValue | ArrayPointer, ...]:
+        """Values and arrays that it uses."""
+        return ()
+
+    @property
+    def writes(self) -> ArrayPointer | None:
+        """The array that it writes to by itself, if any."""
+        return None
+
+    @property
+    def blocks(self) -> "tuple[list[RoutineStatement], ...]":
+        """Statements within it."""
+        return ()
+
+
 @dataclass(frozen=True, eq=False)
-class AssignmentStatement:
+class AssignmentStatement(RoutineStatement):
     """variable = value."""
 
     variable: RoutineValue
     value: RoutineValue
 
+    @property
+    def reads(self) -> tuple[RoutineValue | ArrayPointer, ...]:
+        """See `RoutineStatement`."""
+        return (self.value,)
+
 
 @dataclass(frozen=True, eq=False)
-class StoreStatement:
+class StoreStatement(RoutineStatement):
     """pointer[0] = value."""
 
     pointer: ArrayPointer
     value: RoutineValue
 
+    @property
+    def reads(self) -> tuple[RoutineValue | ArrayPointer, ...]:
+        """See `RoutineStatement`."""
+        return self.pointer, self.value
+
+    @property
+    def writes(self) -> ArrayPointer:
+        """See `RoutineStatement`."""
+        return self.pointer
+
 
 @dataclass(frozen=True, eq=False)
-class CopyStatement:
+class CopyStatement(RoutineStatement):
     """target[:count] = source[:count]."""
 
     target: ArrayPointer
     source: ArrayPointer
     count: int
 
+    @property
+    def reads(self) -> tuple[RoutineValue | ArrayPointer, ...]:
+        """See `RoutineStatement`."""
+        return self.target, self.source
+
+    @property
+    def writes(self) -> ArrayPointer:
+        """See `RoutineStatement`."""
+        return self.target
+
 
 @dataclass(frozen=True, eq=False)
-class CallStatement:
+class CallStatement(RoutineStatement):
     """result = function(arguments); a formula has no result.
 
     Attributes:
@@ -156,47 +200,65 @@ class CallStatement:
     result: RoutineValue | None
     is_argument: bool
 
+    @property
+    def reads(self) -> tuple[RoutineValue | ArrayPointer, ...]:
+        """See `RoutineStatement`."""
+        return self.arguments
+
 
 @dataclass(frozen=True, eq=False)
-class LoopStatement:
+class LoopStatement(RoutineStatement):
     """Statements for each index from 0 to count - 1, or without an end if there is no index."""
 
     index: RoutineValue | None
     count: RoutineValue | None
-    body: "list[Statement]"
+    body: list[RoutineStatement]
+
+    @property
+    def reads(self) -> tuple[RoutineValue | ArrayPointer, ...]:
+        """See `RoutineStatement`."""
+        return () if self.count is None else (self.count,)
+
+    @property
+    def blocks(self) -> tuple[list[RoutineStatement], ...]:
+        """See `RoutineStatement`."""
+        return (self.body,)
 
 
 @dataclass(frozen=True, eq=False)
-class ConditionStatement:
+class ConditionStatement(RoutineStatement):
     """Statements for a true condition, and for a false one."""
 
     test: RoutineValue
-    body: "list[Statement]"
-    otherwise: "list[Statement]"
+    body: list[RoutineStatement]
+    otherwise: list[RoutineStatement]
+
+    @property
+    def reads(self) -> tuple[RoutineValue | ArrayPointer, ...]:
+        """See `RoutineStatement`."""
+        return (self.test,)
+
+    @property
+    def blocks(self) -> tuple[list[RoutineStatement], ...]:
+        """See `RoutineStatement`."""
+        return self.body, self.otherwise
 
 
 @dataclass(frozen=True, eq=False)
-class BreakStatement:
+class BreakStatement(RoutineStatement):
     """End of the innermost loop."""
 
 
 @dataclass(frozen=True, eq=False)
-class ReturnStatement:
+class ReturnStatement(RoutineStatement):
     """End of the routine."""
 
     value: RoutineValue
 
-
-Statement = (
-    AssignmentStatement
-    | StoreStatement
-    | CopyStatement
-    | CallStatement
-    | LoopStatement
-    | ConditionStatement
-    | BreakStatement
-    | ReturnStatement
-)
+    @property
+    def reads(self) -> tuple[RoutineValue | ArrayPointer, ...]:
+        """See `RoutineStatement`."""
+        return (self.value,)
 
 
 class Routine:
@@ -216,6 +278,7 @@ class Routine:
         name: Its name.
         argument_kinds: Kinds of the arguments, in their order.
         arguments: Arguments by name, in their order.
+        functions: Names of the function arguments.
         local_arrays: Lengths of local arrays by name.
         variables: Variables, in the order of their first use.
         statements: What it does.
@@ -229,7 +292,7 @@ class Routine:
         functions: Sequence[str],
         arrays: Mapping[str, Layout | None],
     ):
-        self.name, self._callees, self._functions = name, callees, functions
+        self.name, self._callees, self.functions = name, callees, functions
         self.arguments: dict[str, RoutineValue | ArrayPointer] = {
             **{count: RoutineValue("integer", "argument", (count,)) for count in counts},
             **{function: ArrayPointer(function) for function in functions},
@@ -240,7 +303,7 @@ class Routine:
         )
         self.local_arrays: dict[str, int] = {}
         self.variables: list[RoutineValue] = []
-        self.statements: list[Statement] = []
+        self.statements: list[RoutineStatement] = []
         self._blocks = [self.statements]  # the statements that are being built, innermost last
 
     def __getattr__(self, name: str) -> Any:
@@ -279,12 +342,17 @@ class Routine:
         self._add(CopyStatement(target, source, count))
 
     def call(self, function: str, *arguments: RoutineValue | ArrayPointer | int) -> RoutineValue:
-        """Call a formula, an earlier routine, or a function argument; returns its integer."""
+        """Call a formula, an earlier routine, or a function argument; returns its integer.
+
+        Function arguments of the called routine are left out where they are linked.
+        """
         callee = self._callees.get(function)
-        if callee is None and function not in self._functions:
+        if callee is None and function not in self.functions:
             raise ValueError(f"'{self.name}' calls '{function}', which is not there yet")
-        if callee is not None and len(arguments) != len(callee.argument_kinds):
-            raise ValueError(f"'{function}' takes {len(callee.argument_kinds)} arguments")
+        if callee is not None:
+            expected, linked = len(callee.argument_kinds), len(getattr(callee, "functions", ()))
+            if len(arguments) not in (expected, expected - linked):
+                raise ValueError(f"'{function}' takes {expected} arguments")
         result = None if isinstance(callee, Formula) else self._add_variable("integer")
         values = tuple(
             x if isinstance(x, ArrayPointer) else as_value(x, "integer") for x in arguments
@@ -338,11 +406,11 @@ class Routine:
         self.variables.append(variable)
         return variable
 
-    def _add(self, statement: Statement) -> None:
+    def _add(self, statement: RoutineStatement) -> None:
         self._blocks[-1].append(statement)
 
     @contextmanager
-    def _block(self, statements: list[Statement]) -> Iterator[None]:
+    def _block(self, statements: list[RoutineStatement]) -> Iterator[None]:
         """Context in which statements are added to a block."""
         self._blocks.append(statements)
         yield

@@ -120,9 +120,8 @@ class ValveDrive(ControlLaw):
 
     def initial_state(self, inputs: ControllerInputs) -> Sequence[Scalar]:
         """See `ControlLaw`."""
-        holding_forces = np.array(inputs.inverse([0.0] * len(inputs.q_a), friction=False))[
-            self._active_indices
-        ]
+        static_forces = inputs.inverse([0.0] * len(inputs.q_a), friction=False)
+        holding_forces = [static_forces[i] for i in self._active_indices]
         hydraulics = self.circuit.hydraulics
         # a sampled command has no signal yet, except perhaps those of an earlier run
         signals: Sequence[Scalar] = [spool.neutral for spool in hydraulics.spools.values()]
@@ -136,12 +135,7 @@ class ValveDrive(ControlLaw):
         tank = hydraulics.supply.tank
         if self.command.has_measured_pressures:
             tank = float(np.array(inputs.reference[-1], dtype=np.float64))
-        initial_signals = np.array(signals, dtype=np.float64)
-        return list(
-            self.circuit.initial_state(
-                holding_forces, self._initial_pressures, initial_signals, tank
-            )
-        )
+        return self.circuit.initial_state(holding_forces, self._initial_pressures, signals, tank)
 
     def _sample_signals(self, time: float, q_a: Array, v_a: Array, pressures: Array) -> Array:
         """Signals (s,) of a sampled law."""

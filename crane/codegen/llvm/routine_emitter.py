@@ -14,8 +14,8 @@ from crane.codegen.routine_statements import (
     LoopStatement,
     ReturnStatement,
     Routine,
+    RoutineStatement,
     RoutineValue,
-    Statement,
     StoreStatement,
 )
 
@@ -59,17 +59,17 @@ class _RoutineEmitter:
         self._number = 0  # of the next register or label
         self._loop_end_labels: list[str] = []  # of the enclosing loops
 
-    def lines_of(self, statements: Sequence[Statement]) -> list[str]:
+    def lines_of(self, statements: Sequence[RoutineStatement]) -> list[str]:
         """The lines of all statements."""
         self._emit_block(statements)
         return self._lines
 
-    def _emit_block(self, statements: Sequence[Statement]) -> None:
+    def _emit_block(self, statements: Sequence[RoutineStatement]) -> None:
         for statement in statements:
             self._emit(statement)
 
     @singledispatchmethod
-    def _emit(self, statement: Statement) -> None:
+    def _emit(self, statement: RoutineStatement) -> None:
         raise TypeError(f"no statement: {statement!r}")
 
     @_emit.register

@@ -96,10 +96,16 @@ class MachineCodeStepper:
         )
         self._program = machine_program(chart, key, self._build)
 
+    def new_program(self) -> Program:
+        """Its functions, not compiled, for other targets."""
+        program = Program()
+        self._build(program)
+        return program
+
     def _build(self, program: Program) -> None:
         """Add the formulas and routines."""
 
-    def _trace_controlled_machine(self, tape: Tape) -> MachineFormulas:
+    def trace_controlled_machine(self, tape: Tape) -> MachineFormulas:
         """The machine with its controller; references and state are the arguments 3 and 4."""
         references = tape.load_vector(3, 0, self.reference_columns)
         settings = controller_settings(self._control, tape, 2, self._fold_settings)
@@ -187,7 +193,7 @@ class RungeKuttaStepper(MachineCodeStepper):
 
     def _build(self, program: Program) -> None:
         for suffix, with_joints_at_rest in self._rest_variants:
-            machine = self._trace_controlled_machine(Tape())
+            machine = self.trace_controlled_machine(Tape())
             rate, margin = machine.state_rate(with_joints_at_rest)
             outputs = machine.outputs(with_joints_at_rest)
             parts = {"rate": rate, "outputs": outputs, "margin": [margin]}
