@@ -13,7 +13,7 @@ export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test slow long mutants lint docs bench referee reproduce clean
+.PHONY: help setup demo test slow long mutants lint docs referee reproduce clean
 
 help:
 	@echo "make setup   create .venv and install the package with its extras and development tools"
@@ -24,8 +24,7 @@ help:
 	@echo "make mutants   100 random faults in the code, and which of them fast tests notice; an hour"
 	@echo "make lint    ruff and mypy"
 	@echo "make docs    the site, its tutorials executed and its links followed; build/site/index.html"
-	@echo "make bench   measure speed; results in docs/performance.md"
-	@echo "make referee   all engines on all problems, half an hour; results in docs/performance.md"
+	@echo "make referee   speed, and all engines on all problems: 40 minutes; docs/performance.md"
 	@echo "make reproduce   both forwarder papers again; docs/validation/"
 	@echo "make clean   remove .venv, caches and results"
 
@@ -86,9 +85,6 @@ docs: $(READY_DOCS)
 	rm -rf build/site
 	$(BIN)/python -m sphinx -q -W --keep-going -b html docs build/site
 	$(BIN)/linkchecker --no-status build/site/index.html
-
-bench: $(READY_DEV)
-	$(BIN)/python scripts/benchmark.py --write docs/performance.md
 
 referee: $(READY_REFEREE)
 	$(BIN)/python benchmarks --write docs/performance.md

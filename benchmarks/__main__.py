@@ -1,99 +1,90 @@
 """The referee: error against time and cost of calls of all engines on all problems.
 
-python benchmarks                              # everything, printed
-python benchmarks --quick                      # a few minutes
-python benchmarks --only bricard               # one problem
-python benchmarks --write docs/performance.md  # also into the page
+python benchmarks                              # everything, printed; rows in build/referee.json
+python benchmarks runs starts                  # some parts
+python benchmarks --quick                      # a little of each, in three minutes
+python benchmarks --problem bricard            # one problem, all engines
+python benchmarks --write docs/performance.md  # also into the pages
+python benchmarks --kept --write docs/performance.md  # from the rows of earlier runs
 python benchmarks --references                 # compute the reference solutions again
 """
 
 import argparse
 import json
+import time
 import warnings
 from pathlib import Path
 
-import drives
-import forward_dynamics
-import report
-import valve_crane
+import work_precision
+from pages import Results, conditions, faults, write_pages
+from parts import PARTS
 from problem import Problem, problems
 from reference import write_reference
-from trajectories import Point, available_engines, measure
 
 import crane
 
-QUICK_PROBLEMS = ("andrews_squeezer", "mini_forwarder", "slider_crank")
-QUICK_MACHINES = ("chain 10", "ring 7", "mini_forwarder/mini_forwarder.yaml")
+ROWS = Path(__file__).parents[1] / "build" / "referee.json"
 MAX_DIFFERENCE = 1e-8  # between the two computations of a reference [m]
 
 
 def main() -> None:
     """Run what the options say."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--only", action="append", help="name of a problem; may be repeated")
-    parser.add_argument("--quick", action="store_true", help="a few problems and machines")
-    parser.add_argument("--write", type=Path, help="page to put the results into")
-    parser.add_argument("--json", type=Path, help="file for all results")
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}")
+    parser.add_argument("--problem", action="append", help="name of a problem; may be repeated")
+    parser.add_argument("--quick", action="store_true", help="a little of each part")
+    parser.add_argument("--write", type=Path, help="page to put the summary into")
+    parser.add_argument("--kept", action="store_true", help="measure nothing")
     parser.add_argument("--references", action="store_true", help="compute reference solutions")
     options = parser.parse_args()
     warnings.simplefilter("ignore", crane.CraneWarning)
-    names = options.only or (list(QUICK_PROBLEMS) if options.quick else None)
-    chosen = problems(names)
-    known = [problem.name for problem in problems()]
-    unknown = sorted(set(names or ()) - set(known))
-    if unknown:
-        parser.error(f"no problem '{unknown[0]}', there are {', '.join(known)}")
+    refuse_unknown(parser, "part", options.parts, list(PARTS))
+    refuse_unknown(parser, "problem", options.problem or [], [one.name for one in problems()])
+    if options.quick and options.write:
+        parser.error("a quick run is not written")
     if options.references:
-        write_references(chosen)
+        write_references(problems(options.problem))
         return
-    parts = [report.conditions()]
-    print(parts[0], flush=True)
-    points = run_work_precision(chosen)
-    parts += report.work_precision_tables(chosen, points)
-    results = []
-    if not options.only:
-        parts += ["### Hydraulics, friction and stops"]
-        parts += drives.tables(drives.measure(options.quick))
-        parts += valve_crane.tables(valve_crane.measure(options.quick))
-        results = run_forward_dynamics(options.quick)
-        parts += ["### Forward dynamics of all engines", report.forward_dynamics_table(results)]
-    print("\n\n".join(parts[1:]))
-    if options.json:
-        rows = [point.as_json() for point in points]
-        options.json.write_text(json.dumps({"points": rows, "forward": results}, indent=1))
+    if options.problem:
+        found = work_precision.measure(options.quick, options.problem)
+        print("\n\n".join(work_precision.tables(found)))
+        return
+    kept = json.loads(ROWS.read_text()) if ROWS.exists() and not options.quick else {}
+    chosen = [] if options.kept else options.parts or list(PARTS)
+    results = kept | run(chosen, options.quick, kept)
+    missing = [name for name in PARTS if name not in results]
+    if options.write and missing:
+        raise SystemExit(f"error: not written, there are no rows yet of {', '.join(missing)}")
     if options.write:
-        images = options.write.parent / "images"
-        report.draw_work_precision(chosen, points, images / "work_precision.png")
-        report.draw_forward_dynamics(results, images / "forward_dynamics.png")
-        report.write_section(options.write, parts)
+        write_pages(options.write, results)
+    lines = faults(results)
+    if lines:
+        raise SystemExit("\n".join(f"error: {line}" for line in lines))
+    print(f"{len(chosen)} parts, crane as exact as it has to be")
 
 
-def run_work_precision(chosen: list[Problem]) -> list[Point]:
-    """Points of all engines on some problems."""
-    engines, missing = available_engines()
-    for line in missing:
-        print(line)
-    points: list[Point] = []
-    for problem in chosen:
-        for engine in engines:
-            points += measure(problem, engine)
-        print(f"{problem.name}: {sum(point.problem == problem.name for point in points)} runs",
-              flush=True)  # fmt: skip
-    return points
+def refuse_unknown(
+    parser: argparse.ArgumentParser, kind: str, names: list[str], known: list[str]
+) -> None:
+    """End with a line if a name is not known."""
+    for name in names:
+        if name not in known:
+            parser.error(f"no {kind} '{name}', there are {', '.join(known)}")
 
 
-def run_forward_dynamics(quick: bool) -> list[dict]:
-    """Forward dynamics of all machines, each in a process of its own."""
-    machines = QUICK_MACHINES if quick else (
-        "mini_forwarder/mini_forwarder.yaml",
-        *(f"{family} {joints}" for family, sizes in forward_dynamics.SIZES.items()
-          for joints in sizes),
-    )  # fmt: skip
-    results = []
-    for machine in machines:
-        results.append(forward_dynamics.measure(machine, 5 if quick else 15))
-        print(f"{machine}: {results[-1].get('failure', 'done')}", flush=True)
-    return results
+def run(names: list[str], quick: bool, kept: Results) -> Results:
+    """Run parts one after another; the rows of complete ones are kept, whatever comes after."""
+    found: Results = {}
+    for name in names:
+        told, start = conditions(), time.monotonic()
+        print(f"\n## {PARTS[name].title}\n\n{told}\n", flush=True)
+        rows, tables = PARTS[name].run(quick)
+        found[name] = {"conditions": told, "rows": rows, "tables": tables}
+        print("\n\n".join(["", *tables]), f"\n\n{time.monotonic() - start:.0f} s", flush=True)
+        if not quick:
+            ROWS.parent.mkdir(exist_ok=True)
+            ROWS.write_text(json.dumps(kept | found, indent=1))
+    return found
 
 
 def write_references(chosen: list[Problem]) -> None:

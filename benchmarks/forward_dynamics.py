@@ -27,6 +27,7 @@ from multibody import Array, Multibody
 from problem import THIRD_PARTY, load_machine
 from scipy.linalg.blas import dsymm
 from scipy.linalg.lapack import dposv
+from timing import Call, in_turns
 
 import crane
 
@@ -42,7 +43,6 @@ MAX_SAMPLES = 200
 SHARE = 0.05  # [s] of a round for each candidate, about
 LIMIT = 300  # of a process [s]
 MAX_DIFFERENCE = 1e-6  # of an engine's accelerations or forces, relative: beyond, it has no time
-Call = Callable[[], object]
 Calls = tuple[dict[str, Call], int, dict[str, Any]]
 
 
@@ -203,18 +203,6 @@ def largest_difference(found: list[Array], expected: list[Array]) -> float:
         float(np.abs(one - other).max() / np.abs(other).max())
         for one, other in zip(found, expected, strict=True)
     )
-
-
-def in_turns(calls: dict[str, Call], rounds: int) -> dict[str, list[float]]:
-    """CPU times of each call [s]; they take turns, after one turn that does not count."""
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for turn in range(rounds + 1):
-        for name, call in calls.items():
-            start = time.process_time()
-            call()
-            if turn:
-                times[name].append(time.process_time() - start)
-    return times
 
 
 def main(quantity: str, prepare: Callable[[Multibody, crane.Dynamics], Calls]) -> None:

@@ -1,21 +1,19 @@
-"""Close random mechanisms from random starts; compare with scipy.optimize.least_squares.
-
-    python scripts/closing_from_anywhere.py [COUNT]
+"""Part: close random mechanisms from random starts; compare with scipy.optimize.least_squares.
 
 Each mechanism of `mechanisms.py` is written as a file with a random home configuration within
 limits, in which the driven joints have a value at which it closes. The search of the package is
 compared with scipy's trust region method with bounds, on the same residual from the same start.
 """
 
-import sys
 import tempfile
 import time
-from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import mechanisms
 import numpy as np
+from report import table
 from scipy.optimize import least_squares
 
 from crane.closure.constraint_tolerances import FILE_PRECISION
@@ -127,9 +125,9 @@ def row(kind: str, seed: int) -> Row:
     task = Task(kind, seed)
     closed, seconds, gap = {}, {}, 0.0
     for name, way in WAYS.items():
-        begun = time.perf_counter()
+        begun = time.process_time()
         q = way(task)
-        seconds[name] = time.perf_counter() - begun
+        seconds[name] = time.process_time() - begun
         closed[name] = q is not None
         if name == "search" and q is not None:
             gap = task.open_by(q)
@@ -142,22 +140,22 @@ def rows(count: int) -> list[Row]:
     return [row(kinds[i % len(kinds)], i // len(kinds)) for i in range(count)]
 
 
-def table(told: list[Row]) -> str:
-    """Shares closed and times, by kind and in all."""
-    by_kind = defaultdict(list)
-    for one in told:
-        by_kind[one.kind].append(one)
-        by_kind["all"].append(one)
-    by_kind["all"] = by_kind.pop("all")
-    heads = [*(f"{way} closed" for way in WAYS), *(f"{way} [ms]" for way in WAYS), "open by"]
-    lines = [f"| mechanism | number | {' | '.join(heads)} |", "| --- " * (len(heads) + 2) + "|"]
-    for kind, some in by_kind.items():
+def measure(quick: bool) -> list[Row]:
+    """200 mechanisms, or one of each kind."""
+    return rows(len(mechanisms.KINDS) if quick else 200)
+
+
+def tables(results: Sequence[Row]) -> list[str]:
+    """Numbers that closed and median times, by kind and in all."""
+    kinds = {row.kind: [one for one in results if one.kind == row.kind] for row in results}
+    lines = []
+    for kind, some in (kinds | {"all": list(results)}).items():
         cells = [f"{sum(one.closed[way] for one in some)}" for way in WAYS]
         cells += [f"{1e3 * np.median([one.seconds[way] for one in some]):.0f}" for way in WAYS]
-        cells.append(f"{max(one.gap for one in some):.0e}")
-        lines.append(f"| {kind.replace('_', ' ')} | {len(some)} | {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-if __name__ == "__main__":
-    print(table(rows(int(sys.argv[1]) if len(sys.argv) > 1 else 200)))
+        gap = max(one.gap for one in some)
+        lines.append([kind.replace("_", " "), f"{len(some)}", *cells, f"{gap:.0e}"])
+    head = [
+        "mechanism", "number", *(f"{way} closed" for way in WAYS),
+        *(f"{way} [ms]" for way in WAYS), "open by [m], [rad]",
+    ]  # fmt: skip
+    return [table(head, lines)]
