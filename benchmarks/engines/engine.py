@@ -24,12 +24,15 @@ class Engine(ABC):
         package: Distribution that it comes with.
         module: Module to import.
         advice: Where its documentation says how to use it for closed loops.
+        budget: CPU time of all runs of a problem [s], after which no further setting is tried;
+            without one, the sweep ends with the first run that is long.
     """
 
     name: str
     package: ClassVar[str]
     module: ClassVar[str]
     advice: ClassVar[str] = ""
+    budget: float = 0.0
 
     @classmethod
     def version(cls) -> str:
