@@ -1,6 +1,6 @@
 """This package."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from multibody import Array
@@ -58,6 +58,12 @@ class CraneSimulator(TreeSimulator):
     def run(self) -> crane.Recording:
         """See `Simulator.run`."""
         return crane.simulate(self.system.machine, None, self._start, **self._arguments)
+
+    def single_call(self) -> Callable[[], Array]:
+        """Accelerations of the active joints; the loops are closed in the call."""
+        forward = crane.Dynamics(self.system.machine).forward
+        q, v = self._start
+        return lambda: forward(q, v, np.zeros_like(v))
 
     def states(self, result: crane.Recording) -> list:
         """See `Simulator.states`."""

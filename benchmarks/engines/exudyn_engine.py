@@ -2,7 +2,7 @@
 
 import contextlib
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -221,6 +221,10 @@ class ExudynSimulator(Simulator):
             for name in names
         ]
 
+    def single_call(self) -> Callable[[], object]:
+        """A step, as a run of one step."""
+        return single_step(self._mbs, self._settings, self._type)
+
     def run(self) -> list[Array]:
         """See `Simulator.run`."""
         solve(self._mbs, self._settings, self._type)
@@ -277,7 +281,7 @@ def solver_settings(
     integration.newton.absoluteTolerance = tolerance
     integration.newton.relativeTolerance = tolerance
     integration.newton.useModifiedNewton = True
-    settings.solutionSettings.writeSolutionToFile = False
+    settings.solution.file.write = False
     settings.solutionSettings.sensorsWritePeriod = float(problem.times[1])
     settings.displayComputationTime = False
     settings.linearSolver.solverType = getattr(exudyn.LinearSolverType, linear)
@@ -295,6 +299,20 @@ def solve(mbs: Any, settings: Any, kind: Any) -> None:
         mbs.SolveDynamic(settings, solverType=kind)
     except Exception as error:
         raise UnsupportedError("the solver stops: " + str(error).splitlines()[0]) from None
+
+
+def single_step(mbs: Any, settings: Any, kind: Any) -> Callable[[], object]:
+    """A run of one step from the start."""
+    integration = settings.timeIntegration
+    step = integration.endTime / integration.numberOfSteps
+    end, count = integration.endTime, integration.numberOfSteps
+
+    def call() -> None:
+        integration.endTime, integration.numberOfSteps = step, 1
+        solve(mbs, settings, kind)
+        integration.endTime, integration.numberOfSteps = end, count
+
+    return call
 
 
 def rotation_to_z(normal: Array) -> Array:

@@ -1,5 +1,6 @@
 """Exudyn's kinematic tree: coordinates of the joints, loops as joints between its links."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from engines.exudyn_engine import (
     Setting,
     rotation_to_z,
     settings_of_newton,
+    single_step,
     solve,
     solver_settings,
 )
@@ -148,6 +150,10 @@ class ExudynTreeSimulator(TreeSimulator):
                 rotationMarker0=one, rotationMarker1=two,
             )
         )  # fmt: skip
+
+    def single_call(self) -> Callable[[], object]:
+        """A step, as a run of one step."""
+        return single_step(self._mbs, self._settings, self._type)
 
     def run(self) -> list[tuple[Array, Array]]:
         """See `Simulator.run`."""

@@ -1,5 +1,7 @@
 """MuJoCo Warp on the processor: the models of MuJoCo, in single precision."""
 
+from collections.abc import Callable
+
 from multibody import Array
 from problem import Problem
 
@@ -49,6 +51,11 @@ class MuJoCoWarpSimulator(TreeSimulator):
         self._count = round(float(problem.times[1]) / step)
         self._outputs = len(problem.times) - 1
         mujoco_warp.step(self._device_model, mujoco_warp.put_data(self._model, self._start))
+
+    def single_call(self) -> Callable[[], object]:
+        """A step."""
+        data = self._warp.put_data(self._model, self._start)
+        return lambda: self._warp.step(self._device_model, data)
 
     def run(self) -> list[tuple[Array, Array]]:
         """See `Simulator.run`."""

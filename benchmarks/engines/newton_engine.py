@@ -1,6 +1,6 @@
 """Newton: maximal coordinates in single precision, loops as joints outside of the tree."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -123,6 +123,12 @@ class NewtonSimulator(Simulator):
             state.body_q.assign(np.array(self._poses))
             state.body_qd.assign(np.hstack([start.velocity, start.angular_velocity]))
             self._newton.eval_ik(self._model, state, state.joint_q, state.joint_qd)
+
+    def single_call(self) -> Callable[[], object]:
+        """A step from the start."""
+        self._reset()
+        one, two = self._states
+        return lambda: self._solver.step(one, two, self._control, None, self._step)
 
     def run(self) -> list[tuple[Array, Array]]:
         """See `Simulator.run`."""

@@ -177,6 +177,11 @@ class PinocchioSimulator(TreeSimulator):
         self._forces = self.system.joint_force_parameters
         self._springs = SpringForces(self.system) if self.system.springs else None
 
+    def single_call(self) -> Callable[[], Array]:
+        """Accelerations of all joints of a closed configuration."""
+        q, v = self.system.q, self.system.v
+        return lambda: self._acceleration(q, v)
+
     def run(self) -> list[tuple[Array, Array]]:
         """See `Simulator.run`."""
         q, v, found = self.system.q.copy(), self.system.v.copy(), []
