@@ -97,7 +97,7 @@ def measure_setting(problem: Problem, engine: Engine, setting: Any) -> Point:
             start = time.process_time()
             result = simulator.run()
             times.append(time.process_time() - start)
-            if sum(times) > LONGEST_RUN:
+            if sum(times) > LONGEST_RUN / 2:
                 break
         states = simulator.states(result)
     except UnsupportedError as error:

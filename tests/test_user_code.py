@@ -2,12 +2,16 @@
 
 import importlib.util
 import runpy
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from cost_of_use import USER_CODE, code_lines, tables
+from cost_of_use import USER_CODE, call_times, code_lines, first_simulator, tables
+from dense_equations import exact_forward
+from engines.pinocchio_engine import Pinocchio
 from multibody import Multibody
+from problem import problems
 from reference import DenseMotion
 from scipy.integrate import solve_ivp
 from warned import quiet
@@ -63,6 +67,18 @@ def test_lines_of_code_are_counted_without_comments(tmp_path):
         '"""Two\nlines."""\n\n# a comment\nx = (\n    1\n)\n\n\ndef f():\n    """Text."""\n'
     )
     assert code_lines(path) == 4
+
+
+def test_costs_are_those_of_a_simulator_with_the_common_step():
+    problem = replace(problems(["n_four_bar_2"])[0], duration=0.5)
+    setting, simulator, _ = quiet(first_simulator, problem, Pinocchio("constraintDynamics"))
+    assert setting[0] == 5e-3
+    calls = []
+    found = call_times(lambda: calls.append(simulator.single_call()()))
+    assert len(calls) == 1100 and found.keys() == {"first", "thousandth"}
+    start = (system := problem.system).q, system.v
+    expected = exact_forward(system)(*start, system.joint_forces(*start))
+    np.testing.assert_allclose(calls[-1], expected, rtol=0, atol=1e-6)
 
 
 def test_an_engine_that_fails_is_a_line_of_the_table():

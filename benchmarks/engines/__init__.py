@@ -8,6 +8,7 @@ from engines.exudyn_tree_engine import ExudynTree
 from engines.mujoco_engine import MuJoCo
 from engines.mujoco_warp_engine import MuJoCoWarp
 from engines.newton_engine import Newton
+from engines.pinocchio_admm_engine import PinocchioAdmm
 from engines.pinocchio_engine import Pinocchio
 
 ENGINES: tuple[Engine, ...] = (
@@ -17,6 +18,7 @@ ENGINES: tuple[Engine, ...] = (
     Crane("DOP853", backend="pinocchio"),
     Pinocchio("constraintDynamics"),
     Pinocchio("lcaba"),
+    PinocchioAdmm(),
     MuJoCo("Euler"),
     MuJoCo("implicitfast"),
     MuJoCo("RK4"),

@@ -13,7 +13,7 @@ from engines.engine import Engine, TreeSimulator
 
 OFFSET = 0.3  # between the two points of a revolute loop in space [m]
 # time constant of connections in steps, and their impedance; below two steps `refsafe` is off
-STIFFNESSES = ((2.0, 0.9), (2.0, 0.99), (1.5, 0.999), (1.5, 0.9999), (0.45, 0.9999))
+STIFFNESSES = ((2.0, 0.9), (1.5, 0.999), (1.5, 0.9999), (0.45, 0.9999))
 Setting = tuple[float, float, float]
 
 
