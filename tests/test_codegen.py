@@ -18,7 +18,6 @@ from crane.codegen.llvm import formula_emitter as llvm_formulas
 from crane.codegen.llvm import sample_function
 from crane.codegen.llvm.machine_code import emit_module
 from crane.codegen.symbolic import (
-    LdltFactorization,
     add_vectors,
     apply_function,
     copysign,
@@ -28,9 +27,9 @@ from crane.codegen.symbolic import (
     matmul,
     matvec,
     scale_vector,
-    solve_linear_system,
     subtract_vectors,
 )
+from crane.codegen.symbolic_linear_algebra import LdltFactorization, solve_linear_system
 
 NAN, INF = math.nan, math.inf
 X = (0.7, -1.9, 3.1, 0.25, -0.6, 12.0, 1.0, -1.0)

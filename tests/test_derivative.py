@@ -9,13 +9,15 @@ from crane.codegen.symbolic import (
     apply_function,
     copysign,
     dot_products,
+    maximum,
+    minimum,
+    where_positive,
+)
+from crane.codegen.symbolic_linear_algebra import (
     load_matrix,
     lu_factorize,
     lu_solve,
-    maximum,
-    minimum,
     symbolic_entries,
-    where_positive,
 )
 from crane.studies.optimization.measure_expressions import DUAL_FUNCTIONS, DualNumber
 

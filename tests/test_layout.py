@@ -12,7 +12,7 @@ from package_source import PACKAGE, nodes
 ORDER = [
     "common", "codegen", "hydraulics", "description", "closure", "machine", "formats",
     "recordings", "dynamics", "motion", "ratings", "control", "simulation", "identification",
-    "studies", "view", "cli",
+    "studies", "export", "view", "cli",
 ]  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from warned import without_a_word
 import crane
 from crane.dynamics import Dynamics
 from crane.simulation.integration.stick_slip_modes import (
-    _RANK_TOLERANCE,
+    RANK_TOLERANCE,
     _bounded_least_squares,
     _independent_columns,
 )
@@ -275,6 +275,6 @@ def test_independent_columns_are_those_of_a_pivoted_qr(near):
         upper, order = qr(columns, mode="r", pivoting=True)
         sizes = np.abs(np.diag(upper))
         own = np.linalg.norm(columns, axis=0)[order[: len(sizes)]]
-        independent = sizes > _RANK_TOLERANCE * own
+        independent = sizes > RANK_TOLERANCE * own
         assert rank == independent.sum()
         assert set(kept) == set(order[:rank])

@@ -87,6 +87,7 @@ class CompiledClosure:
         tolerances: (3,) scaled residual that counts as rounding; that counts as closed if it no
             longer decreases; scaled step whose square is rounding.
         signs: Signs of the block determinants on the branch, over their order of magnitude.
+        has_partly_active_rotations: Whether only some coordinates of a rotation are active.
         follow_address: Address of the function `follow_targets`, for other machine code.
         close_address: Address of the function `close`; of `project` with partly active rotations,
             for the states of a simulation.
@@ -113,7 +114,7 @@ class CompiledClosure:
             self.geometry, active, passive, self._gamma_entry_pairs
         )
         joints = [int(column) + 1 for column in active]
-        self._has_partly_active_rotations = bool(self.geometry.partly_active_joints(joints))
+        self.has_partly_active_rotations = bool(self.geometry.partly_active_joints(joints))
         signs = self.signs = self._determinant_signs(home) if signs is None else signs
         key = self._cache_key(signs)
         program = _SHARED_CODE.get(key)
@@ -124,7 +125,7 @@ class CompiledClosure:
         self.programs = program.dependent_programs
         self.follow_address = program.function_address("follow")
         self.close_address = program.function_address(
-            "project" if self._has_partly_active_rotations else "close"
+            "project" if self.has_partly_active_rotations else "close"
         )
         self._home = home
         self.tolerances = np.array([1e-15 * rounding_scale, 1e-13 * rounding_scale, 1e-9])
@@ -179,7 +180,7 @@ class CompiledClosure:
 
     def _build(self, program: Program, signs: Array) -> None:
         self._add_newton_formula(program, signs, "newton", holds_coordinates=True)
-        if self._has_partly_active_rotations:
+        if self.has_partly_active_rotations:
             self._add_newton_formula(program, signs, "newton_motion", holds_coordinates=False)
         self._predictor.add_to(program)
         self._add_gamma(program)
@@ -187,9 +188,15 @@ class CompiledClosure:
             program,
             self._nq,
             self._n,
-            self._has_partly_active_rotations,
+            self.has_partly_active_rotations,
             self._predictor.wraps_rotations,
         )
+
+    def new_program(self) -> Program:
+        """The functions of the loops, not compiled, for other targets."""
+        program = Program()
+        self._build(program, self.signs)
+        return program
 
     def cached_program(self, key: tuple, build: Callable[[Program], None]) -> Program:
         """A further program of this machine, kept in `programs`; see `Program.from_cache`.

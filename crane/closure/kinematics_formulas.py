@@ -29,11 +29,11 @@ from crane.codegen.symbolic import (
     max_abs,
     maximum,
     scale_vector,
-    solve_linear_system,
     subtract_vectors,
     transpose,
     where_positive,
-)  # fmt: skip
+)
+from crane.codegen.symbolic_linear_algebra import solve_linear_system
 from crane.common.samples import Array
 
 Vector = list[Scalar]

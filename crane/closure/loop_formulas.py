@@ -20,15 +20,8 @@ from crane.closure.kinematics_formulas import (
     subtract_spatial,
 )
 from crane.closure.loop_equations import LoopEquations, aligned_axes
-from crane.codegen.symbolic import (
-    Scalar,
-    add_vectors,
-    cross,
-    dot,
-    scale_vector,
-    solve_linear_system,
-    subtract_vectors,
-)  # fmt: skip
+from crane.codegen.symbolic import Scalar, add_vectors, cross, dot, scale_vector, subtract_vectors
+from crane.codegen.symbolic_linear_algebra import solve_linear_system
 from crane.description.specification import LOOP_TYPES
 
 

@@ -1,6 +1,5 @@
 """Symbolic formulas, routines that call them, and their translation to machine code."""
 
-from crane.codegen.llvm.routine_builder import ArrayPointer, Routine, RoutineValue, select
 from crane.codegen.program import (
     FormulaTooLongError,
     Program,
@@ -8,6 +7,7 @@ from crane.codegen.program import (
     run_with_fallback,
 )
 from crane.codegen.program_cache import cached_result
+from crane.codegen.routine_statements import ArrayPointer, Routine, RoutineValue, select
 from crane.codegen.symbolic import Scalar, SymbolicExpression, Tape, max_abs, maximum
 from crane.codegen.vector_layout import Layout, LayoutView
 

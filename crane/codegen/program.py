@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from crane.codegen.llvm.machine_code import MachineCode
-from crane.codegen.llvm.routine_builder import Routine, RoutineValue
 from crane.codegen.llvm.sample_function import SampleFunction, make_sample_function
 from crane.codegen.program_cache import FunctionSignature, ProgramRecord, cache_entry_name
+from crane.codegen.routine_statements import Routine, RoutineValue
 from crane.codegen.symbolic import Scalar, required_operations
 from crane.codegen.vector_layout import Formula, Layout
 from crane.common.samples import Array

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from crane.codegen.symbolic import Scalar
+from crane.codegen.symbolic import Scalar, SymbolicExpression, required_operations
 
 ArgumentKind = Literal["count", "array"]  # a number, or the address of an array or function
 
@@ -87,3 +87,11 @@ class Formula:
     def argument_kinds(self) -> tuple[ArgumentKind, ...]:
         """Kinds of the arguments."""
         return tuple("array" for _ in range(self.input_count + 1))
+
+    @property
+    def loads(self) -> set[tuple[int, int]]:
+        """Elements that it reads: indices of the input argument and in it."""
+        tapes = [x.tape for x in self.outputs if isinstance(x, SymbolicExpression)]
+        operations = tapes[0].operations if tapes else []
+        used = [operations[i] for i in required_operations(self.outputs)]
+        return {(x[1], x[2]) for x in used if x[0] == "load"}

@@ -91,6 +91,7 @@ class ValveDrive(ControlLaw):
             [self.circuit.constants, self._lower_limits, self._signal_source.settings]
         )
         self.scales = self.circuit.scales
+        self._last_evaluation: tuple[Any, Any, Any] = None, None, None
 
     def for_machine(self, machine: Machine) -> "ValveDrive":
         """The same command and initial pressures for another machine.
@@ -119,9 +120,8 @@ class ValveDrive(ControlLaw):
 
     def initial_state(self, inputs: ControllerInputs) -> Sequence[Scalar]:
         """See `ControlLaw`."""
-        holding_forces = np.array(inputs.inverse([0.0] * len(inputs.q_a), friction=False))[
-            self._active_indices
-        ]
+        static_forces = inputs.inverse([0.0] * len(inputs.q_a), friction=False)
+        holding_forces = [static_forces[i] for i in self._active_indices]
         hydraulics = self.circuit.hydraulics
         # a sampled command has no signal yet, except perhaps those of an earlier run
         signals: Sequence[Scalar] = [spool.neutral for spool in hydraulics.spools.values()]
@@ -135,12 +135,7 @@ class ValveDrive(ControlLaw):
         tank = hydraulics.supply.tank
         if self.command.has_measured_pressures:
             tank = float(np.array(inputs.reference[-1], dtype=np.float64))
-        initial_signals = np.array(signals, dtype=np.float64)
-        return list(
-            self.circuit.initial_state(
-                holding_forces, self._initial_pressures, initial_signals, tank
-            )
-        )
+        return self.circuit.initial_state(holding_forces, self._initial_pressures, signals, tank)
 
     def _sample_signals(self, time: float, q_a: Array, v_a: Array, pressures: Array) -> Array:
         """Signals (s,) of a sampled law."""
@@ -250,7 +245,10 @@ class ValveDrive(ControlLaw):
     def _evaluate_circuit(
         self, inputs: ControllerInputs
     ) -> tuple[CircuitValues, Sequence[Scalar]]:
-        """The circuit, and the signals at its valves."""
+        """The circuit, and the signals at its valves; kept for the inputs that were last given."""
+        known_inputs, *known = self._last_evaluation
+        if inputs is known_inputs:
+            return known[0], known[1]
         m, size = len(self._active_indices), len(self.circuit.constants)
         lower = inputs.settings[size : size + m]
         signals = self._signal_source.signals(
@@ -264,4 +262,5 @@ class ValveDrive(ControlLaw):
             signals,
             inputs.reference[-2:] if self.command.has_measured_pressures else [],
         )
+        self._last_evaluation = inputs, circuit_values, signals
         return circuit_values, signals

@@ -37,7 +37,8 @@ from crane.closure.kinematics_formulas import (
 )
 from crane.closure.loop_equations import Cluster, find_clusters
 from crane.closure.loop_formulas import LoopFormulas, VelocityKinematics
-from crane.codegen.symbolic import LdltFactorization, Scalar, dot, invert_pivot, sum_scalars
+from crane.codegen.symbolic import Scalar, dot, sum_scalars
+from crane.codegen.symbolic_linear_algebra import LdltFactorization, invert_pivot
 from crane.dynamics.spatial_inertia import ClusterMassColumns, SpatialInertia, forward_substitute
 from crane.machine.machine import Machine
 

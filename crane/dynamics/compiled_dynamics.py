@@ -114,7 +114,7 @@ class CompiledQuantity:
         nq, n = machine.model.nv, len(machine.active)
         program = self._program = fast.cached_program(
             ("quantity", quantity, folding_pattern(constant_pattern), formula_structure),
-            lambda program: _build_quantity(
+            lambda program: build_quantity(
                 program, quantity, fast, constant_pattern, n, formula_structure
             ),
         )
@@ -167,7 +167,7 @@ class CompiledQuantity:
         return self._program.call("each", len(targets), fast.follow_address, *arrays)
 
 
-def _build_quantity(
+def build_quantity(
     program: Program,
     quantity: str,
     compiled_closure: CompiledClosure,
@@ -175,6 +175,7 @@ def _build_quantity(
     n: int,
     formula_structure: FormulaStructure,
 ) -> None:
+    """Add the formula and the routines of a quantity, see `CompiledQuantity`."""
     tape = Tape()
     q, kinematics, loops = compiled_closure.trace_kinematics(tape, 0, 2)
     constants = FormulaConstants(tape, 1, constant_pattern)

@@ -14,8 +14,6 @@ from crane.closure.kinematics_formulas import (
     Vector,
 )
 from crane.codegen.symbolic import (
-    LdltFactorization,
-    Matrix,
     Scalar,
     add_vectors,
     apply_function,
@@ -28,7 +26,8 @@ from crane.codegen.symbolic import (
     subtract_vectors,
     transpose,
     where_positive,
-)  # fmt: skip
+)
+from crane.codegen.symbolic_linear_algebra import LdltFactorization, Matrix
 from crane.dynamics.cluster_recursion import (
     RecursionInput,
     joint_accelerations,
@@ -252,6 +251,11 @@ class DynamicsFormulas(InertialForceFormulas):
             for i in self._stick_slip_columns
         ]
 
+    @property
+    def breakaway_forces(self) -> Vector:
+        """(k,) largest friction of the stick-slip joints at rest, relative to its offset."""
+        return [self._joint_laws[i][0] + self._joint_laws[i][5] for i in self._stick_slip_columns]
+
     def accelerations_with_stick_slip(
         self, tau: Sequence[Scalar], with_joints_at_rest: bool
     ) -> StickSlipAccelerations:
@@ -270,7 +274,7 @@ class DynamicsFormulas(InertialForceFormulas):
         slip_signs, is_held, inverse_velocities = (
             [law[SLIP_INDEX + k] for law in laws] for k in range(3)
         )
-        limits = [law[0] + law[5] for law in laws]
+        limits = self.breakaway_forces
         velocities = [self.joint_velocities[i + 1] for i in self._stick_slip_columns]
         slip_velocities = [
             s * v * p for s, v, p in zip(slip_signs, velocities, inverse_velocities, strict=True)

@@ -12,7 +12,6 @@ from crane.closure.kinematics_formulas import (
     scale_spatial,
 )
 from crane.codegen.symbolic import (
-    LdltFactorization,
     Scalar,
     add_vectors,
     cross,
@@ -22,7 +21,8 @@ from crane.codegen.symbolic import (
     scale_vector,
     subtract_vectors,
     sum_scalars,
-)  # fmt: skip
+)
+from crane.codegen.symbolic_linear_algebra import LdltFactorization
 from crane.dynamics.joint_force_formulas import JointForceFormulas
 from crane.dynamics.spatial_inertia import composite_mass_matrix
 

@@ -13,23 +13,23 @@ from crane.description.force_elements import ForceElement, Friction, GasSpring, 
 from crane.dynamics.frame_jacobians import FrameDistances, FramePair
 from crane.machine.machine import Machine
 
-_PARAMETER_NAMES = (
+LAW_PARAMETER_NAMES = (
     "coulomb", "coulomb_offset", "viscous", "viscous_offset", "sharpness", "stiction", "stribeck",
     "slip_sign", "is_held", "inverse_velocity",
     "stiffness", "damping", "constant", "energy_offset",
     "stop_stiffness", "stop_damping", "lower_limit", "upper_limit",
     "gas_force", "gas_area_per_volume", "gas_rest_position", "gas_exponent",
 )  # fmt: skip
-PARAMETER_COUNT = len(_PARAMETER_NAMES)  # values of a law, see `JointForces.table`
-SHARPNESS_INDEX = _PARAMETER_NAMES.index("sharpness")
-SLIP_INDEX = _PARAMETER_NAMES.index("slip_sign")  # first of the stick-slip mode
-END_STOP_INDEX = _PARAMETER_NAMES.index("stop_stiffness")  # first of the end stop
-_MODE_FIELDS = slice(SLIP_INDEX, _PARAMETER_NAMES.index("inverse_velocity") + 1)
+PARAMETER_COUNT = len(LAW_PARAMETER_NAMES)  # values of a law, see `JointForces.table`
+SHARPNESS_INDEX = LAW_PARAMETER_NAMES.index("sharpness")
+SLIP_INDEX = LAW_PARAMETER_NAMES.index("slip_sign")  # first of the stick-slip mode
+END_STOP_INDEX = LAW_PARAMETER_NAMES.index("stop_stiffness")  # first of the end stop
+_MODE_FIELDS = slice(SLIP_INDEX, LAW_PARAMETER_NAMES.index("inverse_velocity") + 1)
 _SPRING_FIELDS = slice(
-    _PARAMETER_NAMES.index("stiffness"), _PARAMETER_NAMES.index("energy_offset") + 1
+    LAW_PARAMETER_NAMES.index("stiffness"), LAW_PARAMETER_NAMES.index("energy_offset") + 1
 )
-_END_STOP_FIELDS = slice(END_STOP_INDEX, _PARAMETER_NAMES.index("upper_limit") + 1)
-_GAS_FIELDS = slice(_PARAMETER_NAMES.index("gas_force"), PARAMETER_COUNT)
+_END_STOP_FIELDS = slice(END_STOP_INDEX, LAW_PARAMETER_NAMES.index("upper_limit") + 1)
+_GAS_FIELDS = slice(LAW_PARAMETER_NAMES.index("gas_force"), PARAMETER_COUNT)
 # for joints with circuit friction only, so that friction is never zero
 MIN_COULOMB_FRICTION = 1e-6
 REST_VELOCITY = 5e-10  # scaled velocity that counts as rest
@@ -144,14 +144,13 @@ class JointForces:
     def _joint_breakaway(self) -> Array:
         """The same without circuit friction."""
         law = self.table[list(self.stick_slip_columns)]
-        return np.asarray(
-            law[:, _PARAMETER_NAMES.index("coulomb")] + law[:, _PARAMETER_NAMES.index("stiction")]
-        )
+        columns = [LAW_PARAMETER_NAMES.index(name) for name in ("coulomb", "stiction")]
+        return np.asarray(law[:, columns].sum(axis=1))
 
     def friction_at_rest(self, limit_share: Array) -> Array:
         """(k,) friction of stick-slip joints at rest, from shares (k,) of its limit."""
         return (
-            self.table[list(self.stick_slip_columns), _PARAMETER_NAMES.index("coulomb_offset")]
+            self.table[list(self.stick_slip_columns), LAW_PARAMETER_NAMES.index("coulomb_offset")]
             + limit_share * self.breakaway
         )
 

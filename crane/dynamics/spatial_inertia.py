@@ -28,7 +28,6 @@ from crane.closure.kinematics_formulas import (
 from crane.closure.loop_equations import Cluster
 from crane.closure.loop_formulas import LoopFormulas
 from crane.codegen.symbolic import (
-    LdltFactorization,
     Scalar,
     add_vectors,
     cross,
@@ -38,7 +37,8 @@ from crane.codegen.symbolic import (
     scale_vector,
     subtract_vectors,
     transpose,
-)  # fmt: skip
+)
+from crane.codegen.symbolic_linear_algebra import LdltFactorization
 
 Matrix = list[Vector]
 

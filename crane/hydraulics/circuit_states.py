@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from crane.codegen import Scalar
-from crane.common.samples import Array
+from crane.codegen.symbolic import maximum, minimum
 from crane.hydraulics.circuit_elements import MAIN_PUMP
 from crane.hydraulics.components import Cylinder, Valve
 from crane.hydraulics.hydraulic_circuit import Hydraulics
@@ -234,6 +234,21 @@ class CircuitStates:
             },
         )
 
+    @property
+    def constant_names(self) -> list[str]:
+        """Names of `constants`: COMPONENT_VALUE."""
+        joints, found = list(self.hydraulics.cylinders), list[str]()
+        for field, tree in zip(
+            CircuitConstants._fields, self._constants_by_component, strict=True
+        ):
+            if not isinstance(tree, list):
+                found += _names_in(tree, field)
+                continue
+            side = "_second" if field == "second_spools" else ""
+            for joint, values in zip(joints, tree, strict=True):
+                found += _names_in(values, joint + side)
+        return found
+
     def split_constants(self, constants: Sequence[Scalar]) -> CircuitConstants:
         """Constants by component.
 
@@ -246,11 +261,11 @@ class CircuitStates:
 
     def initial_state(
         self,
-        forces: Array,
+        forces: Sequence[Scalar],
         pressures: dict[str, tuple[float, float]],
-        signals: Array,
+        signals: Sequence[Scalar],
         tank: float,
-    ) -> Array:
+    ) -> list[Scalar]:
         """State (state_count,) at rest.
 
         Args:
@@ -261,20 +276,20 @@ class CircuitStates:
             tank: Pressure of the tank [Pa].
         """
         vapour = self.hydraulics.oil.vapour_pressure
-        values: dict[str, float] = {}
+        values: dict[str, Scalar] = {}
         for (cylinder, _, _), force in zip(self.cylinders_and_valves, forces, strict=True):
             joint, area_a, area_b = cylinder.joint, cylinder.area_a, cylinder.area_b
             carried_force = force - tank * (area_a - area_b)
-            a = tank + max(carried_force, 0.0) / area_a
-            b = tank + max(-carried_force, 0.0) / area_b
+            a: Scalar = tank + maximum(carried_force, 0.0) / area_a
+            b: Scalar = tank + maximum(-carried_force, 0.0) / area_b
             a, b = pressures.get(joint, (a, b))
-            values[f"pressure_{joint}_a"] = max(a - vapour, 0.0)
-            values[f"pressure_{joint}_b"] = max(b - vapour, 0.0)
+            values[f"pressure_{joint}_a"] = maximum(a - vapour, 0.0)
+            values[f"pressure_{joint}_b"] = maximum(b - vapour, 0.0)
             if cylinder.stiffness > 0:
                 values[f"spring_{joint}"] = (area_a * a - area_b * b) / cylinder.stiffness
         for signal, (name, spool) in zip(signals, self.hydraulics.spools.items(), strict=True):
             u = (signal - spool.neutral) / (spool.full - spool.neutral)
-            values[f"play_{name}"] = values[f"spool_{name}"] = np.clip(u, -1.0, 1.0)
+            values[f"play_{name}"] = values[f"spool_{name}"] = maximum(minimum(u, 1.0), -1.0)
         for name, pump in self.pumps.items():
             values[f"pressure_{name}"] = pump.idle_pressure(tank) - vapour
             values[f"share_{name}"], values[f"load_{name}"] = pump.least, tank
@@ -286,9 +301,8 @@ class CircuitStates:
             values[f"oil_{name}"] = item.volume * (1.0 - item.precharge / max(p, item.precharge))
         if self.engine is not None:
             values["engine"] = 1.0 + self.engine.speed_droop / self.engine.speed
-        return np.array(
-            [values.get(name, 0.0) for name in self.state_units] + [0.0] * len(BALANCE_UNITS)
-        )
+        balances = [0.0] * len(BALANCE_UNITS)
+        return [*(values.get(name, 0.0) for name in self.state_units), *balances]
 
 
 def _inverse(value: float) -> float:
@@ -303,3 +317,11 @@ def _map_numbers(tree: Any, function: Callable[[Any], Any]) -> Any:
     if isinstance(tree, list):
         return [_map_numbers(x, function) for x in tree]
     return function(tree)
+
+
+def _names_in(tree: Any, path: str) -> list[str]:
+    """Names of the numbers of a tree of dictionaries and lists."""
+    if not isinstance(tree, dict | list):
+        return [path]
+    pairs = tree.items() if isinstance(tree, dict) else enumerate(tree)
+    return [name for key, value in pairs for name in _names_in(value, f"{path}_{key}")]

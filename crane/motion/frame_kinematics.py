@@ -40,6 +40,9 @@ class CompiledPoint:
         machine: The machine.
         frame: Index of the frame in the Pinocchio model.
 
+    Attributes:
+        frame_offset: (3,) origin of the frame in its body, the second argument of the formulas.
+
     Raises:
         FormulaTooLongError: The formulas are too long to be compiled.
     """
@@ -48,12 +51,12 @@ class CompiledPoint:
         compiled_closure = self._compiled_closure = machine.closure.compiled_closure
         model_frame = machine.model.frames[frame]
         self._body = machine.coordinates.body_of_joint[model_frame.parentJoint]
-        self._frame_offset = (
+        self.frame_offset = (
             compiled_closure.geometry.body_rotations[self._body].T
             @ model_frame.placement.translation
         )
         self._nq, self._n = machine.model.nv, len(machine.active)
-        name = ("frame", type(self).__name__, self._body, folding_pattern(self._frame_offset))
+        name = ("frame", type(self).__name__, self._body, folding_pattern(self.frame_offset))
         if name not in compiled_closure.programs:
             compiled_closure.programs[name] = compiled_closure.cached_program(
                 name, self._build_program
@@ -64,7 +67,7 @@ class CompiledPoint:
         """Rows of `_output_expressions` for configurations (N, nq) and velocities (N, n)."""
         v_a = np.zeros((len(q), self._n)) if v_a is None else v_a
         out = np.empty((len(q), self._program.formula_outputs("formula").size))
-        constants = self._compiled_closure.geometry.constants, self._frame_offset
+        constants = self._compiled_closure.geometry.constants, self.frame_offset
         for i in range(
             0, len(q), _BLOCK_SAMPLES
         ):  # copies of this size stay in the processor's cache
@@ -80,7 +83,7 @@ class CompiledPoint:
     def _trace_point(self, tape: Tape) -> tuple[PositionKinematics, LoopFormulas, list[Scalar]]:
         """Bodies, loops, and the position of the frame in the reference body."""
         _, bodies, loops = self._compiled_closure.trace_kinematics(tape, 0, 2)
-        frame_offset = FormulaConstants(tape, 1, self._frame_offset).vector(0)
+        frame_offset = FormulaConstants(tape, 1, self.frame_offset).vector(0)
         point = add_vectors(
             bodies.origin[self._body], matvec(bodies.rotation[self._body], frame_offset)
         )
@@ -89,6 +92,12 @@ class CompiledPoint:
     def _rotate_to_world(self, bodies: PositionKinematics, vector: list[Scalar]) -> list[Scalar]:
         """Components in the world frame of a vector of the reference body."""
         return matvec([list(axis) for axis in zip(*bodies.rotation[0], strict=True)], vector)
+
+    def new_program(self) -> Program:
+        """Its functions, not compiled, for other targets."""
+        program = Program()
+        self._build_program(program)
+        return program
 
     def _build_program(self, program: Program) -> None:
         nq, n = self._nq, self._n

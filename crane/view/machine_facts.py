@@ -19,7 +19,7 @@ class MachineFact(NamedTuple):
 
     Attributes:
         name: Subject of the fact.
-        text: Statement.
+        text: RoutineStatement.
         heading: Headings of the columns; "" for columns that need none.
         rows: Cells of the table.
     """

@@ -6,8 +6,9 @@ from collections.abc import Iterable
 from typing import Any
 
 from crane.codegen.llvm.formula_emitter import emit_formula
-from crane.codegen.llvm.routine_builder import Routine
+from crane.codegen.llvm.routine_emitter import emit_routine
 from crane.codegen.llvm.vector_functions import define_functions
+from crane.codegen.routine_statements import Routine
 from crane.codegen.vector_layout import Formula
 from crane.common.file_cache import cached_object_code, entry_name, read_entry
 
@@ -43,7 +44,7 @@ def emit_module(functions: Iterable[Formula | Routine]) -> str:
                 _emit_entry_point(function, "void"),
             ]
         else:
-            texts += [function.text(), _emit_entry_point(function, "i64")]
+            texts += [emit_routine(function), _emit_entry_point(function, "i64")]
     return "\n".join([*texts, define_functions(vector_functions)])
 
 

@@ -236,15 +236,13 @@ class ChartSwitchingIntegrator:
         if steps_made == len(instants):
             nodes = slice(len(instants) - 1 - (NODES_BEFORE - 1) * stride, None, stride)
             path = extrapolate_states(
-                instants[nodes], fine_rows[nodes, : len(state)], integrator.python_stepper.observe
+                instants[nodes], fine_rows[nodes, : len(state)], integrator.rate_and_outputs
             )
-            q = self._chart.state_layout.view(path.state_at(behind_time)).q
+            q = self._chart.state_layout.view(path.states(np.array([behind_time]))[0]).q
             behind = self._chart_behind_crossing(q)
             if behind is not None:
                 self._enter_chart(behind, 0.0)
-                path = correct_polynomial(
-                    path, behind_time, self._integrator.python_stepper.observe
-                )
+                path = correct_polynomial(path, behind_time, self._integrator.rate_and_outputs)
                 return self._record_crossing(
                     path, behind_time, fine_step, times, state, step, rows
                 )
@@ -336,13 +334,12 @@ class ChartSwitchingIntegrator:
         """
         first = int(np.searchsorted(times, path.times[path.nodes_before - 1], side="right"))
         i = int(np.searchsorted(times, behind_time))
-        for k in range(first, i):
-            rows[k] = [*path.state_at(times[k]), *path.outputs_at(times[k])]
+        rows[first:i] = path.rows(times[first:i])
         self.done = i
         self._to_user_coordinates(times[first:i], rows[first:i])
         self._recent_states = self._recent_states[:0]
         next_time = times[0] + i * step
-        state[:] = path.state_at(min(behind_time, next_time))
+        state[:] = path.states(np.array([min(behind_time, next_time)]))[0]
         if next_time - behind_time > 1e-6 * fine_step:
             part = (next_time - behind_time) / np.ceil((next_time - behind_time) / fine_step)
             instants = np.arange(behind_time, next_time - 0.5 * part, part)
@@ -426,9 +423,9 @@ class ChartSwitchingIntegrator:
                 "take passive joints with them",
             )
         at.v_a[:] = np.einsum("nij,nj->ni", velocity_maps, at.v_a)
-        at.friction[:] = np.einsum(
-            "nij,nj->ni", np.linalg.pinv(np.swapaxes(velocity_maps, 1, 2)), at.friction
-        )
+        if at.friction.any():
+            inverses = np.linalg.pinv(np.swapaxes(velocity_maps, 1, 2))
+            at.friction[:] = np.einsum("nij,nj->ni", inverses, at.friction)
 
     @property
     def _uses_inverse_dynamics(self) -> bool:

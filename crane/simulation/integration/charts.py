@@ -300,7 +300,7 @@ STEPS_BEFORE, STEPS_BEHIND = 2, 4  # steps from the last node to the crossing, a
 NODES_BEHIND = 3  # nodes behind the crossing
 MAX_MOTION_PER_STEP = 1e-2  # displacement of the fastest joint in coordinate units
 MAX_RELATIVE_RANK = 0.05  # `relative_rank` at a crossing, as a share of that at home
-_CORRECTOR_ITERATIONS = 6
+_CORRECTIONS = 6
 
 RateFunction = Callable[[float, Array], tuple[Array, Array]]
 """(time, state) -> rate of the state, outputs."""
@@ -333,30 +333,26 @@ class CrossingPolynomial:
     outputs: Array
     nodes_before: int
 
-    def state_at(self, time: float) -> Array:
-        """The state at an instant [s]."""
+    def rows(self, times: Array) -> Array:
+        """States and outputs (N, .) at instants (N,) [s]."""
         origin = self.times[self.nodes_before - 1]
-        unit = self.times[self.nodes_before - 1] - self.times[self.nodes_before - 2]
-        at, until = (self.times - origin) / unit, (time - origin) / unit
-        powers = np.arange(len(at))
-        weights = np.linalg.solve(
-            (at[:, None] ** powers).T, until ** (powers + 1.0) / (powers + 1.0)
-        )
-        return self.start_state + unit * (weights @ self.rates)
+        unit = origin - self.times[self.nodes_before - 2]
+        nodes, at = (self.times - origin) / unit, (np.asarray(times) - origin) / unit
+        powers = np.arange(len(nodes))
+        values = at[:, None] ** powers
+        integrals = unit * values * at[:, None] / (powers + 1)
+        weights = np.linalg.solve((nodes[:, None] ** powers).T, np.vstack([integrals, values]).T).T
+        states = self.start_state + weights[: len(at)] @ self.rates
+        return np.hstack([states, weights[len(at) :] @ self.outputs])
 
-    def outputs_at(self, time: float) -> Array:
-        """The outputs at an instant [s]."""
-        unit = self.times[1] - self.times[0]
-        at, until = (self.times - time) / unit, np.zeros(len(self.times))
-        until[0] = 1.0
-        return np.linalg.solve((at[:, None] ** np.arange(len(at))).T, until) @ self.outputs
+    def states(self, times: Array) -> Array:
+        """States (N, size) at instants (N,) [s]."""
+        return self.rows(times)[:, : len(self.start_state)]
 
 
 def extrapolate_states(times: Array, states: Array, rate: RateFunction) -> CrossingPolynomial:
     """Extrapolation from states (k, size) at times (k,) [s]."""
-    rates_and_outputs = [rate(time, state) for time, state in zip(times, states, strict=True)]
-    rates, outputs = (np.array(part) for part in zip(*rates_and_outputs, strict=True))
-    return CrossingPolynomial(times, states[-1], rates, outputs, len(times))
+    return CrossingPolynomial(times, states[-1], *_evaluate(times, states, rate), len(times))
 
 
 def correct_polynomial(
@@ -369,9 +365,9 @@ def correct_polynomial(
     original, unit = polynomial, polynomial.times[1] - polynomial.times[0]
     node_times_behind = time + unit * np.arange(NODES_BEHIND)
     times = np.append(polynomial.times, node_times_behind)
-    for _ in range(_CORRECTOR_ITERATIONS):
-        rates_and_outputs = [rate(one, polynomial.state_at(one)) for one in node_times_behind]
-        rates, outputs = (np.array(part) for part in zip(*rates_and_outputs, strict=True))
+    for _ in range(_CORRECTIONS):
+        states = polynomial.states(node_times_behind)
+        rates, outputs = _evaluate(node_times_behind, states, rate)
         polynomial = CrossingPolynomial(
             times,
             original.start_state,
@@ -380,3 +376,10 @@ def correct_polynomial(
             original.nodes_before,
         )
     return polynomial
+
+
+def _evaluate(times: Array, states: Array, rate: RateFunction) -> tuple[Array, Array]:
+    """Rates and outputs at times and states."""
+    found = [rate(time, state) for time, state in zip(times, states, strict=True)]
+    rates, outputs = (np.array(part) for part in zip(*found, strict=True))
+    return rates, outputs

@@ -110,7 +110,7 @@ class ErrorControlledStepper(MachineCodeStepper):
         self._steps_end_at_outputs = isinstance(chart.control, ValveDrive)
         super().__init__(chart, method, fold_settings)
         self.tolerance = np.ascontiguousarray(tolerance)
-        self._step_state = np.zeros(6)
+        self._step_state = np.array([0.0] * 5 + [np.inf, 0.0])
         # of the controller, or its reference, and of external forces [s]
         sources = [x for x in (self._control, self._control.reference) if hasattr(x, "breaks")]
         breaks = [x.breaks() for x in (*chart.machine.external_forces, *sources[:1])]
@@ -138,7 +138,7 @@ class ErrorControlledStepper(MachineCodeStepper):
             Fewer than all rows are filled where a step fails or another chart is needed.
         """
         lengths, pair = self._step_state, min(step, 2.0 * MAX_REFERENCE_SPACING)
-        lengths[5] = 0.0
+        lengths[6] = 0.0
         if lengths[0] != step:
             lengths[:2] = step, 0.01 * min(step, MAX_REFERENCE_SPACING)
         functions = [self.closure_code.close_address]
@@ -150,19 +150,26 @@ class ErrorControlledStepper(MachineCodeStepper):
             count = min(max_rows, len(rows) - done)
             now, segment_start = first + step * done, offset
             segment_end = min(count * step, segment_start + _MAX_REFERENCE_PAIRS * pair)
-            next_time = now + segment_start + _TIME_TOLERANCE * step
-            time_to_break = self._break_times[np.searchsorted(self._break_times, next_time)] - now
-            if isinstance(self._control, ValveDrive) and self._control.period:
+            difference = _TIME_TOLERANCE * step
+            next_time = now + segment_start + difference
+            breaks, following = self._break_times, np.searchsorted(self._break_times, next_time)
+            time_to_break = breaks[following] - now
+            may_jump = isinstance(self._control, ValveDrive) and bool(self._control.period)
+            if isinstance(self._control, ValveDrive) and may_jump:
                 time_to_break = min(
                     time_to_break, self._control.next_delayed_jump(next_time) - now
                 )
-            if time_to_break < segment_end - _TIME_TOLERANCE * step:
-                segment_end = time_to_break
+            starts_at_break = following and breaks[following - 1] > next_time - 2.0 * difference
+            ends_at_break = time_to_break < segment_end + difference
+            segment_end = min(segment_end, time_to_break)
+            if self._steps_end_at_outputs and offset < 0:  # samples of a log are output instants
+                segment_end = min(segment_end, 0.0)
             pairs = max(1, int(np.ceil((segment_end - segment_start) / pair - _TIME_TOLERANCE)))
             lengths[2:5] = segment_start, (segment_end - segment_start) / pairs, segment_end
-            # references have one-sided limits at both ends
+            # references have one-sided limits where they may jump
             grid = np.linspace(now + segment_start, now + segment_end, 2 * pairs + 1)
-            grid[[0, -1]] += _TIME_TOLERANCE * (grid[1] - grid[0]) * np.array([1.0, -1.0])
+            inwards = np.array([may_jump or starts_at_break, may_jump or ends_at_break]) * [1, -1]
+            grid[[0, -1]] += _TIME_TOLERANCE * (grid[1] - grid[0]) * inwards
             rows_made = self._program.call(
                 "run",
                 count,
@@ -182,7 +189,7 @@ class ErrorControlledStepper(MachineCodeStepper):
             time_left = segment_end - (rows_made * step + offset)
             if abs(offset) < _TIME_TOLERANCE * step:
                 offset = 0.0
-            if lengths[5]:
+            if lengths[6]:
                 lengths[1] *= _STEP_REDUCTION_AFTER_EVENT
                 break
             if time_left > _TIME_TOLERANCE * step:
@@ -192,7 +199,7 @@ class ErrorControlledStepper(MachineCodeStepper):
 
     def _build(self, program: Program) -> None:
         for suffix, with_joints_at_rest in self._rest_variants:
-            machine = self._trace_controlled_machine(Tape())
+            machine = self.trace_controlled_machine(Tape())
             outputs = machine.outputs(with_joints_at_rest)
             if isinstance(self._control, ValveDrive):
                 outputs += self._control.channel_values(machine.inputs)

@@ -147,6 +147,18 @@ class StickSlipIntegrator(ABC):
             return self._compiled_method.observe(time, state)
         return self.python_stepper.observe(time, state)[1], self.python_stepper.transition_margin
 
+    def rate_and_outputs(self, time: float, state: Array) -> tuple[Array, Array]:
+        """Rate of a state at a time [s], and outputs.
+
+        Raises:
+            IntegrationHaltError: The loops do not close, or the configuration is singular.
+        """
+        if self._compiled_method is not None:
+            rate, outputs = self._compiled_method.rate_and_outputs(time, state)
+            if np.isfinite(rate).all():
+                return rate, outputs
+        return self.python_stepper.observe(time, state)
+
     def _prepare_modes(self, time: float, state: Array) -> None:
         """Set the stick-slip modes before the first step, and after a change of the chart."""
         if not self._stick_slip.columns:

@@ -5,6 +5,7 @@ import numpy as np
 from crane.closure.kinematics_formulas import largest_scaled_value
 from crane.codegen import (
     ArrayPointer,
+    LayoutView,
     Program,
     Routine,
     RoutineValue,
@@ -43,7 +44,8 @@ class MachineCodeStepper:
     """Base class of compiled methods: machine code of a machine with its controller.
 
     A method implements `_build`, which adds formulas `observe` with the parts `outputs` and
-    `margin`, and `observe_rest` where joints can stick.
+    `margin` and `rate` with the part `rate`, and `observe_rest` and `rate_rest` where joints can
+    stick.
 
     Args:
         chart: The machine in a chart.
@@ -94,10 +96,16 @@ class MachineCodeStepper:
         )
         self._program = machine_program(chart, key, self._build)
 
+    def new_program(self) -> Program:
+        """Its functions, not compiled, for other targets."""
+        program = Program()
+        self._build(program)
+        return program
+
     def _build(self, program: Program) -> None:
         """Add the formulas and routines."""
 
-    def _trace_controlled_machine(self, tape: Tape) -> MachineFormulas:
+    def trace_controlled_machine(self, tape: Tape) -> MachineFormulas:
         """The machine with its controller; references and state are the arguments 3 and 4."""
         references = tape.load_vector(3, 0, self.reference_columns)
         settings = controller_settings(self._control, tape, 2, self._fold_settings)
@@ -142,6 +150,15 @@ class MachineCodeStepper:
 
     def observe(self, time: float, state: Array) -> tuple[Array, float]:
         """Outputs and the margin of stick-slip transitions at a time [s] and a state."""
+        at = self._evaluate("observe", time, state)
+        return at.outputs, float(at.margin[0])
+
+    def rate_and_outputs(self, time: float, state: Array) -> tuple[Array, Array]:
+        """Rate of a state at a time [s], and outputs."""
+        return self._evaluate("rate", time, state).rate, self.observe(time, state)[0]
+
+    def _evaluate(self, formula: str, time: float, state: Array) -> LayoutView:
+        """Outputs of `observe` or `rate` at a time [s] and a state."""
         reference = reference_samples(self._chart.machine, self._control, np.array([time]))
         if self.external_callback is not None:
             callback_inputs = np.empty(self._program.formula_outputs("callback_inputs").size)
@@ -153,11 +170,11 @@ class MachineCodeStepper:
                 "external", self.external_callback.address, callback_inputs, external_references
             )
             self.external_callback.raise_pending()
-        layout = self._program.formula_outputs("observe")
+        layout = self._program.formula_outputs(formula)
         out = np.empty(layout.size)
-        name = "observe" + AT_REST_SUFFIX * bool(self.bounds[HELD_INDEX])
+        name = formula + AT_REST_SUFFIX * bool(self.bounds[HELD_INDEX])
         self._program.call(name, *self._common_arguments, reference, state, out)
-        return out[layout["outputs"]], float(out[layout.start_index("margin")])
+        return layout.view(out)
 
 
 class RungeKuttaStepper(MachineCodeStepper):
@@ -176,7 +193,7 @@ class RungeKuttaStepper(MachineCodeStepper):
 
     def _build(self, program: Program) -> None:
         for suffix, with_joints_at_rest in self._rest_variants:
-            machine = self._trace_controlled_machine(Tape())
+            machine = self.trace_controlled_machine(Tape())
             rate, margin = machine.state_rate(with_joints_at_rest)
             outputs = machine.outputs(with_joints_at_rest)
             parts = {"rate": rate, "outputs": outputs, "margin": [margin]}

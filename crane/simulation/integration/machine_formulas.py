@@ -12,9 +12,11 @@ from crane.codegen import (
     Scalar,
     SymbolicExpression,
     Tape,
+    max_abs,
 )
 from crane.codegen.differentiation import differentiate
-from crane.codegen.symbolic import add_vectors, dot, subtract_vectors
+from crane.codegen.symbolic import add_vectors, dot, matvec, subtract_vectors
+from crane.codegen.symbolic_linear_algebra import LdltFactorization
 from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.control.control_law import ControlLaw, ControllerInputs
@@ -91,6 +93,40 @@ class MachineFormulas:
             self.chart.trace_chart_forces(self.dynamics_formulas.gamma, self.tau),
             self.external_forces.active_forces,
         )
+
+    def stiction_problem(self, inverse_velocities: Sequence[float]) -> dict[str, list[Scalar]]:
+        """The problem of joints at rest, with momenta p = C^T v_A, M_A = C C^T.
+
+        Args:
+            inverse_velocities: (k,) one over the velocities that speeds are compared with.
+
+        Returns:
+            directions (k, n), C^-1 Gamma^T of each joint with stiction; inverse_root (n, n),
+            C^-T; net (n,) C^-1 f; momentum (n,); velocities, drift and limits (k,) of the joints;
+            speeds (k,) relative to those given; motion, the largest velocity v_A; size, the
+            largest absolute value of all, not finite where M_A is singular.
+        """
+        dynamics, v_a = self.dynamics_formulas, self.state_parts.v_a
+        n, k = len(v_a), len(inverse_velocities)
+        entries = dynamics.stick_slip_equations(self._applied_forces)
+        mass = [entries[n * i : n * (i + 1)] for i in range(n)]
+        rows = [entries[n * (n + i) : n * (n + i + 1)] for i in range(k)]
+        root = LdltFactorization(mass)
+        velocities = matvec(rows, v_a)
+        parts = {
+            "directions": [x for row in rows for x in root.root_solve(row)],
+            "inverse_root": [
+                x for i in range(n) for x in root.root_solve([float(i == j) for j in range(n)])
+            ],
+            "net": root.root_solve(entries[-n:]),
+            "momentum": root.root_multiply(v_a),
+            "velocities": velocities,
+            "drift": entries[n * (n + k) : -n],
+            "limits": dynamics.breakaway_forces,
+            "speeds": [x * s for x, s in zip(velocities, inverse_velocities, strict=True)],
+            "motion": [max_abs(v_a)],
+        }
+        return {**parts, "size": [max_abs([x for part in parts.values() for x in part])]}
 
     def outputs(self, with_joints_at_rest: bool) -> list[Scalar]:
         """Outputs without the channels of circuits; see `output_layout`."""

@@ -13,11 +13,11 @@ from crane.codegen.symbolic import (
     add_vectors,
     apply_function,
     dot,
-    lu_factorize,
     maximum,
     scale_vector,
     subtract_vectors,
 )
+from crane.codegen.symbolic_linear_algebra import lu_factorize
 from crane.common.samples import Array
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.error_controlled_stepper import (
@@ -90,7 +90,7 @@ class RadauStepper(ErrorControlledStepper):
     def _add_method(self, program: Program) -> None:
         self._system = RadauLinearSystem(self._chart)
         for suffix, with_joints_at_rest in self._rest_variants:
-            dynamics = self._trace_controlled_machine(Tape()).dynamics_formulas
+            dynamics = self.trace_controlled_machine(Tape()).dynamics_formulas
             mass = [x for row in dynamics.mass_matrix for x in row]
             free = (
                 dynamics.active_motion_factors if with_joints_at_rest else [1.0] * self._mobility

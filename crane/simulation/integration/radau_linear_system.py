@@ -2,15 +2,14 @@
 
 from crane.codegen import Layout, Scalar, Tape
 from crane.codegen.symbolic import (
-    Matrix,
     add_vectors,
     dot,
-    lu_solve,
     matvec,
     scale_vector,
     subtract_vectors,
     transpose,
 )
+from crane.codegen.symbolic_linear_algebra import Matrix, lu_solve
 from crane.simulation.integration.charts import Chart
 
 # eigenvalues of the inverse of the matrix of the method

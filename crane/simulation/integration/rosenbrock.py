@@ -5,15 +5,17 @@ import numpy as np
 from crane.codegen import Program, RoutineValue, Scalar, SymbolicExpression, Tape, max_abs, maximum
 from crane.codegen.differentiation import differentiate
 from crane.codegen.symbolic import (
-    Matrix,
     add_vectors,
     apply_function,
-    load_matrix,
-    lu_factorize,
-    lu_solve,
     matvec,
     scale_vector,
     subtract_vectors,
+)
+from crane.codegen.symbolic_linear_algebra import (
+    Matrix,
+    load_matrix,
+    lu_factorize,
+    lu_solve,
     symbolic_entries,
 )
 from crane.control.valve_drive import ValveDrive
@@ -179,7 +181,7 @@ class RosenbrockStepper(ErrorControlledStepper):
         Gamma x = Gamma b.
         """
         tape = Tape()
-        machine = self._trace_controlled_machine(tape)
+        machine = self.trace_controlled_machine(tape)
         dynamics, n = machine.dynamics_formulas, len(machine.state_parts.v_a)
         mass, k = dynamics.mass_matrix, self._stiff_state_count
         step_gamma = GAMMA * tape.load(5, 0)

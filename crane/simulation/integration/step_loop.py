@@ -26,7 +26,7 @@ class StepLoop:
 
     Elements of its argument h: output interval; step size to try; time of the state, relative to
     the first output instant before, and to the next one behind; spacing of references; end;
-    whether a stick-slip transition is there.
+    most steps, rejected ones included; whether a stick-slip transition is there.
 
     A step that passes an event is rejected. The secant method locates the event; steps that end
     before it are accepted.
@@ -107,16 +107,28 @@ class StepLoop:
         self._margin_before, self._margin_behind = r.new_variable(1.0), r.new_variable(0.0)
         self._event_signs = r.local_array("event_signs", max(1, self._event_distance_count))
         self._signed_distance = r.local_array("least_distance", 1)
-        if self._event_distance_count:
-            r.call("event_signs", self.start_rate, self._event_signs)
+        self._update_margin_before(self.start_rate)
         if self._has_stick_slip:
-            r.assign(self._margin_before, self.start_rate["margin"])
-            with r.if_then(self._margin_before < -EVENT_TOLERANCE):
-                r.store(r.h, 5, 1.0)
+            with r.if_then(self.start_rate["margin"] < -EVENT_TOLERANCE):
+                r.store(r.h, 6, 1.0)
                 self._write_return()
+        tried = r.new_variable(0.0)
         with r.loop_forever():
+            with r.if_then(~(tried < r.h[5])):
+                r.break_loop()
+            r.assign(tried, tried + 1.0)
             self._write_step()
         self._write_return()
+
+    def _update_margin_before(self, rate: ArrayPointer) -> None:
+        """Margin of the next event, from the rate at the start of a step."""
+        r, margin = self.routine, self._margin_before
+        r.assign(margin, rate["margin"] if self._has_stick_slip else 1.0)
+        if self._event_distance_count:
+            r.call("event_signs", rate, self._event_signs)
+            r.call("least_distance", rate, self._event_signs, self._signed_distance)
+            distance = self._signed_distance[0]
+            r.assign(margin, select(distance < margin, distance, margin))
 
     def _write_step(self) -> None:
         r = self.routine
@@ -273,17 +285,14 @@ class StepLoop:
             r.copy(r.state, self.step_result, self._size)
             r.copy(self.start_rate, self.end_rate, self._size)
         with r.if_then(event > 0):
-            r.store(r.h, 5, 1.0)
+            r.store(r.h, 6, 1.0)
             self._write_return()
-        with r.if_then(time_to_event > 0.0):
-            r.assign(time_to_event, time_to_event - length)
-            r.assign(self._margin_before, least_margin)
+        r.assign(time_to_event, select(time_to_event > 0.0, time_to_event - length, 0.0))
+        self._update_margin_before(self.end_rate)
         if self._event_distance_count:
-            r.call("event_signs", self.end_rate, self._event_signs)
             with r.if_then(least_margin < -EVENT_TOLERANCE):  # a passed event distance
                 r.assign(time_to_event, 0.0)
                 r.assign(self._trial_count, 0)
-                r.assign(self._margin_before, 1.0)
         with r.if_then(exceeds_chart_limits(r, self._closure_result)):
             self._write_return()
 

@@ -29,9 +29,9 @@ from crane.machine.machine import Machine
 
 # accuracy of located events; see `StickSlipAccelerations.transition_margin`
 EVENT_TOLERANCE = 1e-10
-_MAX_VELOCITY_CHANGE = 1e-6  # relative change of velocities by stopping a joint at rest
-_MAX_LIMIT_SHARE = 1.0 - 1e-12  # share of its breakaway force at which a joint slips
-_RANK_TOLERANCE = 1e-9  # share of the largest singular value, or of its norm, of zero rows
+MAX_VELOCITY_CHANGE = 1e-6  # relative change of velocities by stopping a joint at rest
+MAX_LIMIT_SHARE = 1.0 - 1e-12  # share of its breakaway force at which a joint slips
+RANK_TOLERANCE = 1e-9  # share of the largest singular value, or of its norm, of zero rows
 _MAX_NAMED_JOINTS = 4  # joints that a message names
 _MAX_TRIALS = 200  # trial steps to locate an event
 
@@ -157,12 +157,12 @@ class StickSlipModes:
         holding_forces = np.linalg.solve(cholesky_factor, rows[resting].T) * limits
         drift_term = np.linalg.lstsq(holding_forces.T, limits * drift[resting], rcond=None)[0]
         limit_shares = _bounded_least_squares(holding_forces, net_force + drift_term)
-        below_limit = np.flatnonzero(np.abs(limit_shares) < _MAX_LIMIT_SHARE)
+        below_limit = np.flatnonzero(np.abs(limit_shares) < MAX_LIMIT_SHARE)
         independent, rank = _independent_columns(
             holding_forces[:, below_limit] * (1.0 - np.abs(limit_shares[below_limit]))
         )
         self.slip_signs[resting] = np.where(
-            np.abs(limit_shares) < _MAX_LIMIT_SHARE, limit_shares, np.sign(limit_shares)
+            np.abs(limit_shares) < MAX_LIMIT_SHARE, limit_shares, np.sign(limit_shares)
         )
         held_joints = resting[below_limit[independent]]
         self.slip_signs[held_joints], self.is_held[held_joints] = 0.0, True
@@ -191,17 +191,17 @@ class StickSlipModes:
         velocity_changes = (
             np.linalg.solve(cholesky_factor.T, impulse_directions * (v / sizes)) * rates[:, None]
         )
-        is_resting = np.abs(velocity_changes).max(0) <= _MAX_VELOCITY_CHANGE
+        is_resting = np.abs(velocity_changes).max(0) <= MAX_VELOCITY_CHANGE
         candidates, impulse_directions = candidates[is_resting], impulse_directions[:, is_resting]
         if not len(candidates):
             return v_a
         basis, values, _ = np.linalg.svd(impulse_directions, full_matrices=False)
-        basis = basis[:, values > _RANK_TOLERANCE * values[0]]
+        basis = basis[:, values > RANK_TOLERANCE * values[0]]
         out = np.zeros_like(v_a)
         if basis.shape[1] < len(v_a):
             out[:] = np.linalg.solve(cholesky_factor.T, momentum - basis @ (basis.T @ momentum))
         out[np.isin(closure.active, np.array(self.columns)[candidates])] = 0.0
-        return out if np.abs((out - v_a) * rates).max() <= _MAX_VELOCITY_CHANGE else v_a
+        return out if np.abs((out - v_a) * rates).max() <= MAX_VELOCITY_CHANGE else v_a
 
 
 def _bounded_least_squares(matrix: Array, right_side: Array) -> Array:
@@ -237,13 +237,13 @@ def _independent_columns(columns: Array) -> tuple[Indices, int]:
         least_singular_value = np.linalg.svd(columns / column_norms, compute_uv=False).min(
             initial=1.0
         )
-        if least_singular_value > 2.0 * _RANK_TOLERANCE:
+        if least_singular_value > 2.0 * RANK_TOLERANCE:
             return np.arange(count), count
     from scipy.linalg import qr  # slow to call
 
     upper, order = qr(columns, mode="r", pivoting=True)
     sizes = np.abs(np.diag(upper))
-    rank = int((sizes > _RANK_TOLERANCE * column_norms[order[: len(sizes)]]).sum())
+    rank = int((sizes > RANK_TOLERANCE * column_norms[order[: len(sizes)]]).sum())
     return np.asarray(order[:rank], dtype=np.intp), rank
 
 

@@ -1,0 +1,301 @@
+"""Linked functions in C99: no allocation, no static data, no recursion.
+
+The type `real` and the macro R(x) for constants are defined by what includes the functions:
+double, or float; <tgmath.h> selects the functions of that type.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import singledispatchmethod
+from typing import Any
+
+from crane.codegen.linked_functions import LinkedFunction, variables_read
+from crane.codegen.routine_statements import (
+    ArrayPointer,
+    AssignmentStatement,
+    BreakStatement,
+    CallStatement,
+    ConditionStatement,
+    CopyStatement,
+    LoopStatement,
+    ReturnStatement,
+    Routine,
+    RoutineStatement,
+    RoutineValue,
+    StoreStatement,
+)
+from crane.codegen.symbolic import SymbolicExpression, required_operations
+from crane.codegen.vector_layout import Formula
+
+C_PRELUDE = """\
+static inline real maximum_of(real a, real b)
+{
+    return a != a ? a : (a >= b ? a : b);
+}
+"""  # NaN if one is NaN
+
+PIECE_LENGTH = 2000  # operations of a C function; compilers need more than linear time
+_INFIX = {"add": "+", "subtract": "-", "multiply": "*", "divide": "/"}
+_FUNCTIONS = {"abs": "fabs", "maximum": "maximum_of"}  # others have the names of C
+_TYPES = {"real": "real", "integer": "int", "truth": "int"}
+_OPERATORS = {"and": "&&", "or": "||"}
+
+
+def format_c_real(value: float) -> str:
+    """A number in C, exact in double precision."""
+    if math.isnan(value):
+        return "NAN"
+    if math.isinf(value):
+        return "INFINITY" if value > 0 else "(-INFINITY)"
+    return f"R({value!r})"
+
+
+def emit_c_function(linked: LinkedFunction) -> str:
+    """A linked function as static functions in C."""
+    if isinstance(linked.function, Formula):
+        return _emit_formula(linked, linked.function)
+    return _CRoutineEmitter(linked, linked.function).text()
+
+
+def c_parameters(linked: LinkedFunction) -> str:
+    """The parameters of a function in C."""
+    counts = linked.function.arguments if isinstance(linked.function, Routine) else {}
+    words = []
+    for name in linked.arguments:
+        if isinstance(counts.get(name), RoutineValue):
+            words.append(f"int {name}")
+        else:
+            words.append(f"{'' if name in linked.written else 'const '}real *{name}")
+    return ", ".join(words)
+
+
+def _emit_formula(linked: LinkedFunction, formula: Formula) -> str:
+    name = linked.name
+    symbolic = [x for x in formula.outputs if isinstance(x, SymbolicExpression)]
+    operations = symbolic[0].tape.operations if symbolic else []
+    order = [i for i in required_operations(formula.outputs) if operations[i][0] != "load"]
+    pieces = [order[i : i + PIECE_LENGTH] for i in range(0, len(order), PIECE_LENGTH)] or [[]]
+    slots = _memory_slots(operations, pieces, formula)
+    inputs = list(linked.arguments[:-1])
+    parameters = ", ".join([*(f"const real *restrict {x}" for x in inputs), "real *restrict out"])
+    texts, calls = [], []
+    for number, piece in enumerate(pieces):
+        lines = _piece_lines(operations, piece, slots)
+        if number == len(pieces) - 1:
+            local = set(piece)
+            lines += [
+                f"out[{i}] = {_operand(x.index, operations, slots, local)};"
+                if isinstance(x, SymbolicExpression)
+                else f"out[{i}] = {format_c_real(float(x))};"
+                for i, x in enumerate(formula.outputs)
+            ]
+        if len(pieces) == 1:
+            return _function_text(f"void {name}({parameters})", [*inputs, "out"], lines)
+        head = f"void {name}_{number}({parameters}, real *restrict w)"
+        texts.append(_function_text(head, [*inputs, "out", "w"], lines))
+        calls.append(f"{name}_{number}({', '.join([*inputs, 'out', 'w'])});")
+    size = 1 + max(slots.values(), default=0)
+    texts.append(_function_text(f"void {name}({parameters})", [], [f"real w[{size}];", *calls]))
+    return "\n".join(texts)
+
+
+def _memory_slots(
+    operations: Sequence[tuple], pieces: Sequence[Sequence[int]], formula: Formula
+) -> dict[int, int]:
+    """Memory slots of the values that a later piece uses."""
+    piece_of = {index: number for number, piece in enumerate(pieces) for index in piece}
+    last = dict(piece_of)
+    uses = [
+        (x, number)
+        for index, number in piece_of.items()
+        for x in operations[index][1:]
+        if type(x) is int
+    ]
+    outputs = [x.index for x in formula.outputs if isinstance(x, SymbolicExpression)]
+    for x, number in [*uses, *((index, len(pieces) - 1) for index in outputs)]:
+        if x in last:
+            last[x] = max(last[x], number)
+    slots: dict[int, int] = {}
+    free: list[int] = []
+    for number, piece in enumerate(pieces):
+        for index in (x for x in piece if last[x] > number):
+            slots[index] = free.pop() if free else 1 + max(slots.values(), default=-1)
+        free += [slots[i] for i in slots if last[i] == number]
+    return slots
+
+
+def _piece_lines(
+    operations: Sequence[tuple], piece: Sequence[int], slots: dict[int, int]
+) -> list[str]:
+    local, lines = set(piece), []
+    for index in piece:
+        kind, *operands = operations[index]
+        words = [_operand(x, operations, slots, local) for x in operands]
+        lines.append(f"const real v{index} = {_operation_text(kind, words)};")
+        if index in slots:
+            lines.append(f"w[{slots[index]}] = v{index};")
+    return lines
+
+
+def _operation_text(kind: str, words: list[str]) -> str:
+    if kind in _INFIX:
+        return f"{words[0]} {_INFIX[kind]} {words[1]}"
+    if kind == "negate":
+        return f"-{words[0]}"
+    if kind == "positive":
+        return f"{words[0]} > R(0.0) ? {words[1]} : {words[2]}"
+    if kind == "dot":
+        half = len(words) // 2
+        return " + ".join(f"{x} * {y}" for x, y in zip(words[:half], words[half:], strict=True))
+    return f"{_FUNCTIONS.get(kind, kind)}({', '.join(words)})"
+
+
+def _operand(
+    x: int | float, operations: Sequence[tuple], slots: dict[int, int], local: set[int]
+) -> str:
+    if not isinstance(x, int):
+        return format_c_real(x) if x >= 0 else f"({format_c_real(x)})"
+    kind, *where = operations[x]
+    if kind == "load":
+        return f"in{where[0]}[{where[1]}]"
+    return f"v{x}" if x in local else f"w[{slots[x]}]"
+
+
+def _function_text(head: str, parameters: Sequence[str], lines: Sequence[str]) -> str:
+    """A static function; parameters that no line uses are named, for compilers that warn."""
+    body = "\n".join(lines)
+    unused = [f"(void){x};" for x in parameters if f"{x}[" not in body]
+    return "\n".join([f"static {head}", "{", *(f"    {x}" for x in (*lines, *unused)), "}", ""])
+
+
+class _CRoutineEmitter:
+    """Writes a routine."""
+
+    def __init__(self, linked: LinkedFunction, routine: Routine):
+        self._linked, self._routine = linked, routine
+        self._lines: list[str] = []
+        self._indent = 1
+
+    def text(self) -> str:
+        """The routine as a function."""
+        routine, linked = self._routine, self._linked
+        self._emit_block(routine.statements)
+        read = variables_read(routine)
+        declarations = [f"real {name}[{max(1, n)}];" for name, n in routine.local_arrays.items()]
+        names = [(_TYPES[x.kind], x.operands[0]) for x in routine.variables]
+        declarations += [f"{kind} {name};" for kind, name in names]
+        unread = [f"(void){name};" for _, name in names if name not in read]
+        body = "\n".join(self._lines)
+        unread += [
+            f"(void){name};"
+            for name in (*linked.arguments, *routine.local_arrays)
+            if not _has_word(body, name)
+        ]
+        return "\n".join(
+            [
+                f"static int {linked.name}({c_parameters(linked)})",
+                "{",
+                *(f"    {x}" for x in declarations),
+                *self._lines,
+                *(f"    {x}" for x in unread),
+                "    return 0;",
+                "}",
+                "",
+            ]
+        )
+
+    def _emit_block(self, statements: Sequence[RoutineStatement]) -> None:
+        for statement in statements:
+            self._emit(statement)
+
+    def _line(self, text: str) -> None:
+        self._lines.append("    " * self._indent + text)
+
+    def _emit_body(self, head: str, statements: Sequence[RoutineStatement]) -> None:
+        self._line(f"{head} {{")
+        self._indent += 1
+        self._emit_block(statements)
+        self._indent -= 1
+        self._line("}")
+
+    @singledispatchmethod
+    def _emit(self, statement: RoutineStatement) -> None:
+        raise TypeError(f"no statement: {statement!r}")
+
+    @_emit.register
+    def _(self, statement: AssignmentStatement) -> None:
+        self._line(f"{statement.variable.operands[0]} = {_value(statement.value)};")
+
+    @_emit.register
+    def _(self, statement: StoreStatement) -> None:
+        self._line(f"{_element(statement.pointer)} = {_value(statement.value)};")
+
+    @_emit.register
+    def _(self, statement: CopyStatement) -> None:
+        if statement.count:
+            target, source = _pointer(statement.target), _pointer(statement.source)
+            self._line(f"memcpy({target}, {source}, {statement.count} * sizeof(real));")
+
+    @_emit.register
+    def _(self, statement: CallStatement) -> None:
+        callee = self._linked.callees[statement.function]
+        passed = callee.passed(statement.arguments)
+        words = [_pointer(x) if isinstance(x, ArrayPointer) else _value(x) for x in passed]
+        call = f"{callee.name}({', '.join(words)});"
+        result = statement.result
+        self._line(call if result is None else f"{result.operands[0]} = {call}")
+
+    @_emit.register
+    def _(self, statement: LoopStatement) -> None:
+        if statement.index is None or statement.count is None:
+            self._emit_body("for (;;)", statement.body)
+            return
+        x = statement.index.operands[0]
+        head = f"for ({x} = 0; {x} < {_value(statement.count)}; ++{x})"
+        self._emit_body(head, statement.body)
+
+    @_emit.register
+    def _(self, statement: ConditionStatement) -> None:
+        self._emit_body(f"if ({_value(statement.test)})", statement.body)
+        if statement.otherwise:
+            self._emit_body("else", statement.otherwise)
+
+    @_emit.register
+    def _(self, statement: BreakStatement) -> None:
+        self._line("break;")
+
+    @_emit.register
+    def _(self, statement: ReturnStatement) -> None:
+        self._line(f"return {_value(statement.value)};")
+
+
+def _pointer(array: ArrayPointer) -> str:
+    offset = _value(array.offset)
+    return array.name if offset == "0" else f"{array.name} + {offset}"
+
+
+def _element(array: ArrayPointer) -> str:
+    return f"{array.name}[{_value(array.offset).removeprefix('(').removesuffix(')')}]"
+
+
+def _value(value: RoutineValue) -> str:
+    """A value as an expression, in parentheses where it has an operator."""
+    operands: tuple[Any, ...] = value.operands
+    match value.operation:
+        case "constant":
+            return format_c_real(operands[0]) if value.kind == "real" else str(operands[0])
+        case "argument" | "variable":
+            return str(operands[0])
+        case "element":
+            return _element(operands[0].element_pointer(operands[1]))
+        case "select":
+            test, yes, no = (_value(x) for x in operands)
+            return f"({test} ? {yes} : {no})"
+        case "not":
+            return f"!{_value(operands[0])}"
+    a, b = (_value(x) for x in operands)
+    return f"({a} {_OPERATORS.get(value.operation, value.operation)} {b})"
+
+
+def _has_word(text: str, word: str) -> bool:
+    return any(f"{word}{end}" in text for end in "[,) +;")

@@ -1,0 +1,21 @@
+"""Forces of the drives as inputs."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from crane.codegen import Scalar
+from crane.common.samples import Array
+from crane.control.control_law import ControlLaw, ControllerInputs
+
+
+class ForceInputs(ControlLaw):
+    """Forces of the driven joints that come from outside, one reference each [N], [N m]."""
+
+    def references(self, times: Array) -> Array:
+        """See `ControlLaw`; zero."""
+        return np.zeros((len(times), int(self.machine.is_driven.sum())))
+
+    def law(self, inputs: ControllerInputs) -> tuple[Sequence[Scalar], Sequence[Scalar]]:
+        """See `ControlLaw`."""
+        return self.expand_driven(inputs.reference), []

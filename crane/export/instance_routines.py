@@ -1,0 +1,344 @@
+"""Routines of an instance of a machine, see `crane.export.instance_program`."""
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+
+from crane.codegen import (
+    ArrayPointer,
+    Layout,
+    Program,
+    Routine,
+    RoutineValue,
+    Scalar,
+    Tape,
+    select,
+)
+from crane.codegen.routine_statements import as_value
+from crane.codegen.symbolic import add_vectors, scale_vector, subtract_vectors
+from crane.common.samples import Array
+from crane.export.force_inputs import ForceInputs
+from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.error_controlled_stepper import ErrorControlledStepper
+from crane.simulation.integration.machine_code_stepper import HELD_INDEX
+from crane.simulation.integration.machine_formulas import AT_REST_SUFFIX
+from crane.simulation.integration.stick_slip_routine import add_stick_slip_routines
+
+# Statuses of the routines, besides the number of what was done.
+DONE, NOT_CLOSED, BEYOND_CHART, HALTED, TOO_MANY_EVENTS = 1, -1, -2, -3, -4
+STATUS_TEXTS = MappingProxyType(
+    {
+        DONE: "done",
+        NOT_CLOSED: "the loops do not close",
+        BEYOND_CHART: "the active joints do not determine the motion: a dead centre",
+        HALTED: "the step failed: the motion diverges, or too many steps were needed",
+        TOO_MANY_EVENTS: "joints stick and slip too often",
+    }
+)
+_FIRST_STEP_SHARE, _LONGEST_FIRST_STEP = 0.01, 5e-4  # as `ErrorControlledStepper.run`
+_STEP_REDUCTION_AFTER_EVENT = 0.2
+_TIME_TOLERANCE = 1e-9  # of a step
+INNER_ROUTINES = (
+    "find_modes", "orthogonalize", "least_squares", "transposed_least_squares",
+    "bounded_least_squares",
+)  # fmt: skip
+
+
+class InstanceRoutines:
+    """Writer of the routines of an instance.
+
+    Args:
+        chart: The machine with its drives.
+        stepper: The method of `advance`.
+        layout: Layout of an instance.
+        programs: Programs that the routines call, by the prefix of their functions.
+        quantities: Names of the routines of dynamics.
+        tip_offset: Origin of the tip in its body; None without a tip.
+    """
+
+    def __init__(
+        self,
+        chart: Chart,
+        stepper: ErrorControlledStepper,
+        layout: Layout,
+        programs: Mapping[str, Program],
+        quantities: Sequence[str],
+        tip_offset: Array | None,
+    ):
+        self.chart, self.stepper, self.layout = chart, stepper, layout
+        self._programs, self._quantities, self._tip_offset = programs, quantities, tip_offset
+        machine = self.machine = chart.machine
+        self.control = chart.control
+        self._nq, self._n = machine.model.nv, len(machine.active)
+        self._k = len(chart.stick_slip.columns)
+        self._closure = machine.closure.compiled_closure
+
+    def add_to(self, program: Program) -> None:
+        """Add all routines to a program that has the functions of `programs`."""
+        self._add_stiction(program)
+        self._add_initialize(program)
+        self._add_advance(program)
+        self._add_evaluations(program)
+        self._add_kinematics(program)
+        self._add_dynamics(program)
+
+    def _machine_arguments(self, instance: ArrayPointer) -> tuple[ArrayPointer, ...]:
+        return tuple(self._part(instance, x) for x in ("geometry", "dynamics", "settings"))
+
+    def _part(self, instance: ArrayPointer, name: str) -> ArrayPointer:
+        return ArrayPointer(instance.name).element_pointer(self.layout.start_index(name))
+
+    def _element(self, instance: ArrayPointer, name: str, index: int = 0) -> RoutineValue:
+        return ArrayPointer(instance.name)[self.layout.start_index(name) + index]
+
+    def _store(self, r: Routine, name: str, value: RoutineValue | float, index: int = 0) -> None:
+        r.store(ArrayPointer("instance"), self.layout.start_index(name) + index, value)
+
+    def _add_stiction(self, program: Program) -> None:
+        """find_modes, see `add_stick_slip_routines`."""
+        if not self._k:
+            return
+        chart, machine = self.chart, self.machine
+        closure = machine.closure
+        inverse_velocities = closure.characteristic_time / closure.units[chart.stick_slip.columns]
+        parts = self.stepper.trace_controlled_machine(Tape()).stiction_problem(
+            inverse_velocities.tolist()
+        )
+        problem = program.add_formula("stiction", 5, parts)
+        active = closure.active.tolist()
+        add_stick_slip_routines(
+            program,
+            problem,
+            n=self._n,
+            k=self._k,
+            rates=closure.characteristic_time / closure.units[closure.active],
+            active_of_joint=[
+                active.index(x) if x in active else None for x in chart.stick_slip.columns
+            ],
+            state_layout=chart.state_layout,
+            mode_indices=chart.dynamics.formula_structure.stick_slip_mode_indices,
+        )
+
+    def _write_find_modes(self, r: Routine, refs: ArrayPointer) -> None:
+        """Write `find_modes` at the state, and whether joints are held."""
+        if not self._k:
+            return
+        arguments = *self._machine_arguments(r.instance), refs, self._part(r.instance, "q")
+        with r.if_then(r.call("find_modes", *arguments) < 1):
+            r.return_value(HALTED)
+        held = r.new_variable(0.0)
+        *places, _ = self.chart.dynamics.formula_structure.stick_slip_mode_indices
+        for place in places[1::3]:
+            is_held = self._element(r.instance, "dynamics", place)
+            r.assign(held, select(is_held > 0.5, 1.0, held))
+        self._store(r, "bounds", held, HELD_INDEX)
+
+    def _add_initialize(self, program: Program) -> None:
+        """initialize(instance): at rest at the active coordinates in q, with other q as guess."""
+        tape, layout = Tape(), self.chart.state_layout
+        machine = self.stepper.trace_controlled_machine(tape)
+        dynamics, loads = machine.dynamics_formulas, machine.external_forces.active_forces
+
+        def inverse(a_a: Sequence[Scalar], friction: bool) -> list[Scalar]:
+            return subtract_vectors(dynamics.inverse_dynamics(a_a, friction), loads)
+
+        inputs = machine.inputs._replace(inverse=inverse)
+        program.add_formula("start", 5, {"state": list(self.control.initial_state(inputs))})
+        with program.add_routine("initialize", arrays=("instance",)) as r:
+            result = r.local_array("result", self._closure.formula_outputs("newton"))
+            state, states = self._part(r.instance, "q"), layout.parts["controller"]
+            values = r.local_array("values", max(1, states))
+            size = self._closure.formula_outputs("newton").parts["gamma"]
+            bounds = self._part(r.instance, "bounds")
+            arguments = self._part(r.instance, "geometry"), state, result, bounds
+            with r.if_then(r.call(self._close_name, *arguments) < 1):
+                r.return_value(NOT_CLOSED)
+            with r.loop(as_value(layout.size - self._nq, "integer")) as i:
+                r.store(state, i + self._nq, 0.0)
+            refs = self._part(r.instance, "inputs")
+            if states:
+                r.call("start", *self._machine_arguments(r.instance), refs, state, values)
+                start = layout.start_index("controller")
+                r.copy(state.element_pointer(start), values, states)
+            r.copy(self._part(r.instance, "inputs_start"), refs, self.layout.parts["inputs"])
+            cursor = self._part(r.instance, "cursor")
+            r.copy(cursor, state, self._nq)
+            r.copy(cursor.element_pointer(self._nq), result.element_pointer("gamma"), size)
+            self._store(r, "time", 0.0)
+            self._store(r, "lengths", 0.0)
+            self._write_find_modes(r, refs)
+            r.return_value(DONE)
+
+    @property
+    def _close_name(self) -> str:
+        return "loops_project" if self._closure.has_partly_active_rotations else "loops_close"
+
+    def _add_advance(self, program: Program) -> None:
+        """advance(instance): integrate over `step`, inputs linear from `inputs_start`.
+
+        advance_fixed(instance): one step of the classical Runge-Kutta method.
+        """
+        columns = self.stepper.reference_columns
+        tape = Tape()
+        start, end = (tape.load_vector(i, 0, columns) for i in range(2))
+        first = tape.load(2, 0)
+        shares = first, 0.5 + 0.5 * first, 1.0
+        ramp = subtract_vectors(end, start)
+        rows = [add_vectors(start, scale_vector(share, ramp)) for share in shares[:2]]
+        program.add_formula("ramp", 3, [x for row in (*rows, end) for x in row])
+        with program.add_routine("advance", arrays=("instance",)) as r:
+            self._write_advance(r)
+        if isinstance(self.control, ForceInputs):
+            with program.add_routine("advance_fixed", arrays=("instance",)) as r:
+                self._write_fixed_step(r)
+
+    def _write_advance(self, r: Routine) -> None:
+        columns = self.stepper.reference_columns
+        refs, first = r.local_array("refs", max(1, 3 * columns)), r.local_array("first", 1)
+        row = r.local_array("row", 1)
+        state, lengths = self._part(r.instance, "q"), self._part(r.instance, "lengths")
+        bounds, tolerances = (self._part(r.instance, x) for x in ("bounds", "tolerances"))
+        inputs, start = (self._part(r.instance, x) for x in ("inputs", "inputs_start"))
+        step = r.new_variable(self._element(r.instance, "step"))
+        with r.if_then(~(step > 0.0)):
+            r.return_value(HALTED)
+        # a run that goes on to the next output instant, see `ErrorControlledStepper.run`
+        with r.if_then(~((lengths[0] >= step) & (lengths[0] <= step))):
+            r.store(lengths, 0, step)
+            longest = select(step < _LONGEST_FIRST_STEP, step, _LONGEST_FIRST_STEP)
+            r.store(lengths, 1, longest * _FIRST_STEP_SHARE)
+        time, events = r.new_variable(step * -1.0), r.new_variable(0.0)
+        with r.loop_forever():
+            r.store(first, 0, (time + step) / step)
+            r.call("ramp", start, inputs, first, refs)
+            r.store(lengths, 2, time)
+            r.store(lengths, 3, time * -1.0)
+            r.store(lengths, 4, 0.0)
+            r.store(lengths, 6, 0.0)
+            r.call(
+                "steps_run", 1, *self._machine_arguments(r.instance), refs, state, row, lengths,
+                bounds, tolerances,
+            )  # fmt: skip
+            r.assign(time, lengths[2])
+            with r.if_then((lengths[6] > 0.0) & (time <= 0.0)):
+                r.store(lengths, 1, lengths[1] * _STEP_REDUCTION_AFTER_EVENT)
+                r.assign(events, events + 1.0)
+                with r.if_then(events > self._element(r.instance, "max_events")):
+                    r.return_value(TOO_MANY_EVENTS)
+                r.store(first, 0, (time + step) / step)
+                r.call("ramp", start, inputs, first, refs)
+                self._write_find_modes(r, refs)
+            with r.if_else():
+                with r.if_then(~(time < step * -_TIME_TOLERANCE)):
+                    r.break_loop()
+                self._write_halt(r, state)
+            with r.if_then(~(time < step * -_TIME_TOLERANCE)):
+                r.break_loop()
+        self._store(r, "time", self._element(r.instance, "time") + step)
+        r.copy(start, inputs, columns)
+        r.return_value(DONE)
+
+    def _write_halt(self, r: Routine, state: ArrayPointer) -> None:
+        """Return why a step failed."""
+        r.store(self._part(r.instance, "lengths"), 0, 0.0)
+        result = r.local_array("result", self._closure.formula_outputs("newton"))
+        r.call("loops_newton", self._part(r.instance, "geometry"), state, result)
+        bounds = self._part(r.instance, "bounds")
+        beyond = (result["largest_gamma"] > bounds[3]) | (result["determinant"] < bounds[4])
+        with r.if_then(beyond):
+            r.return_value(BEYOND_CHART)
+        r.return_value(HALTED)
+
+    def _write_fixed_step(self, r: Routine) -> None:
+        columns, size = self.stepper.reference_columns, self.chart.row_layout.size
+        refs, first = r.local_array("refs", max(1, 3 * columns)), r.local_array("first", 1)
+        row, sizes = r.local_array("row", size), r.local_array("sizes", 3)
+        state, bounds = self._part(r.instance, "q"), self._part(r.instance, "bounds")
+        inputs, start = (self._part(r.instance, x) for x in ("inputs", "inputs_start"))
+        step = r.new_variable(self._element(r.instance, "step"))
+        r.store(first, 0, 0.0)
+        r.call("ramp", start, inputs, first, refs)
+        r.store(sizes, 0, step)
+        r.store(sizes, 1, step * 0.5)
+        r.store(sizes, 2, 0.0)
+        arguments = refs, state, row, sizes, bounds
+        done = r.call("fixed_run", 1, *self._machine_arguments(r.instance), *arguments)
+        with r.if_then((done < 1) & (sizes[2] > 0.0)):  # joints begin to slip, or stop
+            self._write_find_modes(r, refs)
+            r.store(sizes, 2, 0.0)
+            again = r.call("fixed_run", 1, *self._machine_arguments(r.instance), *arguments)
+            r.assign(done, again)
+        with r.if_then(done < 1):
+            self._write_halt(r, state)
+        self._store(r, "time", self._element(r.instance, "time") + step)
+        r.copy(start, inputs, columns)
+        r.return_value(DONE)
+
+    def _add_evaluations(self, program: Program) -> None:
+        """update_outputs(instance); derivatives(instance, rate) of the state."""
+        observe = self._programs["steps"].formula_outputs("observe")
+        rate = self._programs["steps"].formula_outputs("rate")
+        for name, formula, layout, part in (
+            ("update_outputs", "observe", observe, "outputs"),
+            ("derivatives", "rate", rate, "rate"),
+        ):
+            arrays = ("instance",) if name == "update_outputs" else ("instance", "rate")
+            with program.add_routine(name, arrays=arrays) as r:
+                values = r.local_array("values", layout)
+                arguments = (
+                    *self._machine_arguments(r.instance), self._part(r.instance, "inputs"),
+                    self._part(r.instance, "q"), values,
+                )  # fmt: skip
+                if self._k:
+                    held = self._element(r.instance, "bounds", HELD_INDEX)
+                    with r.if_then(held > 0.5):
+                        r.call(f"steps_{formula}{AT_REST_SUFFIX}", *arguments)
+                    with r.if_else():
+                        r.call(f"steps_{formula}", *arguments)
+                else:
+                    r.call(f"steps_{formula}", *arguments)
+                target = self._part(r.instance, "tau") if part == "outputs" else r.rate
+                r.copy(target, values.element_pointer(part), layout.parts[part])
+                r.return_value(DONE)
+
+    def _add_kinematics(self, program: Program) -> None:
+        """close_loops, follow_loops, gamma and tip."""
+        newton = self._closure.formula_outputs("newton")
+        with program.add_routine("close_loops", arrays=("instance", "q")) as r:
+            result = r.local_array("result", newton)
+            geometry, bounds = (self._part(r.instance, x) for x in ("geometry", "bounds"))
+            with r.if_then(r.call("loops_close", geometry, r.q, result, bounds) < 1):
+                r.return_value(NOT_CLOSED)
+            r.return_value(DONE)
+        with program.add_routine("follow_loops", arrays=("instance", "q_a", "q")) as r:
+            geometry, cursor, bounds = (
+                self._part(r.instance, x) for x in ("geometry", "cursor", "bounds")
+            )
+            done = r.call("loops_follow", 1, geometry, r.q_a, cursor, r.q, bounds)
+            with r.if_then(done < 1):
+                r.return_value(NOT_CLOSED)
+            r.return_value(DONE)
+        with program.add_routine("gamma", arrays=("instance", "q", "gamma")) as r:
+            geometry = self._part(r.instance, "geometry")
+            with r.if_then(r.call("loops_gamma_each", 1, geometry, r.q, r.gamma) < 1):
+                r.return_value(BEYOND_CHART)
+            r.return_value(DONE)
+        if self._tip_offset is None:
+            return
+        with program.add_routine("tip", arrays=("instance", "q", "v_a", "tip")) as r:
+            offset = r.local_array("offset", 3)
+            for i, x in enumerate(self._tip_offset.tolist()):
+                r.store(offset, i, x)
+            geometry = self._part(r.instance, "geometry")
+            r.call("tip_formula", geometry, offset, r.q, r.v_a, r.tip)
+            r.return_value(DONE)
+
+    def _add_dynamics(self, program: Program) -> None:
+        """The routines of `DYNAMICS_ROUTINES`: (instance, q, v_a, x, result)."""
+        for name in self._quantities:
+            with program.add_routine(name, arrays=("instance", "q", "v_a", "x", "result")) as r:
+                inputs = r.local_array("values", 2 * self._n)
+                r.copy(inputs, r.v_a, self._n)
+                r.copy(inputs.element_pointer(self._n), r.x, self._n)
+                geometry, dynamics = (self._part(r.instance, x) for x in ("geometry", "dynamics"))
+                r.call(f"{name}_formula", geometry, dynamics, r.q, inputs, r.result)
+                r.return_value(DONE)

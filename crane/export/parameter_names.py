@@ -1,0 +1,141 @@
+"""Names and units of the elements of an instance, in the order of `InstanceProgram.layout`."""
+
+from collections.abc import Iterable, Iterator
+from itertools import compress
+from typing import TYPE_CHECKING
+
+from crane.control.valve_drive import ValveDrive
+from crane.description.external_forces import WRENCH_COMPONENTS
+from crane.dynamics.external_forces import reference_counts
+from crane.dynamics.joint_forces import LAW_PARAMETER_NAMES
+from crane.hydraulics.circuit_states import BALANCE_UNITS
+
+if TYPE_CHECKING:
+    from crane.export.instance_program import InstanceProgram
+
+_ROTATION = [f"rotation_{i}{j}" for i in "xyz" for j in "xyz"]
+_POSITION = ["position_x", "position_y", "position_z"]
+_INERTIA = ["mass", *(f"com_{x}" for x in "xyz")] + [
+    f"inertia_{x}" for x in ("xx", "xy", "xz", "yy", "yz", "zz")
+]
+_WRENCH_UNITS = ("N", "N", "N", "N m", "N m", "N m")
+
+
+def parameter_names(program: "InstanceProgram") -> tuple[list[str], list[str]]:
+    """Names and units of all elements of an instance."""
+    pairs = list(_elements(program))
+    sizes = program.layout.parts
+    found: dict[str, list[tuple[str, str]]] = {name: [] for name in sizes}
+    for part, name, unit in pairs:
+        found[part].append((name, unit))
+    for part, size in sizes.items():
+        if not found[part]:
+            found[part] = [(f"{part}_{i}" if size > 1 else part, "") for i in range(size)]
+        assert len(found[part]) == size, (part, size, len(found[part]))
+    names = [name for part in sizes for name, _ in found[part]]
+    return names, [unit for part in sizes for _, unit in found[part]]
+
+
+def _elements(program: "InstanceProgram") -> Iterator[tuple[str, str, str]]:
+    """Part, name and unit of the elements that have a meaning."""
+    machine, chart = program.machine, program.chart
+    yield from (("time", "time", "s"), ("step", "step", "s"))
+    inputs = list(_inputs(program))
+    yield from (("inputs_start", f"start_{name}", unit) for name, unit in inputs)
+    yield from (("inputs", name, unit) for name, unit in inputs)
+    for joint in machine.joints:
+        yield "q", f"q_{joint}", machine.unit(joint)
+    force_units = {"m": "N", "rad": "N m"}
+    for joint in machine.active:
+        unit = machine.unit(joint)
+        yield "v_a", f"v_{joint}", f"{unit}/s"
+        yield "tau", f"tau_{joint}", force_units.get(unit, "")
+        yield "friction", f"friction_{joint}", force_units.get(unit, "")
+    if isinstance(program.control, ValveDrive):
+        circuit = program.control.circuit
+        for name, unit in circuit.state_units.items():
+            yield "controller", f"state_{name}", unit
+        for name, unit in BALANCE_UNITS.items():
+            yield "controller", f"integral_{name}", unit
+        for name, unit in program.control.channels:
+            yield "channels", name, unit
+        yield from (("settings", name, "") for name in _setting_names(program.control))
+    yield "work", "work", "J"
+    loads = [force.name for force in machine.external_forces]
+    yield from (("work", f"work_{name}", "J") for name in loads)
+    yield from (("dissipated", "dissipated", "J"), ("kinetic", "kinetic", "J"))
+    yield "potential", "potential", "J"
+    for column in chart.stick_slip.columns:
+        yield "friction_at_rest", f"rest_{machine.joints[column]}", ""
+    for force in machine.external_forces:
+        pairs = zip(WRENCH_COMPONENTS, _WRENCH_UNITS, strict=True)
+        yield from (("external", f"load_{force.name}_{x}", unit) for x, unit in pairs)
+        yield from (("external", f"load_{force.name}_{x}", unit) for x, unit in force.channels)
+    if machine.supports:
+        for joint in machine.joints:
+            yield "a", f"a_{joint}", f"{machine.unit(joint)}/s2"
+    yield from (("geometry", name, unit) for name, unit in _geometry(program))
+    yield from (("dynamics", name, "") for name in _dynamics(program))
+
+
+def _inputs(program: "InstanceProgram") -> Iterator[tuple[str, str]]:
+    machine = program.machine
+    if isinstance(program.control, ValveDrive):
+        yield from ((f"signal_{name}", "V") for name in program.control.circuit.hydraulics.spools)
+    else:
+        driven = compress(machine.active, machine.is_driven)
+        units = {"m": "N", "rad": "N m"}
+        yield from ((f"force_{joint}", units.get(machine.unit(joint), "")) for joint in driven)
+    for force in machine.external_forces:
+        count = reference_counts([force])[0]
+        pairs = zip(WRENCH_COMPONENTS, _WRENCH_UNITS, strict=True)
+        components = list(pairs) if count == len(WRENCH_COMPONENTS) else []
+        components += [(f"reference_{i}", "") for i in range(count - len(components))]
+        yield from ((f"{force.name}_{name}", unit) for name, unit in components)
+
+
+def _geometry(program: "InstanceProgram") -> Iterator[tuple[str, str]]:
+    machine = program.machine
+    frames = [f"{joint}_frame" for joint in machine.joints]
+    for loop in machine.closure.equations.loops:
+        frames += [f"{loop.name}_predecessor", f"{loop.name}_successor"]
+    for frame in frames:
+        yield from ((f"{frame}_{name}", "") for name in _ROTATION)
+        yield from ((f"{frame}_{name}", "m") for name in _POSITION)
+    yield "inverse_characteristic_length", "1/m"
+
+
+def _dynamics(program: "InstanceProgram") -> Iterator[str]:
+    machine, dynamics = program.machine, program.chart.dynamics
+    for part, names in (
+        ("inertias", [f"{joint}_{x}" for joint in machine.joints for x in _INERTIA]),
+        ("joint_laws", [f"{joint}_{x}" for joint in machine.joints for x in LAW_PARAMETER_NAMES]),
+        ("gravity", ["gravity_x", "gravity_y", "gravity_z"]),
+        ("rotor_inertias", [f"{joint}_rotor_inertia" for joint in machine.joints]),
+        ("distances", _distance_names(f"{a}_{b}" for a, b in dynamics.forces.lengths.pairs)),
+        ("moving_factor", ["moving_factor"]),
+        ("circuit_friction", [f"{machine.joints[i]}_circuit_friction"
+                              for i in dynamics.forces.circuit_friction_columns]),
+        ("fixed_inertia", [f"fixed_{x}" for x in ("mass", "moment_x", "moment_y", "moment_z")]),
+        ("tip_point", ["tip_x", "tip_y", "tip_z"]),
+        ("least_inertias", [f"{joint}_least_inertia" for joint in machine.joints]),
+    ):  # fmt: skip
+        size = dynamics.formula_structure.constants_layout.parts[part]
+        yield from names[:size]
+
+
+def _distance_names(pairs: Iterable[str]) -> list[str]:
+    names = []
+    for pair in pairs:
+        names += [f"{pair}_{x}" for x in LAW_PARAMETER_NAMES]
+        names += [f"{pair}_{end}_{x}" for end in ("first", "second") for x in "xyz"]
+    return names
+
+
+def _setting_names(control: ValveDrive) -> list[str]:
+    """Names of the settings of a valve drive."""
+    circuit = control.circuit
+    names = circuit.constant_names
+    names += [f"{joint}_lower_limit" for joint in circuit.hydraulics.joints]
+    count = len(control.settings) - len(names)
+    return names + [f"signal_setting_{i}" for i in range(count)]
