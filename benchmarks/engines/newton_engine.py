@@ -62,7 +62,7 @@ class NewtonSimulator(Simulator):
         self._builder.add_articulation(joints)
         for loop in self.system.loops:
             self._add_loop(loop)
-        self._model = self._builder.finalize(skip_validation_inertia=True)
+        self._model = self._builder.finalize()
         self._control = self._model.control()
         forces = np.zeros(self._model.joint_dof_count)
         forces[: len(joints)] = [body.force for body in self.system.bodies]
