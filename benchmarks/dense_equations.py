@@ -17,11 +17,11 @@ RANK_TOLERANCE = 1e-9  # share of the largest singular value below which a row i
 def exact_forward(system: Multibody) -> Solver:
     """Forward dynamics from the dense equations with multipliers, by their pseudo-inverse.
 
-    Rows: both origins of a loop coincide, and the axes stay parallel. Redundant rows do no harm.
+    Rows: both origins of a loop coincide, and the axes stay parallel; couplings. Redundant rows do
+    no harm. Configurations are Pinocchio's (nq,).
     """
     rows = KinematicRows(system)
     model, data = system.model, system.model.createData()
-    n = model.nv
 
     def forward(q: Array, v: Array, tau: Array) -> Array:
         mass = pin.crba(model, data, q)
@@ -36,7 +36,6 @@ def exact_forward(system: Multibody) -> Solver:
         right = null.T @ (tau - bias - mass @ particular)
         return particular + null @ np.linalg.solve(reduced, right)
 
-    assert n == len(system.bodies)
     return forward
 
 
@@ -81,7 +80,10 @@ class KinematicRows:
                 drifts.append(
                     np.cross(drift1, axis2) + 2 * np.cross(rate1, rate2) + np.cross(axis1, drift2)
                 )
-        return np.vstack(jacobians), np.concatenate(drifts)
+        couplings = self._system.couplings
+        return np.vstack([*jacobians, couplings]), np.append(
+            np.concatenate([*drifts, []]), np.zeros(len(couplings))
+        )
 
     def _end_terms(self, joint: int, placement: pin.SE3, loop: Loop) -> tuple:
         """Point, axis, Jacobians of point and rotation, drift of the point, rates of the axis."""

@@ -15,15 +15,18 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 from dense_equations import exact_forward
 from engines.mujoco_engine import MuJoCo
 from engines.pinocchio_engine import best_forward, sample_states
 from multibody import Array, Multibody
-from problem import load_machine
+from problem import THIRD_PARTY, load_machine
+from scipy.linalg.blas import dsymm
+from scipy.linalg.lapack import dposv
 
 import crane
 
@@ -33,24 +36,47 @@ SIZES = {
     "ring": (4, 7, 10, 20, 60),
     "spatial ring": (6, 8, 10, 20, 60),
 }
+QUICK = ("chain 10", "ring 7", "mini_forwarder/mini_forwarder.yaml")
+THIRD_PARTY_START = 0.8  # [rad]: grbda's four-bars are flat at zero, where branches meet
 MAX_SAMPLES = 200
 SHARE = 0.05  # [s] of a round for each candidate, about
 LIMIT = 300  # of a process [s]
+MAX_DIFFERENCE = 1e-6  # of an engine's accelerations or forces, relative: beyond, it has no time
 Call = Callable[[], object]
+Calls = tuple[dict[str, Call], int, dict[str, Any]]
+
+
+def machines(quick: bool) -> list[str]:
+    """Names of the machines: the mini forwarder, our families, and grbda's where they are."""
+    if quick:
+        return list(QUICK)
+    families = [f"{family} {joints}" for family, sizes in SIZES.items() for joints in sizes]
+    files = sorted((THIRD_PARTY / "grbda").glob("*.urdf"))
+    if not files:
+        print("grbda's machines are left out: there is no ../shared/data/third_party/grbda")
+    return [QUICK[-1], *families, *(f"third_party/grbda/{path.name}" for path in files)]
 
 
 def measure(machine: str, rounds: int) -> dict[str, Any]:
     """Times of a machine; `cached` is the first call of a later process [s]."""
     with tempfile.TemporaryDirectory() as cache:
-        environment = dict(os.environ, XDG_CACHE_HOME=cache, OMP_NUM_THREADS="1")
-        found = _run_process(machine, rounds, environment)
+        found = run_process(__file__, machine, rounds, cache)
         if "failure" not in found:
-            found["cached"] = _run_process(machine, 0, environment)["first"]
+            found["cached"] = run_process(__file__, machine, 0, cache)["first"]
     return {"machine": machine} | found
 
 
-def _run_process(machine: str, rounds: int, environment: dict[str, str]) -> dict[str, Any]:
-    command = [sys.executable, __file__, machine, "--rounds", str(rounds)]
+def run_process(script: str, machine: str, rounds: int, cache: str) -> dict[str, Any]:
+    """What a script of one machine prints, or why there is nothing.
+
+    Args:
+        script: Whose `main` is the one below.
+        machine: Its argument.
+        rounds: Of calls, 0 for none.
+        cache: Folder of the cache.
+    """
+    environment = dict(os.environ, XDG_CACHE_HOME=cache, OMP_NUM_THREADS="1")
+    command = [sys.executable, script, machine, "--rounds", str(rounds)]
     try:
         done = subprocess.run(
             command, capture_output=True, text=True, env=environment, timeout=LIMIT, check=True
@@ -62,41 +88,92 @@ def _run_process(machine: str, rounds: int, environment: dict[str, str]) -> dict
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def candidates(
-    system: Multibody, dynamics: crane.Dynamics
-) -> tuple[dict[str, Call], int, dict[str, Any]]:
+def candidates(system: Multibody, dynamics: crane.Dynamics) -> Calls:
     """Calls over all samples, the number of samples, and settings and errors of the peers."""
     active = system.machine.closure.active
     few = sample_states(system, 5)
-    start = time.process_time()
-    for q, v, tau in few:
-        dynamics.forward(q[active], v[active], tau[active])
-    count = int(np.clip(5 * SHARE / (time.process_time() - start), 5, MAX_SAMPLES))
+    own, count = timed_samples(dynamics.forward, [tuple(x[active] for x in row) for row in few])
+    full = peer_samples(system, few)
     exact = exact_forward(system)
-    full = [(q, v, tau + system.joint_forces(q, v)) for q, v, tau in few]
     expected = [exact(*sample) for sample in full]
-    told: dict[str, Any] = {}
-    own = [dynamics.forward(q[active], v[active], tau[active]) for q, v, tau in few]
-    told["crane difference"] = largest_difference(own, [a[active] for a in expected])
-    samples = sample_states(system, count)
-    samples = samples[::2] + samples[1::2][::-1]  # there and back, without a jump between rounds
-    arrays = [np.array(values) for values in zip(*samples, strict=True)]
-    q_a, v_a, tau_a = (np.ascontiguousarray(values[:, active]) for values in arrays)
-    rows = list(zip(q_a, v_a, tau_a, strict=True))
-    samples = [(q, v, tau + system.joint_forces(q, v)) for q, v, tau in samples]
+    told = {"crane difference": largest_difference(own, [a[active] for a in expected])}
+    samples = there_and_back(sample_states(system, count))
+    q, v_a, tau_a = stacks(samples, active)
+    rows = list(zip(q[:, active], v_a, tau_a, strict=True))
+    q_a = np.ascontiguousarray(q[:, active])
     calls: dict[str, Call] = {
         "crane, one call": lambda: [dynamics.forward(*row) for row in rows],
         "crane, a stack": lambda: dynamics.forward(q_a, v_a, tau_a),
-        "crane, closed stack": lambda: dynamics.evaluate_closed("forward", arrays[0], v_a, tau_a),
+        "crane, closed stack": lambda: dynamics.evaluate_closed("forward", q, v_a, tau_a),
     }
-    for algorithm in ("constraintDynamics", "lcaba"):
-        solver, settings = best_forward(system, algorithm, full, expected)
-        told |= {f"{algorithm} {key}": value for key, value in settings.items()}
-        if settings["difference"] < 1e-6:
-            calls[f"pin.{algorithm}"] = peer_call(solver, samples)
+    samples = peer_samples(system, samples)
+    for name, (solver, settings) in peer_solvers(system, full, expected).items():
+        told |= {f"{name} {key}": value for key, value in settings.items()}
+        if settings["difference"] < MAX_DIFFERENCE:
+            calls[f"pin.{name}"] = peer_call(solver, samples)
     if MuJoCo.version():
-        calls["mj_forward"] = mujoco_call(system, samples)
+        try:
+            calls["mj_forward"] = mujoco_call(system, samples)
+        except ValueError as error:
+            told["mj_forward failure"] = str(error)
     return calls, count, told
+
+
+def timed_samples(call: Callable, few: Sequence[tuple[Array, ...]]) -> tuple[list[Array], int]:
+    """Results of a call for a few samples, and how many of them fill the share of a round."""
+    start = time.process_time()
+    found = [call(*sample) for sample in few]
+    needed = (time.process_time() - start) / len(few)
+    return found, int(np.clip(SHARE / needed, 5, MAX_SAMPLES))
+
+
+def there_and_back(samples: list) -> list:
+    """The same samples in an order without a jump between rounds."""
+    return samples[::2] + samples[1::2][::-1]
+
+
+def stacks(samples: list, active: Array) -> tuple[Array, Array, Array]:
+    """Stacks of all coordinates (N, n), and of the active joints' velocities and third values."""
+    q, v, x = (np.array(values) for values in zip(*samples, strict=True))
+    return q, np.ascontiguousarray(v[:, active]), np.ascontiguousarray(x[:, active])
+
+
+def peer_samples(system: Multibody, samples: list) -> list:
+    """Pinocchio's configurations, velocities, and forces with those of springs and dampers."""
+    return [(system.configuration(q), v, tau + system.joint_forces(q, v)) for q, v, tau in samples]
+
+
+def peer_solvers(
+    system: Multibody, samples: list, expected: list[Array]
+) -> dict[str, tuple[Callable[..., Array], dict[str, Any]]]:
+    """Solvers of Pinocchio with their settings and differences."""
+    if not len(system.couplings):
+        return {
+            algorithm: best_forward(system, algorithm, samples, expected)
+            for algorithm in ("constraintDynamics", "lcaba")
+        }
+    if system.loops:
+        return {}
+    solver = coupled_forward(system)
+    difference = largest_difference([solver(*sample) for sample in samples], expected)
+    return {"crba": (solver, {"difference": difference})}
+
+
+def coupled_forward(system: Multibody) -> Callable[..., Array]:
+    """Forward dynamics of couplings without loops: (G' M G) a_A = G' (tau - h) with constant G.
+
+    Neither constraintDynamics nor lcaba has couplings; mass matrix and bias are as in Pinocchio's
+    example mimic_dynamics.py.
+    """
+    model, data = system.model, system.model.createData()
+    gamma = np.asfortranarray(system.machine.closure.gamma(system.q))
+
+    def forward(q: Array, v: Array, tau: Array) -> Array:
+        mass = pin.crba(model, data, q)  # its upper triangle
+        right = gamma.T @ (tau - pin.nonLinearEffects(model, data, q, v))
+        return gamma @ dposv(gamma.T @ dsymm(1.0, mass, gamma), right)[1]
+
+    return forward
 
 
 def peer_call(solver: Callable[..., Array], samples: list) -> Call:
@@ -140,8 +217,13 @@ def in_turns(calls: dict[str, Call], rounds: int) -> dict[str, list[float]]:
     return times
 
 
-def main() -> None:
-    """Measure one machine and print JSON."""
+def main(quantity: str, prepare: Callable[[Multibody, crane.Dynamics], Calls]) -> None:
+    """Measure one machine and print JSON.
+
+    Args:
+        quantity: "forward" or "inverse".
+        prepare: Gives the calls.
+    """
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("machine")
     parser.add_argument("--rounds", type=int, default=15)
@@ -153,18 +235,19 @@ def main() -> None:
     dynamics = crane.Dynamics(machine)
     active = machine.closure.active
     rest = np.zeros(len(active))
-    dynamics.forward(machine.home[active], rest, rest)
+    getattr(dynamics, quantity)(machine.home[active], rest, rest)
     first = time.process_time()
     found: dict[str, Any] = {
         "joints": machine.model.nv,
         "loops": len(machine.closure.equations.loops),
         "freedoms": len(active),
-        "backend": dynamics.backend_of("forward"),
+        "backend": dynamics.backend_of(quantity),
         "load": loaded - start,
         "first": first - loaded,
     }
     if options.rounds:
-        calls, count, told = candidates(Multibody.from_machine(machine, {}), dynamics)
+        start = THIRD_PARTY_START if options.machine.startswith("third_party/") else 0.0
+        calls, count, told = prepare(Multibody.from_machine(machine, {}, start), dynamics)
         times = in_turns(calls, options.rounds)
         found["times"] = {name: statistics.median(t) / count for name, t in times.items()}
         found["spreads"] = {
@@ -176,4 +259,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main("forward", candidates)

@@ -1,7 +1,7 @@
 """Multibody systems as every engine can build them, and their states."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -102,40 +102,51 @@ class Multibody:
     Attributes:
         machine: The machine that it was read from.
         model: Its spanning tree for Pinocchio.
-        bodies: In the order of the joints of `model`.
         loops: What closes the loops.
+        couplings: Rows C (k, n) of linear constraints C v = 0 of velocities of joints.
         springs: Between points.
         gravity: (3,) [m/s2].
-        q: Closed configuration (n,) at the start.
+        q: Closed configuration (n,) at the start, in crane's coordinates.
         v: Velocities (n,) of all joints there.
     """
 
     machine: crane.Machine
     model: pin.Model
-    bodies: tuple[Body, ...]
     loops: tuple[Loop, ...]
+    couplings: Array
     springs: tuple[Spring, ...]
     gravity: Array
     q: Array
     v: Array
 
     @classmethod
-    def from_machine(cls, machine: crane.Machine, velocity: dict[str, float]) -> "Multibody":
+    def from_machine(
+        cls, machine: crane.Machine, velocity: dict[str, float], start: float = 0.0
+    ) -> "Multibody":
         """The system at the home configuration of a machine, with velocities of active joints.
 
+        Args:
+            machine: The machine.
+            velocity: Of active joints at the start, by name; 0 where not given.
+            start: Size of the active coordinates at the start, with the signs of those at home,
+                where home is next to a change point; 0 for home itself.
+
         Raises:
-            ValueError: A joint has several degrees of freedom.
+            ValueError: A loop is no pin and no ball, or a coupling is not linear.
         """
-        model = machine.model
-        passive = {element.joint: element for element in machine.forces if element.joint}
-        closure = machine.closure
+        model, closure = machine.model, machine.closure
+        if closure.equations.coupling_powers.any():
+            raise ValueError("a coupling is not linear")
         q = np.array(machine.home)
+        if start:
+            signs = np.sign(q) * (np.abs(q) > 1e-6)
+            q = closure.solve(start * signs[closure.active])
         v = closure.gamma(q) @ np.array([velocity.get(name, 0.0) for name in machine.active])
         return cls(
             machine=machine,
             model=model,
-            bodies=tuple(_body(model, i, passive) for i in range(1, model.njoints)),
             loops=tuple(_loop(machine, loop) for loop in closure.equations.loops),
+            couplings=closure.equations.coupling_factors,
             springs=tuple(
                 Spring(
                     (_mount(machine, element.between[0]), _mount(machine, element.between[1])),
@@ -152,6 +163,24 @@ class Multibody:
         )
 
     @cached_property
+    def bodies(self) -> tuple[Body, ...]:
+        """Bodies in the order of the joints of `model`.
+
+        Raises:
+            ValueError: A joint has several degrees of freedom, or joints are coupled.
+        """
+        if len(self.couplings):
+            raise ValueError("joints are coupled")
+        bodies = tuple(
+            _body(self.model, i, self.joint_force_parameters) for i in range(1, self.model.njoints)
+        )
+        return _possible_bodies(bodies)
+
+    def configuration(self, q: Array) -> Array:
+        """Pinocchio's configuration of coordinates (n,), with quaternions of balls."""
+        return self.machine.closure.equations.coordinates.configuration(q)
+
+    @cached_property
     def start(self) -> State:
         """State at the start."""
         return self.state(self.q, self.v)
@@ -161,11 +190,16 @@ class Multibody:
         stiffness, rest, damping, force = self.joint_force_parameters
         return stiffness * (rest - q) - damping * v + force
 
-    @property
+    @cached_property
     def joint_force_parameters(self) -> Array:
         """Stiffness, rest, damping and constant force (4, n) along the joints."""
-        values = [(body.stiffness, body.rest, body.damping, body.force) for body in self.bodies]
-        return np.array(values).T
+        values = np.zeros((4, self.model.nv))
+        for element in self.machine.forces:
+            if element.joint:
+                values[:, self.machine.column(element.joint)] = (
+                    element.stiffness, element.rest, element.damping, element.force,
+                )  # fmt: skip
+        return values
 
     def state(self, q: Array, v: Array, data: pin.Data | None = None) -> State:
         """State of all bodies at coordinates and velocities (n,) of the tree."""
@@ -202,6 +236,17 @@ class Multibody:
         """Axis (3,) of the joint of a body in the world."""
         return state.rotation[i] @ self.bodies[i].axis
 
+    def joint_coordinate(self, state: State, i: int) -> float:
+        """Coordinate of the joint of a body [m], or between -pi and pi [rad]."""
+        body = self.bodies[i]
+        mount = Mount(body.parent, body.placement)
+        if not body.is_revolute:
+            offset = self.joint_point(state, i) - self.point(state, mount)
+            return float(offset @ self.direction(state, mount, body.axis))
+        start = np.column_stack([self.direction(state, mount, column) for column in np.eye(3)])
+        turn = start.T @ state.rotation[i]
+        return float(pin.log3(turn) @ body.axis)
+
     def is_planar_loop(self, loop: Loop) -> bool:
         """Whether all joints of a loop move in the plane across its axis.
 
@@ -234,10 +279,9 @@ class Multibody:
         return float(max(gaps, default=0.0))
 
     def energy(self, state: State) -> float:
-        """Kinetic energy, that of gravity and of springs between points [J].
+        """Kinetic energy, that of gravity and of springs [J].
 
-        Springs along joints are left out: engines with other coordinates do not give those of
-        joints.
+        Springs along revolute joints have to stay within half a turn of their frame.
         """
         masses = np.array([body.mass for body in self.bodies])
         kinetic = 0.5 * masses @ (state.velocity**2).sum(axis=1)
@@ -250,10 +294,14 @@ class Multibody:
         for spring in self.springs:
             one, two = (self.point(state, end) for end in spring.ends)
             potential += 0.5 * spring.stiffness * (np.linalg.norm(two - one) - spring.rest) ** 2
+        for i, body in enumerate(self.bodies):
+            if body.stiffness:
+                stretch = self.joint_coordinate(state, i) - body.rest
+                potential += 0.5 * body.stiffness * stretch**2
         return float(kinetic + potential)
 
 
-def _body(model: pin.Model, i: int, passive: dict) -> Body:
+def _body(model: pin.Model, i: int, forces: Array) -> Body:
     joint, inertia = model.joints[i], model.inertias[i]
     if joint.nv != 1 or joint.nq != 1:
         raise ValueError(f"joint '{model.names[i]}' has {joint.nv} degrees of freedom")
@@ -261,7 +309,7 @@ def _body(model: pin.Model, i: int, passive: dict) -> Body:
     joint.calc(data, np.zeros(1))
     subspace = np.asarray(data.S).ravel()
     is_revolute = bool(np.abs(subspace[3:]).max() > 0.5)
-    element = passive.get(model.names[i])
+    stiffness, rest, damping, force = forces[:, joint.idx_v]
     return Body(
         name=model.names[i],
         parent=model.parents[i] - 1,
@@ -271,11 +319,36 @@ def _body(model: pin.Model, i: int, passive: dict) -> Body:
         mass=inertia.mass,
         com=np.array(inertia.lever),
         inertia=np.array(inertia.inertia),
-        stiffness=element.stiffness if element else 0.0,
-        rest=element.rest if element else 0.0,
-        damping=element.damping if element else 0.0,
-        force=element.force if element else 0.0,
+        stiffness=stiffness,
+        rest=rest,
+        damping=damping,
+        force=force,
     )
+
+
+def _possible_bodies(bodies: tuple[Body, ...]) -> tuple[Body, ...]:
+    """Bodies that can exist and move alike.
+
+    Planar machines are written with inertias of which no body can be; engines refuse them. If all
+    joints turn about parallel axes, only the moment about these matters.
+    """
+    rotations, axes = [], []
+    for body in bodies:
+        parent = np.eye(3) if body.parent < 0 else rotations[body.parent]
+        rotations.append(parent @ body.placement[:3, :3])
+        axes.append(rotations[-1] @ body.axis)
+    is_planar = all(body.is_revolute for body in bodies) and np.allclose(np.abs(axes @ axes[0]), 1)
+    if not is_planar or all(_is_possible(body.inertia) for body in bodies):
+        return bodies
+    return tuple(
+        replace(body, inertia=body.axis @ body.inertia @ body.axis * np.eye(3)) for body in bodies
+    )
+
+
+def _is_possible(inertia: Array) -> bool:
+    """Whether the principal moments are positive and none is above the sum of the others."""
+    moments = np.linalg.eigvalsh(inertia)
+    return moments[0] > 0 and moments[2] <= moments[0] + moments[1]
 
 
 def _mount(machine: crane.Machine, name: str) -> Mount:

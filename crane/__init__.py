@@ -1,9 +1,9 @@
 """crane: dynamics, simulation and identification of machines with closed kinematic chains.
 
 The root has what short programs need. All else stands in submodules: `closure`, `control`,
-`description`, `dynamics`, `formats`, `hydraulics`, `identification`, `machine`, `motion`,
-`ratings`, `recordings`, `simulation`, `studies` and `view`. Names are listed in the stub beside
-this file, and imported when they are first used.
+`description`, `dynamics`, `export`, `formats`, `hydraulics`, `identification`, `machine`,
+`motion`, `ratings`, `recordings`, `simulation`, `studies` and `view`. Names are listed in the stub
+beside this file, and imported when they are first used.
 """
 
 import sys

@@ -2,6 +2,7 @@ from . import closure as closure
 from . import control as control
 from . import description as description
 from . import dynamics as dynamics
+from . import export as export
 from . import formats as formats
 from . import hydraulics as hydraulics
 from . import identification as identification

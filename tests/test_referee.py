@@ -1,11 +1,16 @@
 """The referee of `benchmarks/`: reference solutions, engines, and what it makes of them."""
 
+from dataclasses import replace
+
+import forward_dynamics
 import hydraulic_crane
+import inverse_dynamics
 import numpy as np
+import pinocchio as pin
 import pytest
 from dense_equations import exact_forward
 from engines import ENGINES
-from engines.crane_engine import Crane
+from engines.crane_engine import Crane, CraneSimulator
 from engines.drake_engine import Drake
 from engines.exudyn_engine import Exudyn
 from engines.exudyn_tree_engine import ExudynTree
@@ -14,10 +19,13 @@ from engines.mujoco_warp_engine import MuJoCoWarp
 from engines.newton_engine import Newton
 from engines.pinocchio_admm_engine import AdmmForward
 from engines.pinocchio_engine import Pinocchio, largest_difference, sample_states
-from problem import Problem, problems
+from multibody import Multibody
+from problem import FOLDER, Problem, load_machine, machine_file, missing_problems, problems
 from reference import crane_positions, independent_positions
 from trajectories import Point, failures, measure_setting, time_at_error
 from warned import quiet
+
+import crane
 
 PROBLEMS = {problem.name: problem for problem in problems()}
 
@@ -43,18 +51,24 @@ def test_the_squeezer_ends_where_the_test_set_for_ivp_solvers_says():
     ("name", "error"),
     [
         ("bricard", 1e-11),
+        ("delta_robot", 1e-12),
+        ("grbda_leg", 1e-12),
         *(pytest.param(name, error, marks=pytest.mark.slow)
           for name, error in (("mini_forwarder", 1e-11), ("andrews_squeezer", 1e-13),
-                              ("flyball_governor", 1e-11),
+                              ("flyball_governor", 1e-11), ("stewart_platform", 1e-12),
+                              ("cassie_leg", 1e-12), ("grbda_chains", 1e-11),
+                              ("grbda_tree", 1e-11),
                               ("slider_crank", 1e-9), ("n_four_bar_2", 2e-8),
                               ("n_four_bar_40", 2e-6))),
     ],
 )  # fmt: skip
 def test_references_by_two_ways(name, error):
     """Dense equations with multipliers, or a closed form, against crane."""
+    if name not in PROBLEMS:
+        pytest.skip("its machine is not part of the project: ../shared/data/third_party")
     problem = PROBLEMS[name]
     assert problem.error(quiet(crane_positions, problem)) < error
-    if name in ("mini_forwarder", "slider_crank"):
+    if name in ("mini_forwarder", "slider_crank", "grbda_leg"):
         assert problem.error(independent_positions(problem)[0]) < 1e-11
 
 
@@ -102,6 +116,61 @@ def test_failures_are_told_in_a_line():
     assert failures(points) == ["e: 3 of 5 settings fail, most: unstable"]
 
 
+def test_energy_has_the_springs_along_joints():
+    problem = PROBLEMS["delta_robot"]
+    system = problem.system
+    simulator = CraneSimulator(problem, "DOP853", 1e-12)
+    states = simulator.states(quiet(simulator.run))
+    joint = [body.name for body in system.bodies].index("motor1")
+    angles = [system.joint_coordinate(state, joint) for state in states]
+    assert problem.is_conservative and np.ptp(angles) > 0.2
+    energies = [system.energy(state) for state in states]
+    np.testing.assert_allclose(energies, system.energy(system.start), rtol=0, atol=1e-9)
+
+
+def test_planar_bodies_that_cannot_be_move_as_ones_that_can():
+    machine = quiet(load_machine, "n_four_bar_2.urdf")
+    system = Multibody.from_machine(machine, {})
+    flat = machine.model.copy()
+    for i, body in enumerate(system.bodies):
+        moment = np.diag(body.axis * (body.axis @ body.inertia @ body.axis))
+        flat.inertias[i + 1] = pin.Inertia(body.mass, body.com, np.abs(moment))
+    assert np.linalg.eigvalsh(flat.inertias[1].inertia)[1] == 0
+    bodies = replace(system, model=flat).bodies
+    for body, original in zip(bodies, system.bodies, strict=True):
+        moments = np.linalg.eigvalsh(body.inertia)
+        assert moments[0] > 0 and moments[2] <= moments[0] + moments[1]
+        assert body.axis @ (body.inertia - original.inertia) @ body.axis == pytest.approx(
+            0, abs=1e-9
+        )
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["mini_forwarder/mini_forwarder.yaml", "spatial ring 6",
+     "third_party/grbda/robot-models_mini_cheetah.urdf",
+     pytest.param("third_party/grbda/variable_four_bar_urdf_four_bar_branch_2_5.urdf",
+                  marks=pytest.mark.slow)],
+)  # fmt: skip
+@pytest.mark.parametrize("part", [forward_dynamics, inverse_dynamics])
+def test_engines_agree_on_accelerations_and_forces(name, part):
+    if name.startswith("third_party/") and not machine_file(name).exists():
+        pytest.skip("no ../shared/data/third_party")
+    machine = quiet(load_machine, name)
+    start = forward_dynamics.THIRD_PARTY_START if name.startswith("third_party/") else 0.0
+    system = Multibody.from_machine(machine, {}, start)
+    calls, _, told = quiet(part.candidates, system, crane.Dynamics(machine))
+    differences = {key: value for key, value in told.items() if key.endswith("difference")}
+    assert len(differences) >= 2 and max(differences.values()) < 1e-8
+    assert any(call.startswith("pin.") for call in calls)
+
+
+def test_forces_are_not_projected_with_too_few_rows():
+    system = Multibody.from_machine(quiet(load_machine, "ring 7"), {})
+    with pytest.raises(ValueError, match="too few independent rows"):
+        inverse_dynamics.Projection(system, np.ones((3, 7)))
+
+
 def test_an_unstable_run_is_a_failure_in_one_line():
     point = measure_setting(PROBLEMS["bricard"], MuJoCo("Euler"), (0.05, 0.1, 0.9999))
     assert point.failure and "\n" not in point.failure and point.error == np.inf
@@ -116,6 +185,7 @@ def test_time_at_an_error_is_that_of_the_frontier():
 
 def test_names_of_engines_and_problems_are_unique():
     assert len({engine.name for engine in ENGINES}) == len(ENGINES)
+    assert len(PROBLEMS) + len(missing_problems()) == len(list(FOLDER.glob("*.yaml")))
     assert all(isinstance(problem, Problem) and problem.source for problem in PROBLEMS.values())
 
 

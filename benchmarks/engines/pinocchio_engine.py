@@ -85,7 +85,7 @@ def sample_states(system: Multibody, count: int) -> list[tuple[Array, Array, Arr
     n = len(active)
     rate, phase = random.uniform(0.5, 1.5, n), random.uniform(0, 2 * np.pi, n)
     turn = 0.01 * np.arange(count)[:, None] * rate + phase
-    reach = min(0.1, len(system.loops) / system.model.nv)
+    reach = min(0.1, max(len(system.loops), 1) / system.model.nv)
     path = closure.units[active] * (np.sin(turn) - np.sin(phase))
     while True:
         with contextlib.suppress(crane.CraneError):

@@ -27,7 +27,7 @@ GROUPS = {  # modules of this room and their commands, in the order of use
     "rate": "workspace working-range breakout capacity stability power",
     "design": "study design",
     "show": "view plot sketch live",
-    "exchange": "convert import schema",
+    "exchange": "convert export import schema",
 }
 _SIGNAL_STATUS = 128  # exit status of a process that a signal has ended, less its number
 _FLAGS = ("--debug", "--strict", "--trust-xacro")  # that all commands take

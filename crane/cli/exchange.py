@@ -11,6 +11,7 @@ from crane.cli.command import command
 from crane.cli.options import (
     MachineName,
     MachineOptions,
+    OutputFolder,
     OverwriteOptions,
     RequiredOutputFile,
     TimeOptions,
@@ -23,6 +24,7 @@ from crane.common.atomic_output import (
 from crane.common.errors import CraneError, CraneWarning, InputError, check_name
 
 _FORMATS = ("urdf+", "urdf", "mjcf", "machine")
+_TARGETS = ("c",)
 _SUFFIXES = {".urdf": "urdf+", ".xml": "mjcf", ".mjcf": "mjcf"}
 
 
@@ -60,6 +62,25 @@ def convert(
         write = crane.formats.write_urdf_plus if kind == "urdf+" else crane.formats.write_mjcf
         write(loaded, out)
     print(f"written to {written}")
+
+
+@command()
+def export(
+    machine: MachineName,
+    options: MachineOptions,
+    output: OutputFolder,
+    to: Annotated[str, typer.Option(metavar="TARGET", help="Target: c (C99 sources).")] = "c",
+    name: Annotated[
+        str,
+        typer.Option(metavar="NAME", help="Prefix of all names; that of the machine by default."),
+    ] = "",
+) -> None:
+    """Write a machine as a program for another environment."""
+    check_name(to, _TARGETS, f"--to is '{to}'")
+    check_folder_is_writable(output.out, output.force)
+    loaded = options.load(machine)
+    written = crane.export.write_c(loaded, output.out, name=name, overwrite=output.force)
+    print(f"written to {written}: see its header, or cmake -B build -S {written}")
 
 
 def _output_format(out: Path, to: str | None) -> str:

@@ -181,7 +181,9 @@ class _CRoutineEmitter:
         routine, linked = self._routine, self._linked
         self._emit_block(routine.statements)
         read = variables_read(routine)
-        declarations = [f"real {name}[{max(1, n)}];" for name, n in routine.local_arrays.items()]
+        # compilers do not see that arrays are filled before they are read
+        arrays = routine.local_arrays.items()
+        declarations = [f"real {name}[{max(1, n)}] = {{0}};" for name, n in arrays]
         names = [(_TYPES[x.kind], x.operands[0]) for x in routine.variables]
         declarations += [f"{kind} {name};" for kind, name in names]
         unread = [f"(void){name};" for _, name in names if name not in read]

@@ -1,5 +1,8 @@
-"""Machines as programs for targets outside of Python."""
+"""Machines as programs for targets outside of Python.
 
-from crane.export.instance_program import InstanceProgram
+For controllers, simulators and pages that take a machine along without this package.
+"""
 
-__all__ = ["InstanceProgram"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

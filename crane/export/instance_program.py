@@ -40,6 +40,9 @@ from crane.simulation.integration.rosenbrock import RosenbrockStepper
 from crane.simulation.simulation_setup import machine_under_control
 
 TIP_WRENCH_NAME = "tip"
+SINGLE_PRECISION_TOLERANCE = 1e-4  # of a step
+# over those of double precision: residuals of rounding, of closed loops; last step of Newton
+_SINGLE_PRECISION_BOUNDS = np.array([1e9, 1e8, 1e6])
 MAX_STEPS, MAX_EVENTS = 10_000, 200  # of one call of `advance`, by default
 DYNAMICS_ROUTINES = MappingProxyType(
     {
@@ -105,11 +108,9 @@ class InstanceProgram:
         states = control.circuit.state_count if isinstance(control, ValveDrive) else 0
         dynamics = Dynamics(machine)
         self.chart = Chart.from_dynamics(dynamics, control, states)
-        self.stepper: ErrorControlledStepper = (
-            RosenbrockStepper(self.chart)
-            if isinstance(control, ValveDrive)
-            else DormandPrinceStepper(self.chart)
-        )
+        is_valve_drive = isinstance(control, ValveDrive)
+        self._stepper_class = RosenbrockStepper if is_valve_drive else DormandPrinceStepper
+        self.stepper: ErrorControlledStepper = self._stepper_class(self.chart)
         self._quantities = {name: DYNAMICS_ROUTINES[name] for name in quantities}
         self._nq, self._n = machine.model.nv, len(machine.active)
         self._k = len(self.chart.stick_slip.columns)
@@ -145,6 +146,15 @@ class InstanceProgram:
         if isinstance(self.control, ValveDrive):
             neutral = [x.neutral for x in self.control.circuit.hydraulics.spools.values()]
             at.inputs[: len(neutral)] = at.inputs_start[: len(neutral)] = neutral
+        return values
+
+    @cached_property
+    def single_precision_defaults(self) -> Array:
+        """`defaults` with tolerances that single precision reaches."""
+        values = self.defaults.copy()
+        at = self.layout.view(values)
+        at.bounds[:3] *= _SINGLE_PRECISION_BOUNDS
+        at.tolerances[:] = self._stepper_class(self.chart, SINGLE_PRECISION_TOLERANCE).tolerance
         return values
 
     @cached_property

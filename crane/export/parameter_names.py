@@ -75,7 +75,10 @@ def _elements(program: "InstanceProgram") -> Iterator[tuple[str, str, str]]:
         for joint in machine.joints:
             yield "a", f"a_{joint}", f"{machine.unit(joint)}/s2"
     yield from (("geometry", name, unit) for name, unit in _geometry(program))
-    yield from (("dynamics", name, "") for name in _dynamics(program))
+    units = _dynamics_units(program)
+    yield from (
+        ("dynamics", name, unit) for name, unit in zip(_dynamics(program), units, strict=True)
+    )
 
 
 def _inputs(program: "InstanceProgram") -> Iterator[tuple[str, str]]:
@@ -139,3 +142,37 @@ def _setting_names(control: ValveDrive) -> list[str]:
     names += [f"{joint}_lower_limit" for joint in circuit.hydraulics.joints]
     count = len(control.settings) - len(names)
     return names + [f"signal_setting_{i}" for i in range(count)]
+
+
+def _dynamics_units(program: "InstanceProgram") -> Iterator[str]:
+    """Units of `_dynamics`; none where they depend on another parameter."""
+    machine, dynamics = program.machine, program.chart.dynamics
+    inertia = ("kg", "m", "m", "m", *("kg m2",) * 6)
+    for part, size in dynamics.formula_structure.constants_layout.parts.items():
+        if part == "inertias":
+            yield from inertia * len(machine.joints)
+        elif part == "joint_laws":
+            for joint in machine.joints:
+                units = _law_units(machine.unit(joint))
+                yield from (units.get(name, "") for name in LAW_PARAMETER_NAMES)
+        elif part == "distances":
+            names = [*LAW_PARAMETER_NAMES, *("",) * 6]
+            units = _law_units("m")
+            pairs = len(dynamics.forces.lengths.pairs)
+            yield from ([units.get(name, "") if name else "m" for name in names] * pairs)
+        else:
+            unit = {"gravity": "m/s2", "tip_point": "m"}.get(part, "")
+            yield from (unit for _ in range(size))
+
+
+def _law_units(unit: str) -> dict[str, str]:
+    force = "N" if unit == "m" else "N m"
+    constant = dict.fromkeys(
+        ("coulomb", "coulomb_offset", "stiction", "constant", "gas_force"), force
+    )
+    rates = dict.fromkeys(
+        ("viscous", "viscous_offset", "damping", "stop_damping"), f"{force} s/{unit}"
+    )
+    springs = dict.fromkeys(("stiffness", "stop_stiffness"), f"{force}/{unit}")
+    lengths = dict.fromkeys(("lower_limit", "upper_limit", "gas_rest_position"), unit)
+    return {**constant, **rates, **springs, **lengths, "energy_offset": "J"}

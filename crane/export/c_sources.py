@@ -1,0 +1,298 @@
+"""C99 sources of a machine: header, functions, self-test with recorded vectors, examples."""
+
+import re
+from collections.abc import Iterator, Mapping
+from importlib.resources import files
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+import crane
+from crane.codegen.c_emitter import C_PRELUDE, c_parameters, emit_c_function
+from crane.codegen.linked_functions import LinkedFunction
+from crane.codegen.symbolic import SymbolicExpression, required_operations
+from crane.codegen.vector_layout import Formula
+from crane.common.atomic_output import check_folder_is_writable, replace_folder
+from crane.common.samples import Array
+from crane.export.instance_program import DYNAMICS_ROUTINES, InstanceProgram
+from crane.export.instance_routines import STATUS_TEXTS
+from crane.export.recorded_values import random_vectors, recorded_motion
+from crane.formats.machine_loading import load
+from crane.machine.machine import Machine
+
+_ARRAYS = (
+    "q", "v_a", "contacts", "tau", "friction", "friction_at_rest", "a", "cursor", "lengths",
+    "bounds", "tolerances",
+)  # fmt: skip
+_PARAMETERS = ("geometry", "dynamics", "settings")
+_TEMPLATES = (
+    "CMakeLists.txt", "machine_example.c", "machine_example.py", "machine_sfunction.c",
+)  # fmt: skip
+_TEXTS = {
+    "initialize": "Close the loops from the active coordinates in q, the others as first guess,\n"
+    "and start at rest; pressures hold the machine, joints with stiction stick or slip.",
+    "advance": "Integrate over `step` with controlled errors. The inputs go linearly from those\n"
+    "of the last call to those that are set now.",
+    "advance_fixed": "One step of the classical Runge-Kutta method of length `step`. Joints begin "
+    "to\nslip and stop at the start of a step only.",
+    "update_outputs": "Compute the outputs, from `tau` on, at the state and inputs.",
+    "derivatives": "Derivatives of the state, from `q` on, at the state and inputs.",
+    "close_loops": "Newton's method in place: q (nq) closed at its active coordinates, the others "
+    "as first guess.",
+    "follow_loops": "q (nq) at active coordinates q_a (n), by one step from the last ones.",
+    "gamma": "dq/dq_a (nq, n) at a closed configuration.",
+    "tip": "Position of the tip (3), its Jacobian (3, n) and its acceleration at a_a = 0 (3).",
+    "inverse_dynamics": "Active forces (n) at accelerations x (n), without friction.",
+    "inverse_dynamics_with_friction": "Active forces (n) at accelerations x (n).",
+    "forward_dynamics": "Accelerations (n) under active forces x (n), without friction.",
+    "forward_dynamics_with_friction": "Accelerations (n) under active forces x (n).",
+    "mass_matrix": "(n, n); v_a and x are not used, as for gravity and energy.",
+    "bias": "Forces (n) of inertia, gravity and springs at a_a = 0.",
+    "gravity": "Active forces (n) that hold the machine.",
+    "energy": "Kinetic and potential energy [J].",
+    "regressor": "(n, parameters): forces = regressor times inertial parameters, see the docs.",
+    "inverse_dynamics_derivatives": "By q_a, v_a and x, (3, n, n).",
+    "forward_dynamics_derivatives": "By q_a, v_a and x, (3, n, n).",
+}
+
+
+def c_identifier(name: str) -> str:
+    """A name as an identifier in C."""
+    found = re.sub(r"\W", "_", name, flags=re.ASCII)
+    return f"m_{found}" if not found or found[0].isdigit() else found
+
+
+def write_c(
+    machine: Machine | str | Path, folder: str | Path, *, name: str = "", overwrite: bool = True
+) -> Path:
+    """Write a machine as C99 sources, with a self-test, examples and a CMakeLists.txt.
+
+    They close the loops and compute the tip, inverse and forward dynamics, mass matrix, gravity,
+    regressor and derivatives, and integrate the machine with friction that sticks, end stops and
+    its hydraulic circuit, as `simulate` does. NAME.h explains the functions.
+
+    Args:
+        machine: The machine, or what `crane.load` takes.
+        folder: Folder of the files.
+        name: Prefix of all public names; that of the machine by default.
+        overwrite: Whether files of the same names are replaced.
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: See `InstanceProgram`.
+        OutputError: The folder cannot be written.
+    """
+    check_folder_is_writable(Path(folder), overwrite)
+    loaded = machine if isinstance(machine, Machine) else load(machine)
+    texts = CSources(InstanceProgram(loaded), name).files()
+    with replace_folder(folder, overwrite) as output_folder:
+        for file, text in texts.items():
+            (output_folder / file).write_text(text, encoding="utf-8")
+    return Path(folder)
+
+
+class CSources:
+    """The C sources of a machine.
+
+    Args:
+        program: The machine as a program.
+        name: Prefix of all public names; that of the machine by default.
+    """
+
+    def __init__(self, program: InstanceProgram, name: str = ""):
+        self._program, self.name = program, c_identifier(name or program.machine.name)
+        self._values = [
+            _number(x) if x == y else f"sizeof({self.name}_real) < 8 ? {_number(y)} : {_number(x)}"
+            for x, y in zip(program.defaults, program.single_precision_defaults, strict=True)
+        ]
+        self._loads = _instance_loads(program)
+
+    def files(self) -> dict[str, str]:
+        """Texts of all files by name."""
+        name = self.name
+        found = {
+            f"{name}.h": self.header(),
+            f"{name}.c": self.source(),
+            f"{name}_test.c": self.test(),
+        }
+        for template in _TEMPLATES:
+            found[template.replace("machine", name)] = self._fill(_template(template))
+        return found
+
+    def _fill(self, text: str, further: Mapping[str, str] = MappingProxyType({})) -> str:
+        """A template with the values of the machine in place of @VALUE@."""
+        machine, inputs = self._program.machine, _inputs_of(self._program)
+        values = {
+            "NAME": self.name, "UPPER": self.name.upper(), "MACHINE": machine.name,
+            "VERSION": crane.__version__, "NQ": str(machine.model.nv),
+            "N": str(len(machine.active)), "INPUT_COUNT": str(len(inputs)),
+            "FIRST_INPUT": self._members()[inputs[0]] if inputs else "time",
+            "OUTPUTS": str(sum(self._program.chart.output_layout.parts.values())), **further,
+        }  # fmt: skip
+        return re.sub(r"@([A-Z_]+)@", lambda match: values[match[1]], text)
+
+    def _members(self) -> dict[int, str]:
+        """Member of the struct for each element of an instance."""
+        found: dict[int, str] = {}
+        taken: set[str] = {*_ARRAYS}
+        for part, size in self._program.layout.parts.items():
+            start = self._program.layout.start_index(part)
+            for i in range(size):
+                if part in _ARRAYS:
+                    found[start + i] = f"{part}[{i}]"
+                    continue
+                name = c_identifier(self._program.names[start + i])
+                while name in taken:
+                    name += "_"
+                taken.add(name)
+                found[start + i] = name
+        return found
+
+    def _struct_lines(self) -> Iterator[tuple[str, str]]:
+        """Declaration of each member, and the initial values."""
+        members, layout = self._members(), self._program.layout
+        unused: list[int] = []
+
+        def padding() -> Iterator[tuple[str, str]]:
+            if unused:
+                values = ", ".join(self._values[i] for i in unused)
+                yield f"{self.name}_real unused_{unused[0]}[{len(unused)}];", f"{{{values}}}"
+                unused.clear()
+
+        for part, size in layout.parts.items():
+            start = layout.start_index(part)
+            if part in _ARRAYS:
+                yield from padding()
+                if size:
+                    values = ", ".join(self._values[start : start + size])
+                    yield f"{self.name}_real {part}[{size}];", f"{{{values}}}"
+                continue
+            for i in range(start, start + size):
+                if part in _PARAMETERS and i not in self._loads:
+                    unused.append(i)
+                    continue
+                yield from padding()
+                unit = self._program.units[i]
+                comment = f" /* {unit} */" if unit else ""
+                yield f"{self.name}_real {members[i]};{comment}", self._values[i]
+        yield from padding()
+
+    def header(self) -> str:
+        """The header."""
+        program, upper = self._program, self.name.upper()
+        machine, prototypes = program.machine, []
+        for entry, linked in program.entries.items():
+            operations, memory = _costs(linked)
+            cost = f"{operations} operations where nothing is repeated, arrays of {memory} bytes."
+            text = "\n * ".join([*_TEXTS[entry].split("\n"), cost])
+            prototypes.append(f"/* {text} */\n{self._prototype(entry, linked)};")
+        joints = ",\n    ".join(f"{upper}_{c_identifier(x).upper()}" for x in machine.joints)
+        values = {
+            "STATUSES": "\n".join(f" *  {code}: {text}" for code, text in STATUS_TEXTS.items()),
+            "ACTIVE": ", ".join(map(str, machine.closure.active.tolist())),
+            "JOINTS": joints,
+            "MEMBERS": _join([line for line, _ in self._struct_lines()]),
+            "PROTOTYPES": "\n".join(prototypes),
+        }
+        return self._fill(_template("machine.h"), values)
+
+    def _prototype(self, entry: str, linked: LinkedFunction) -> str:
+        real, parameters = f"{self.name}_real", c_parameters(linked).replace("real *", "@*")
+        instance = f"{'' if 'instance' in linked.written else 'const '}{self.name} *m"
+        rest = [x.replace("@*", f"{real} *") for x in parameters.split(", ")[1:]]
+        return f"int {self.name}_{entry}({', '.join([instance, *rest])})"
+
+    def source(self) -> str:
+        """The functions."""
+        wrappers = []
+        for entry, linked in self._program.entries.items():
+            kind = "real *" if "instance" in linked.written else "const real *"
+            arguments = ", ".join([f"({kind})m", *linked.arguments[1:]])
+            call = f"return {linked.name}({arguments});"
+            wrappers.append(f"{self._prototype(entry, linked)}\n{{\n    {call}\n}}\n")
+        values = {
+            "FUNCTIONS": "\n".join([C_PRELUDE, *map(emit_c_function, self._program.functions)]),
+            "DEFAULTS": _join([f"{value}," for _, value in self._struct_lines()]),
+            "WRAPPERS": "\n".join(wrappers),
+        }
+        return self._fill(_template("machine.c"), values)
+
+    def test(self) -> str:
+        """A program that compares the functions with recorded values of crane."""
+        program, name = self._program, self.name
+        vectors, motion = random_vectors(program), recorded_motion(program)
+        sizes = {key: rows[0].size for key, rows in vectors.items()}
+        checks = []
+        for key in (x for x in vectors if x in DYNAMICS_ROUTINES):
+            arguments = f'"{key}", found, {key}[i], {sizes[key]}'
+            checks += [f"{name}_{key}(&m, q, v, x, found);", f"compare({arguments});"]
+        inputs = _inputs_of(program)
+        set_inputs = f"for (j = 0; j < {len(inputs)}; ++j)\n            " + (
+            f"(&m.{self._members()[inputs[0]]})[j] = ({name}_real)inputs[i][j];" if inputs else ";"
+        )
+        tables = {**vectors, "inputs": motion.inputs, "motion": motion.q}
+        values = {
+            "TABLES": "\n".join(_table(key, np.array(rows)) for key, rows in tables.items()),
+            "STATES": str(len(vectors["second"])), "STEPS": str(len(motion.q)),
+            "STEP": repr(motion.step), "LARGEST": str(max(sizes.values())),
+            "CHECKS": "\n        ".join(checks), "SET_INPUTS": set_inputs,
+        }  # fmt: skip
+        return self._fill(_template("self_test.c"), values)
+
+
+def _join(lines: list[str]) -> str:
+    return "\n    ".join(lines)
+
+
+def _number(value: float) -> str:
+    if np.isposinf(value):
+        return "1e300"
+    return repr(float(value))
+
+
+def _inputs_of(program: InstanceProgram) -> range:
+    start = program.layout.start_index("inputs")
+    return range(start, start + program.layout.parts["inputs"])
+
+
+def _instance_loads(program: InstanceProgram) -> frozenset[int]:
+    """Elements of an instance that formulas read."""
+    entries = program.entries.values()
+    return frozenset().union(*(x.loads.get("instance", frozenset()) for x in entries))
+
+
+def _costs(linked: LinkedFunction) -> tuple[int, int]:
+    """Operations of all formulas that are called, each once, and bytes of arrays on the stack."""
+    seen: dict[str, int] = {}
+
+    def memory(function: LinkedFunction) -> int:
+        if isinstance(function.function, Formula):
+            seen[function.name] = len(_operations(function.function))
+            return 0
+        own = 8 * sum(function.function.local_arrays.values())
+        return own + max((memory(x) for x in function.callees.values()), default=0)
+
+    size = memory(linked)
+    return sum(seen.values()), size
+
+
+def _operations(formula: Formula) -> list[int]:
+    tapes = [x.tape for x in formula.outputs if isinstance(x, SymbolicExpression)]
+    required = required_operations(formula.outputs)
+    return [i for i in required if tapes[0].operations[i][0] != "load"]
+
+
+def _template(name: str) -> str:
+    folder = files("crane.export") / "templates"
+    return (folder / f"{name}.template").read_text(encoding="utf-8")
+
+
+def _table(name: str, rows: Array) -> str:
+    """A constant table; of one number where it would be empty."""
+    flat = rows.reshape(len(rows), -1) if rows.size else np.zeros((1, 1))
+    lines = ["{" + ", ".join(_number(x) for x in row) + "}" for row in flat.tolist()]
+    body = ",\n    ".join(lines)
+    return f"static const double {name}[{flat.shape[0]}][{flat.shape[1]}] = {{\n    {body}}};"

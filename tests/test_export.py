@@ -1,0 +1,177 @@
+"""Machines as programs outside of Python: C by compilers that are here."""
+
+import ctypes
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from command_line import typed
+from warned import quiet
+
+import crane
+from crane.common.errors import InputError
+from crane.export import InstanceProgram, write_c
+from crane.export.c_sources import CSources
+
+COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
+STRICT = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic"]
+EVERY_MACHINE = (
+    "excavator", "excavator_ls", "excavator_two_pumps", "kr300", "mini_forwarder", "patu655",
+    "patu655_grapple", "patu655_ls", "tx40",
+)  # fmt: skip
+needs_compiler = pytest.mark.skipif(not COMPILERS, reason="no C compiler is here")
+
+
+def compiled(folder, name, *flags, compiler=None):
+    """The self-test of the sources in a folder as an executable, by strict rules."""
+    command = [compiler or COMPILERS[0], *STRICT, *flags, f"{name}.c", f"{name}_test.c"]
+    subprocess.run([*command, "-o", "self_test", "-lm"], cwd=folder, check=True, timeout=300)
+    return folder / "self_test"
+
+
+def run(path, *before):
+    done = subprocess.run([*before, path], capture_output=True, text=True, timeout=300)
+    return done.returncode, done.stdout + done.stderr
+
+
+class Library:
+    """The functions of a machine in C, and an instance as numpy arrays by part."""
+
+    def __init__(self, machine, folder, *flags):
+        self.program = InstanceProgram(machine)
+        texts = CSources(self.program, "m").files()
+        for name in ("m.h", "m.c"):
+            (folder / name).write_text(texts[name])
+        command = [COMPILERS[0], *STRICT, *(flags or ("-O1",)), "-shared", "-fPIC", "m.c", "-lm"]
+        subprocess.run([*command, "-o", "m.so"], cwd=folder, check=True, timeout=300)
+        self._library = ctypes.CDLL(str(folder / "m.so"))
+        self.instance = self.program.defaults.copy()
+        self.at = self.program.layout.view(self.instance)
+
+    def __call__(self, name, *arrays):
+        pointers = [x.ctypes.data_as(ctypes.c_void_p) for x in (self.instance, *arrays)]
+        return getattr(self._library, f"m_{name}")(*pointers)
+
+
+def signals(program, times):
+    """Signals that open and reverse all valves, one after another."""
+    start = program.layout.view(program.defaults).inputs
+    found = {}
+    for i, (name, spool) in enumerate(program.control.circuit.hydraulics.spools.items()):
+        stroke = 0.25 * (spool.full - spool.neutral) * np.sin(3 * times + i)
+        found[name] = start[i] + stroke * (times > 0.1)
+    return found
+
+
+def largest_difference(machine, folder, steps=150, step=0.01):
+    """Of the active coordinates in C and by `simulate`, over their motion; transitions."""
+    library = Library(machine, folder)
+    program, times = library.program, step * np.arange(steps + 1)
+    moved = signals(program, times)
+    command = crane.control.ValveSignals(machine, times, moved)
+    expected = quiet(crane.simulate, machine, command, duration=times[-1], step=step)
+    library.at.step[:] = step
+    library.at.inputs[: len(moved)] = [x[0] for x in moved.values()]
+    assert library("initialize") == 1
+    worst = 0.0
+    for i in range(steps):
+        library.at.inputs[: len(moved)] = [x[i + 1] for x in moved.values()]
+        assert library("advance") == 1
+        q_a = library.at.q[machine.closure.active]
+        worst = max(worst, np.abs(q_a - expected.q[i + 1]).max())
+    assert library.at.time[0] == pytest.approx(times[-1], rel=1e-12)
+    return worst / np.ptp(expected.q, axis=0).max(), expected
+
+
+@needs_compiler
+def test_sources_compile_without_warnings_and_their_self_test_passes(tmp_path):
+    typed("export", "mini_forwarder", "--out", str(tmp_path / "c"), "--name", "crane 1")
+    status, output = run(compiled(tmp_path / "c", "crane_1", "-O0"))
+    assert status == 0
+    assert "motion: status 1" in output
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_a_motion_with_joints_that_stick_is_that_of_simulate(tmp_path):
+    machine = crane.load("patu655")
+    difference, expected = largest_difference(machine, tmp_path)
+    assert difference < 1e-12
+    stick = np.array([x for name, x in expected.channels.items() if name.startswith("rest_")])
+    assert 0 < np.count_nonzero(stick) < stick.size
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EVERY_MACHINE)
+def test_quantities_at_random_states_are_those_of_the_library(tmp_path, name):
+    machine = crane.load(name)
+    library, dynamics = Library(machine, tmp_path, "-O0"), crane.Dynamics(machine)
+    random, n = np.random.default_rng(2), len(machine.active)
+    home, units = (
+        machine.home[machine.closure.active],
+        machine.closure.units[machine.closure.active],
+    )
+    path = 0.05 * units * np.sin(0.05 * np.arange(1000)[:, None] * random.uniform(0.5, 1.5, n))
+    configurations = machine.closure.solve(home + path)
+    worst = 0.0
+    for q in configurations:
+        v, x = random.normal(size=(2, n))
+        for routine, quantity in (
+            ("inverse_dynamics", "inverse"),
+            ("forward_dynamics", "forward"),
+            ("mass_matrix", "mass matrix"),
+        ):
+            expected = dynamics.evaluate_closed(quantity, q, v, x)
+            found = np.empty_like(expected)
+            assert library(routine, q, v, x, found) == 1
+            worst = max(worst, np.abs(found - expected).max() / np.abs(expected).max())
+        closed = q.copy()
+        closed[machine.closure.passive] += 1e-3 * units.min()
+        assert library("close_loops", closed) == 1
+        assert np.abs((closed - q) / machine.closure.units).max() < 1e-13
+    assert worst < 2e-13
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_tools_find_no_error_in_memory_or_arithmetic(tmp_path):
+    write_c(crane.load("patu655"), tmp_path, name="m")
+    for compiler in COMPILERS:
+        flags = "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"
+        status, output = run(compiled(tmp_path, "m", *flags, compiler=compiler))
+        assert status == 0, output
+    if shutil.which("valgrind"):
+        checked = compiled(tmp_path, "m", "-O1")
+        status, output = run(checked, "valgrind", "--error-exitcode=9")
+        assert status == 0, output
+        assert "total heap usage: 1 allocs" in output  # the buffer of printf
+
+
+@needs_compiler
+def test_single_precision_keeps_its_digits(tmp_path):
+    write_c(crane.load("kr300"), tmp_path, name="m")
+    flags = "-O0", "-Dm_real=float", "-DTOLERANCE=1e-3", "-DMOTION_TOLERANCE=1e300"
+    status, output = run(compiled(tmp_path, "m", *flags))
+    assert status == 0
+    difference = float(re.search(r"dynamics: largest relative difference (\S+),", output)[1])
+    assert 1e-9 < difference < 1e-3
+
+
+def test_parameters_have_names_and_change_the_motion():
+    program = InstanceProgram(crane.load("mini_forwarder"), quantities=("gravity",))
+    assert len({*program.names}) == len(program.names) == program.layout.size
+    mass = program.defaults[program.names.index("q2_mass")]
+    expected = program.machine.model.inertias[program.machine.model.getJointId("q2")].mass
+    assert mass == expected
+    header = CSources(program).header()
+    assert "mini_forwarder_real q2_mass; /* kg */" in header
+
+
+def test_a_load_that_is_a_function_in_python_is_refused():
+    machine = crane.load("mini_forwarder")
+    load = crane.description.WrenchFunction(machine.tip, lambda *motion: np.zeros(6))
+    with pytest.raises(InputError, match="is a function in Python"):
+        InstanceProgram(machine.with_external_forces(load))
