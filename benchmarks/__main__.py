@@ -12,9 +12,10 @@ import json
 import warnings
 from pathlib import Path
 
+import drives
 import forward_dynamics
-import hydraulic_crane
 import report
+import valve_crane
 from problem import Problem, problems
 from reference import write_reference
 from trajectories import Point, available_engines, measure
@@ -51,7 +52,9 @@ def main() -> None:
     parts += report.work_precision_tables(chosen, points)
     results = []
     if not options.only:
-        parts += ["#### Two arms on cylinders", report.hydraulics_table(hydraulic_crane.measure())]
+        parts += ["### Hydraulics, friction and stops"]
+        parts += drives.tables(drives.measure(options.quick))
+        parts += valve_crane.tables(valve_crane.measure(options.quick))
         results = run_forward_dynamics(options.quick)
         parts += ["### Forward dynamics of all engines", report.forward_dynamics_table(results)]
     print("\n\n".join(parts[1:]))

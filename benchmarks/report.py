@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import hydraulic_crane
 import matplotlib as mpl
 from engines import ENGINES
 from matplotlib.figure import Figure
@@ -157,18 +156,6 @@ def forward_dynamics_table(results: Sequence[dict[str, Any]]) -> str:
             *(f"{1e6 * times[name]:.2f}" if name in times else "-" for name in CALLS), *ratios,
             *(f"{found[key]:.2f}" for key in ("load", "first", "cached")),
         ])  # fmt: skip
-    return table(head, rows)
-
-
-def hydraulics_table(runs: Sequence[hydraulic_crane.Run]) -> str:
-    """Errors and times of the hydraulic crane."""
-    head = ["engine", "step [s] or tolerance", "error of the strokes [m]", "time [ms]",
-            "times real time"]  # fmt: skip
-    rows = [
-        [run.engine, f"{run.setting:g}", f"{run.error:.1e}", f"{1e3 * run.time:.3g}",
-         f"{hydraulic_crane.DURATION / run.time:.0f}"]
-        for run in runs
-    ]  # fmt: skip
     return table(head, rows)
 
 

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import forward_dynamics
-import hydraulic_crane
 import inverse_dynamics
 import numpy as np
 import pinocchio as pin
@@ -187,13 +186,3 @@ def test_names_of_engines_and_problems_are_unique():
     assert len({engine.name for engine in ENGINES}) == len(ENGINES)
     assert len(PROBLEMS) + len(missing_problems()) == len(list(FOLDER.glob("*.yaml")))
     assert all(isinstance(problem, Problem) and problem.source for problem in PROBLEMS.values())
-
-
-@pytest.mark.slow
-def test_the_two_arm_crane_follows_equations_by_hand():
-    machine, state = quiet(hydraulic_crane.start)
-    assert (state[4:] > 0.99e5).all()
-    found = quiet(hydraulic_crane.simulate_crane, machine, 1e-8)
-    strokes = found.q[1:]
-    assert np.ptp(strokes, axis=0).min() > 0.01
-    np.testing.assert_allclose(strokes, hydraulic_crane.reference(), rtol=0, atol=2e-9)

@@ -20,6 +20,7 @@ from crane.control.valve_commands import (
 from crane.hydraulics.circuit_equations import CircuitEquations, CircuitValues
 from crane.machine.machine import Machine
 
+_VOID_UNIT = 1e7  # unit of the distances from a void [Pa]
 _SAMPLING_PERIOD = 1e-3  # sampling period of a law with delayed valves [s]
 # states of the circuit that are recorded: compressions of springs, oil in accumulators
 _RECORDED_STATE_PREFIXES = ("spring_", "oil_")
@@ -196,6 +197,21 @@ class ValveDrive(ControlLaw):
         circuit_values, _ = self._evaluate_circuit(inputs)
         friction = zip(self.circuit.joints, circuit_values.circuit_friction, strict=True)
         return [force for joint, force in friction if joint in friction_joints]
+
+    def void_distances(self, inputs: ControllerInputs) -> list[Scalar]:
+        """States of the pressures [`_VOID_UNIT`] that turn negative where a void forms.
+
+        The compliance of these chambers jumps there; that of a floating chamber does not.
+        """
+        rigid_valves = zip(
+            self.circuit.cylinder_state_starts, self.circuit.cylinders_and_valves, strict=True
+        )
+        return [
+            inputs.state[start + side] * (1.0 / _VOID_UNIT)
+            for start, (_, valve, _) in rigid_valves
+            for side in range(2)
+            if not valve.float_from > 0
+        ]
 
     def channel_values(self, inputs: ControllerInputs) -> list[Scalar]:
         """Values of `channels`."""

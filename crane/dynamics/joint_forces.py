@@ -174,9 +174,8 @@ class JointForces:
             is_moving: Whether anything moves.
         """
         self.moving_factor = float(is_moving)
-        self.table[list(self.stick_slip_columns), _MODE_FIELDS] = np.column_stack(
-            [slip_sign, is_held, inverse_velocity]
-        )
+        modes = np.array([slip_sign, is_held, inverse_velocity]).T
+        self.table[list(self.stick_slip_columns), _MODE_FIELDS] = modes
 
     def set_circuit_friction(self, circuit_friction: Array) -> None:
         """Set the circuit friction (g,) of the joints of `circuit_friction_columns`."""

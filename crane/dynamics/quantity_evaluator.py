@@ -263,8 +263,9 @@ class QuantityEvaluator(OneLineRepr):
         They only affect the quantities of the integration, `STICK_SLIP_QUANTITIES`.
         """
         self.forces.set_stick_slip_modes(slip_sign, is_held, inverse_velocity, is_moving)
-        modes = np.column_stack([slip_sign, is_held, inverse_velocity])
-        self.formula_constants[self._mode_indices] = [*modes.ravel(), is_moving]
+        modes = np.array([slip_sign, is_held, inverse_velocity]).T.ravel()
+        self.formula_constants[self._mode_indices[:-1]] = modes
+        self.formula_constants[self._mode_indices[-1]] = is_moving
 
     def set_circuit_friction(self, circuit_friction: Array) -> None:
         """Set the circuit friction; see `JointForces.set_circuit_friction`.

@@ -212,6 +212,8 @@ class ErrorControlledStepper(MachineCodeStepper):
             event_distances += scale_vector(
                 1.0 / closure.characteristic_length, machine.external_forces.event_distances
             )
+            if isinstance(self._control, ValveDrive):
+                event_distances += self._control.void_distances(machine.inputs)
             program.add_formula(
                 "rate" + suffix,
                 5,

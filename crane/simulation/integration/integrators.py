@@ -175,11 +175,10 @@ class StickSlipIntegrator(ABC):
         if self._compiled_method is None:
             self.python_stepper.find_modes(time, state)
         else:
-            self._compiled_method.adopt_modes()
             self.python_stepper.find_modes(
                 time, state, self._compiled_method.observe(time, state)[0]
             )
-            self._compiled_method.adopt_modes()
+            self._compiled_method.note_joints_at_rest()
         self._stick_slip.record_transition(time, state)
 
     def _count_transition(self, time: float, state: Array, step: float) -> None:

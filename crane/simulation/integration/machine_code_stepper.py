@@ -125,7 +125,11 @@ class MachineCodeStepper:
         """Adopt the stick-slip modes of the chart."""
         if self.has_stick_slip:
             self._chart.stick_slip.apply_to(self._chart.dynamics)
-            self.bounds[HELD_INDEX] = self._chart.stick_slip.is_held.any()
+            self.note_joints_at_rest()
+
+    def note_joints_at_rest(self) -> None:
+        """Note whether joints are held at rest, in the modes that the dynamics have already."""
+        self.bounds[HELD_INDEX] = self._chart.stick_slip.is_held.any()
 
     @property
     def _rest_variants(self) -> tuple[tuple[str, bool], ...]:

@@ -31,8 +31,11 @@ AT_REST_SUFFIX = "_rest"  # of formulas for machines with joints at rest
 
 def reference_samples(machine: Machine, control: ControlLaw, times: Array) -> Array:
     """References (N, c), which depend on time alone: of the controller, then of loads."""
-    external_samples = external_forces.reference_samples(machine.external_forces, times)
-    return np.ascontiguousarray(np.hstack([control.references(times), external_samples]))
+    samples = control.references(times)
+    if machine.external_forces:
+        external_samples = external_forces.reference_samples(machine.external_forces, times)
+        samples = np.hstack([samples, external_samples])
+    return np.ascontiguousarray(samples)
 
 
 def reference_count(control: ControlLaw) -> int:

@@ -13,8 +13,10 @@ from crane.simulation.integration.stick_slip_modes import EVENT_TOLERANCE
 MIN_STEP_RATIO = 0.2  # least ratio of a step size to the one before
 _MIN_CLOSABLE_MOVE = 0.02  # displacement in coordinate units up to which the loops have to close
 _MIN_STEP_SHARE = 1e-9  # least step size, as a share of the output interval
+_MAX_JUMP_SHARE = 1e-6  # step size from which on rejected steps are searched for jumps, likewise
+_MAX_JUMP_ERROR = 1e9  # largest error of a step over a located jump, over its tolerance
 _MIN_TRIAL_SHARE = 0.02  # least share of a step that is tried to locate an event
-_SECANT_TRIALS = 8  # trials before bisection
+_SECANT_TRIALS = 24  # trials of the Illinois method before bisection
 _END_SHARE = 1.0 - 2.0**-41  # share of the remaining time from which a step ends at its goal
 
 StepWriter = Callable[[RoutineValue, RoutineValue], None]
@@ -28,8 +30,10 @@ class StepLoop:
     the first output instant before, and to the next one behind; spacing of references; end;
     most steps, rejected ones included; whether a stick-slip transition is there.
 
-    A step that passes an event is rejected. The secant method locates the event; steps that end
-    before it are accepted.
+    A step that passes an event is rejected. The Illinois method locates the event (a secant method
+    that halves the margin of an end that stays); steps that end before it are accepted. Where
+    rates jump, as where a void forms, no step over the event meets its tolerance: it is located by
+    the rejected steps, and passed by one of a billionth of the output interval.
 
     Args:
         stepper: The method with its machine and controller.
@@ -104,6 +108,7 @@ class StepLoop:
         self.call("rate", self._time, r.state, self.start_rate)
         # event location: time to the event, and margins before and behind it
         self._time_to_event, self._trial_count = r.new_variable(0.0), r.new_variable(0)
+        self._last_trial = r.new_variable(0)  # 1 beyond the event, -1 before it
         self._margin_before, self._margin_behind = r.new_variable(1.0), r.new_variable(0.0)
         self._event_signs = r.local_array("event_signs", max(1, self._event_distance_count))
         self._signed_distance = r.local_array("least_distance", 1)
@@ -141,16 +146,33 @@ class StepLoop:
         change = self.step_result["change"]
         # NaN: slower
         next_length = r.new_variable(length * select(change > 0.0, change, MIN_STEP_RATIO))
-        with r.if_then(self.step_result["error"] <= 1.0):
+        error = self.step_result["error"]
+        # no step over a jump is short enough for its tolerance
+        with r.if_then((error <= 1.0) | ((self._is_located > 0) & (error < _MAX_JUMP_ERROR))):
             with r.if_then(self._close_loops(self.step_result, self._closure_result) < 1):
                 # a shorter step, which comes nearer to the end of a branch
                 r.store(r.h, 1, length * MIN_STEP_RATIO)
                 with r.if_then(self.step_result["move"] < _MIN_CLOSABLE_MOVE):
                     self._write_return()
             with r.if_else():
+                # behind a jump the error of the step over it says nothing
+                restart = r.new_variable(self._output_interval * _MAX_JUMP_SHARE)
+                is_short = (self._is_located > 0) & (next_length < restart)
+                r.assign(next_length, select(is_short, restart, next_length))
                 self._finish_step(next_length)
         with r.if_else():
             r.store(r.h, 1, next_length)
+            if self._event_distance_count:
+                self._detect_jump()
+
+    def _detect_jump(self) -> None:
+        """Detect an event at which rates jump, in a step that has become short for that."""
+        r, size = self.routine, self._step_size
+        with r.if_then(size < self._output_interval * _MAX_JUMP_SHARE):
+            self.call("rate", self._time + size, self.step_result, self.end_rate)
+            r.call("least_distance", self.end_rate, self._event_signs, self._signed_distance)
+            with r.if_then(self._signed_distance[0] < -2.0 * EVENT_TOLERANCE):
+                self._bring_nearer(size, r.new_variable(self._signed_distance[0]))
 
     def _close_loops(self, state: ArrayPointer, result: ArrayPointer) -> RoutineValue:
         """Close the loops of a state; returns 1 if they close."""
@@ -186,7 +208,7 @@ class StepLoop:
             self._write_return()
 
     def _locate_event(self, time_left: RoutineValue) -> None:
-        """Shorten the remaining time to where the secant method expects the event."""
+        """Shorten the remaining time to where the Illinois method expects the event."""
         r, time_to_event = self.routine, self._time_to_event
         share = r.new_variable(
             (self._margin_before + 1.5 * EVENT_TOLERANCE)
@@ -231,8 +253,16 @@ class StepLoop:
             with r.if_then((least_margin < -2.0 * EVENT_TOLERANCE) & (self._is_located < 1)):
                 r.assign(is_beyond_event, 1)
                 r.assign(event, 0)
-                r.assign(self._time_to_event, self._step_size)
-                r.assign(self._margin_behind, least_margin)
+                self._bring_nearer(self._step_size, least_margin)
+
+    def _bring_nearer(self, time_to_event: RoutineValue, margin: RoutineValue) -> None:
+        """Note a step beyond the event: its size and margin."""
+        r = self.routine
+        halved = r.new_variable(self._margin_before * 0.5)
+        r.assign(self._margin_before, select(self._last_trial > 0, halved, self._margin_before))
+        r.assign(self._time_to_event, time_to_event)
+        r.assign(self._margin_behind, margin)
+        r.assign(self._last_trial, 1)
 
     def _record_outputs(self, is_beyond_event: RoutineValue, event: RoutineValue) -> None:
         """Write the rows of the output instants within the step."""
@@ -258,8 +288,7 @@ class StepLoop:
                     (margin < -2.0 * EVENT_TOLERANCE) & (output_time > self._time) & (event < 1)
                 ):
                     r.assign(is_beyond_event, 1)
-                    r.assign(self._time_to_event, output_time - self._time)
-                    r.assign(self._margin_behind, margin)
+                    self._bring_nearer(output_time - self._time, margin)
                     r.assign(self._recorded_count, count)
                     r.assign(output_time, first_time)
                     r.break_loop()
@@ -289,6 +318,9 @@ class StepLoop:
             self._write_return()
         r.assign(time_to_event, select(time_to_event > 0.0, time_to_event - length, 0.0))
         self._update_margin_before(self.end_rate)
+        retained = select(self._last_trial < 0, 0.5, 1.0)
+        r.assign(self._margin_behind, self._margin_behind * retained)
+        r.assign(self._last_trial, -1)
         if self._event_distance_count:
             with r.if_then(least_margin < -EVENT_TOLERANCE):  # a passed event distance
                 r.assign(time_to_event, 0.0)

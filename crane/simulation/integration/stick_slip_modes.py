@@ -81,6 +81,8 @@ class StickSlipModes:
         self._inverse_velocities = (
             machine.closure.characteristic_time / machine.closure.units[self.columns]
         )
+        # (k, n) which active coordinate each of them is
+        self._is_active = np.equal.outer(self.columns, machine.closure.active)
         self.slip_signs = np.zeros(len(columns))
         self.is_held = np.zeros(len(columns), dtype=bool)
         self.is_moving, self.has_modes, self.is_undetermined = True, False, False
@@ -137,12 +139,12 @@ class StickSlipModes:
         v = rows @ v_a
         resting: Indices = np.flatnonzero(np.abs(v) * self._inverse_velocities <= REST_VELOCITY)
         try:
-            cholesky_factor = np.linalg.cholesky(mass).astype(np.float64)
+            whitening = np.linalg.inv(np.linalg.cholesky(mass)).astype(np.float64)
         except np.linalg.LinAlgError as error:
             raise dynamics.singular_mass_error(q) or error from None
         if len(resting) and v_a.any():
             v_a = self._remove_resting_velocities(
-                closure, cholesky_factor, resting, rows[resting], v[resting], v_a
+                closure, mass, whitening, resting, rows[resting], v[resting], v_a
             )
             v = rows @ v_a
         self.slip_signs[:] = np.sign(v)
@@ -152,11 +154,12 @@ class StickSlipModes:
         if not len(resting):
             return v_a
         parts = dynamics.evaluate_closed("resting", q, v_a, tau)
-        drift, net_force = parts[n * (n + k) : -n], np.linalg.solve(cholesky_factor, parts[-n:])
+        drift, net_force = parts[n * (n + k) : -n][resting], whitening @ parts[-n:]
         limits = dynamics.forces.breakaway[resting]
-        holding_forces = np.linalg.solve(cholesky_factor, rows[resting].T) * limits
-        drift_term = np.linalg.lstsq(holding_forces.T, limits * drift[resting], rcond=None)[0]
-        limit_shares = _bounded_least_squares(holding_forces, net_force + drift_term)
+        holding_forces = whitening @ rows[resting].T * limits
+        if drift.any():
+            net_force += np.linalg.lstsq(holding_forces.T, limits * drift, rcond=None)[0]
+        limit_shares = _bounded_least_squares(holding_forces, net_force)
         below_limit = np.flatnonzero(np.abs(limit_shares) < MAX_LIMIT_SHARE)
         independent, rank = _independent_columns(
             holding_forces[:, below_limit] * (1.0 - np.abs(limit_shares[below_limit]))
@@ -174,7 +177,8 @@ class StickSlipModes:
     def _remove_resting_velocities(
         self,
         closure: Closure,
-        cholesky_factor: Array,
+        mass: Array,
+        whitening: Array,
         candidates: Indices,
         rows: Array,
         v: Array,
@@ -182,30 +186,32 @@ class StickSlipModes:
     ) -> Array:
         """Velocities after joints at rest are stopped by least impulses.
 
-        A joint at a reversal while others move is not at rest.
+        A joint at a reversal while others move is not at rest. `whitening` is C^-1 of M = C C^T.
         """
-        impulse_directions = np.linalg.solve(cholesky_factor, rows.T)
-        momentum = cholesky_factor.T @ v_a
+        impulse_directions = whitening @ rows.T
         rates = closure.characteristic_time / closure.units[closure.active]
         sizes = np.maximum((impulse_directions**2).sum(0), 1e-300)
-        velocity_changes = (
-            np.linalg.solve(cholesky_factor.T, impulse_directions * (v / sizes)) * rates[:, None]
-        )
+        velocity_changes = whitening.T @ (impulse_directions * (v / sizes)) * rates[:, None]
         is_resting = np.abs(velocity_changes).max(0) <= MAX_VELOCITY_CHANGE
         candidates, impulse_directions = candidates[is_resting], impulse_directions[:, is_resting]
         if not len(candidates):
             return v_a
-        basis, values, _ = np.linalg.svd(impulse_directions, full_matrices=False)
-        basis = basis[:, values > RANK_TOLERANCE * values[0]]
+        basis = impulse_directions / np.sqrt(sizes[is_resting])
+        if len(candidates) > 1:
+            basis, values, _ = np.linalg.svd(impulse_directions, full_matrices=False)
+            basis = basis[:, values > RANK_TOLERANCE * values[0]]
         out = np.zeros_like(v_a)
         if basis.shape[1] < len(v_a):
-            out[:] = np.linalg.solve(cholesky_factor.T, momentum - basis @ (basis.T @ momentum))
-        out[np.isin(closure.active, np.array(self.columns)[candidates])] = 0.0
+            momentum = whitening @ (mass @ v_a)  # C^T v
+            out[:] = whitening.T @ (momentum - basis @ (basis.T @ momentum))
+        out[self._is_active[candidates].any(axis=0)] = 0.0
         return out if np.abs((out - v_a) * rates).max() <= MAX_VELOCITY_CHANGE else v_a
 
 
 def _bounded_least_squares(matrix: Array, right_side: Array) -> Array:
     """The x (k,) within -1 and 1 of least |right_side - matrix x|, and of these the smallest."""
+    if matrix.shape[1] == 1:  # the usual case, one joint comes to rest
+        return np.clip(matrix.T @ right_side / max((matrix**2).sum(), 1e-300), -1.0, 1.0)
     shares, _, rank, _ = np.linalg.lstsq(matrix, right_side, rcond=None)
     is_bounded = np.abs(shares) > 1.0
     if not is_bounded.any():
@@ -233,6 +239,8 @@ def _independent_columns(columns: Array) -> tuple[Indices, int]:
     count = columns.shape[1]
     column_norms = np.linalg.norm(columns, axis=0)
     # the distance of a unit column from the span of others is at least the singular value
+    if count == 1 and column_norms.all():
+        return np.arange(1), 1
     if count <= len(columns) and column_norms.all():
         least_singular_value = np.linalg.svd(columns / column_norms, compute_uv=False).min(
             initial=1.0
