@@ -6,7 +6,8 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -18,7 +19,7 @@ from problem import Problem, problems
 import crane
 
 MARK = "point "  # before the lines of a point, beside what engines print
-ROUNDS = 3  # runs of a setting, whose median counts
+ROUNDS = 3  # runs of a setting, whose median counts; fewer where they take long
 LONGEST_RUN = 1.0  # CPU time [s] after which finer settings are left out
 
 
@@ -71,27 +72,32 @@ def main() -> None:
     problem, name = problems([sys.argv[1]])[0], sys.argv[2]
     engine = next(engine for engine in ENGINES if engine.name == name)
     warnings.simplefilter("ignore", crane.CraneWarning)
+    spent = 0.0
     for setting in engine.settings(problem):
+        start = time.process_time()
         point = measure_setting(problem, engine, setting)
         print(MARK + json.dumps(point.as_json()), flush=True)
-        if point.time > LONGEST_RUN and not point.failure:
+        spent += time.process_time() - start - np.nan_to_num(point.build)
+        long = LONGEST_RUN < point.time < np.inf
+        if (spent > engine.budget) if engine.budget else long:
             break
 
 
 def measure_setting(problem: Problem, engine: Engine, setting: Any) -> Point:
     """The point of one setting."""
-    text = " ".join(f"{x:g}" for x in np.atleast_1d(setting))
-    found = {"problem": problem.name, "engine": engine.name, "setting": text}
+    values = setting if isinstance(setting, tuple) else (setting,)
+    text = " ".join(x if isinstance(x, str) else f"{x:g}" for x in values)
+    found: dict[str, Any] = {"problem": problem.name, "engine": engine.name, "setting": text}
     start = time.process_time()
     try:
         simulator = engine.build(problem, setting)
-        built = time.process_time() - start
+        found["build"] = time.process_time() - start
         times, result = [], None
         for _ in range(ROUNDS):
             start = time.process_time()
             result = simulator.run()
             times.append(time.process_time() - start)
-            if times[-1] > LONGEST_RUN:
+            if sum(times) > LONGEST_RUN / 2:
                 break
         states = simulator.states(result)
     except UnsupportedError as error:
@@ -115,8 +121,19 @@ def measure_setting(problem: Problem, engine: Engine, setting: Any) -> Point:
         time=statistics.median(times),
         loop_error=max(system.loop_error(state) for state in states),
         energy_drift=drift,
-        build=built,
     )
+
+
+def failures(points: Sequence[Point]) -> list[str]:
+    """A line for each engine of which settings failed, with the most frequent cause."""
+    lines = []
+    for name in dict.fromkeys(point.engine for point in points):
+        own = [point for point in points if point.engine == name]
+        causes = Counter(point.failure for point in own if point.failure)
+        if causes:
+            cause, _ = causes.most_common(1)[0]
+            lines.append(f"{name}: {causes.total()} of {len(own)} settings fail, most: {cause}")
+    return lines
 
 
 def time_at_error(points: Iterable[Point], error: float) -> float | None:

@@ -7,14 +7,21 @@ import inverse_dynamics
 import numpy as np
 import pinocchio as pin
 import pytest
+from dense_equations import exact_forward
 from engines import ENGINES
 from engines.crane_engine import Crane, CraneSimulator
+from engines.drake_engine import Drake
+from engines.exudyn_engine import Exudyn
+from engines.exudyn_tree_engine import ExudynTree
 from engines.mujoco_engine import MuJoCo
-from engines.pinocchio_engine import Pinocchio
+from engines.mujoco_warp_engine import MuJoCoWarp
+from engines.newton_engine import Newton
+from engines.pinocchio_admm_engine import AdmmForward
+from engines.pinocchio_engine import Pinocchio, largest_difference, sample_states
 from multibody import Multibody
 from problem import FOLDER, Problem, load_machine, machine_file, missing_problems, problems
 from reference import crane_positions, independent_positions
-from trajectories import Point, measure_setting, time_at_error
+from trajectories import Point, failures, measure_setting, time_at_error
 from warned import quiet
 
 import crane
@@ -72,6 +79,18 @@ def test_references_by_two_ways(name, error):
         (Pinocchio("lcaba"), (5e-3, 0.0), 1e-5),
         (Pinocchio("constraintDynamics"), (1e-3, 0.0), 1e-4),
         (MuJoCo("RK4"), (1e-3, 0.45, 0.9999), 1e-5),
+        (Exudyn("GeneralizedAlpha"), (5e-3, 1e-8, "EigenSparse"), 2e-4),
+        (Exudyn("TrapezoidalIndex2"), (5e-3, 1e-8, "EigenSparse"), 2e-4),
+        (ExudynTree("GeneralizedAlpha"), (5e-3, 1e-8, "EigenSparse"), 2e-4),
+        (Drake(), 5e-3, 2e-3),
+        *(
+            pytest.param(*case, marks=pytest.mark.long)  # a minute of compilation each
+            for case in (
+                (MuJoCoWarp(), (1e-2, 0.45, 0.9999), 2e-3),
+                (Newton("Kamino"), (1e-2, 0.01), 2e-2),
+            )
+        ),
+        pytest.param(Crane("DOP853", "pinocchio"), 1e-6, 2e-6, marks=pytest.mark.slow),
     ],
     ids=lambda value: getattr(value, "name", ""),
 )
@@ -81,6 +100,19 @@ def test_engines_move_the_mini_forwarder_alike(engine, setting, error):
     point = measure_setting(PROBLEMS["mini_forwarder"], engine, setting)
     assert not point.failure and point.error < error and point.loop_error < 10 * error
     assert 0 < point.time < np.inf
+
+
+def test_admm_finds_the_accelerations_of_an_overconstrained_loop():
+    system = PROBLEMS["bricard"].system
+    samples, exact = sample_states(system, 3), exact_forward(system)
+    expected = [exact(*sample) for sample in samples]
+    assert largest_difference(AdmmForward(system, 2), samples, expected) < 1e-6
+
+
+def test_failures_are_told_in_a_line():
+    points = [Point("p", "e", setting=str(k), failure="unstable" * (k > 1)) for k in range(4)]
+    points.append(Point("p", "e", failure="other"))
+    assert failures(points) == ["e: 3 of 5 settings fail, most: unstable"]
 
 
 def test_energy_has_the_springs_along_joints():

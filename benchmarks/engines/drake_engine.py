@@ -1,5 +1,6 @@
 """Drake: discrete MultibodyPlant, loops as ball constraints of its SAP solver."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -105,6 +106,11 @@ class DrakeSimulator(TreeSimulator):
                     for mount in (loop.predecessor, loop.successor)
                 ]
                 self._plant.AddBallConstraint(*ends[0], *ends[1])
+
+    def single_call(self) -> Callable[[], object]:
+        """A step."""
+        advance, root, step = self._simulator.AdvanceTo, self._root, self._plant.time_step()
+        return lambda: advance(root.get_time() + step)
 
     def run(self) -> list[tuple[Array, Array]]:
         """See `Simulator.run`."""

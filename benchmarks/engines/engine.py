@@ -3,7 +3,7 @@
 import importlib.metadata
 import importlib.util
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 from multibody import Array, Multibody, State
@@ -24,12 +24,15 @@ class Engine(ABC):
         package: Distribution that it comes with.
         module: Module to import.
         advice: Where its documentation says how to use it for closed loops.
+        budget: CPU time of all runs of a problem [s], after which no further setting is tried;
+            without one, the sweep ends with the first run that is long.
     """
 
     name: str
     package: ClassVar[str]
     module: ClassVar[str]
     advice: ClassVar[str] = ""
+    budget: float = 0.0
 
     @classmethod
     def version(cls) -> str:
@@ -57,6 +60,14 @@ class Simulator(ABC):
     @abstractmethod
     def run(self) -> Any:
         """Simulate from the start to the end; only this is timed."""
+
+    def single_call(self) -> Callable[[], object]:
+        """A call from Python of the least that the engine computes: a step, or accelerations.
+
+        Raises:
+            UnsupportedError: It has none.
+        """
+        raise UnsupportedError("no single steps")
 
     @abstractmethod
     def states(self, result: Any) -> list[State]:

@@ -2,7 +2,7 @@
 
 import contextlib
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,9 @@ from problem import Problem
 from engines.engine import Engine, Simulator, UnsupportedError
 from engines.mujoco_engine import plane_normal
 
-NEWTON_TOLERANCE = 1e-10
+NEWTON_TOLERANCES = (1e-5, 1e-8)
+DENSE_BODIES = 10  # in a plane, below which the dense solver is the faster one
+Setting = tuple[float, float, str]
 GROUND = -1
 
 
@@ -29,15 +31,19 @@ class Exudyn(Engine):
     def __init__(self, solver: str):
         self.name, self._solver = f"Exudyn {solver}", solver
 
-    def build(self, problem: Problem, setting: float) -> "ExudynSimulator":
+    def settings(self, problem: Problem) -> list[Setting]:
+        """See `settings_of_newton`."""
+        return settings_of_newton(problem)
+
+    def build(self, problem: Problem, setting: Setting) -> "ExudynSimulator":
         """See `Engine.build`."""
-        return ExudynSimulator(problem, self._solver, setting)
+        return ExudynSimulator(problem, self._solver, *setting)
 
 
 class ExudynSimulator(Simulator):
     """Steps of one length; outputs by sensors that Exudyn stores itself."""
 
-    def __init__(self, problem: Problem, solver: str, step: float):
+    def __init__(self, problem: Problem, solver: str, step: float, tolerance: float, linear: str):
         import exudyn
         import exudyn.utilities
 
@@ -60,7 +66,8 @@ class ExudynSimulator(Simulator):
             self._add_spring(spring)
         self._sensors = [self._add_sensors(body) for body in self._bodies]
         self._mbs.Assemble()
-        self._settings = self._solver_settings(solver, problem, step)
+        self._settings = solver_settings(exudyn, problem, step, tolerance, linear)
+        self._type = getattr(exudyn.DynamicSolverType, solver)
 
     def _add_body(self, i: int) -> Any:
         body, state, turn = self.system.bodies[i], self._state, self._turn
@@ -214,31 +221,13 @@ class ExudynSimulator(Simulator):
             for name in names
         ]
 
-    def _solver_settings(self, solver: str, problem: Problem, step: float) -> Any:
-        settings = self._exudyn.SimulationSettings()
-        integration = settings.timeIntegration
-        integration.endTime = problem.duration
-        integration.numberOfSteps = round(problem.duration / step)
-        integration.verboseMode = 0
-        integration.adaptiveStep = False
-        integration.newton.absoluteTolerance = NEWTON_TOLERANCE
-        integration.newton.relativeTolerance = NEWTON_TOLERANCE
-        integration.newton.useModifiedNewton = True
-        settings.solutionSettings.writeSolutionToFile = False
-        settings.solutionSettings.sensorsWritePeriod = float(problem.times[1])
-        settings.displayComputationTime = False
-        if not self._planar:  # redundant constraints
-            settings.linearSolver.solverType = self._exudyn.LinearSolverType.EigenDense
-            settings.linearSolver.ignoreSingularJacobian = True
-        self._type = getattr(self._exudyn.DynamicSolverType, solver)
-        return settings
+    def single_call(self) -> Callable[[], object]:
+        """A step, as a run of one step."""
+        return single_step(self._mbs, self._settings, self._type)
 
     def run(self) -> list[Array]:
         """See `Simulator.run`."""
-        try:
-            self._mbs.SolveDynamic(self._settings, solverType=self._type)
-        except Exception as error:
-            raise UnsupportedError("the solver stops: " + str(error).splitlines()[0]) from None
+        solve(self._mbs, self._settings, self._type)
         return [
             [self._mbs.GetSensorStoredData(sensor) for sensor in sensors]
             for sensors in self._sensors
@@ -259,6 +248,71 @@ class ExudynSimulator(Simulator):
             parts = [np.array([back @ row[j] for row in rows]) for j in (0, 2, 3)]
             found.append(State(np.array(rotation), *parts))
         return found
+
+
+def settings_of_newton(problem: Problem) -> list[Setting]:
+    """Step [s], tolerance of Newton's method, linear solver.
+
+    Overconstrained loops need the one that ignores redundant equations, which is slow.
+    """
+    system = problem.system
+    is_small = len(system.bodies) < DENSE_BODIES and plane_normal(system) is not None
+    solvers = ["EXUdense" if is_small else "EigenSparse"]
+    if any(loop.axis is not None and not system.is_planar_loop(loop) for loop in system.loops):
+        solvers.append("EigenDense")
+    return [
+        (step, tolerance, solver)
+        for step in problem.steps
+        for tolerance in NEWTON_TOLERANCES
+        for solver in solvers
+    ]
+
+
+def solver_settings(
+    exudyn: Any, problem: Problem, step: float, tolerance: float, linear: str
+) -> Any:
+    """Settings of a solver with steps of one length."""
+    settings = exudyn.SimulationSettings()
+    integration = settings.timeIntegration
+    integration.endTime = problem.duration
+    integration.numberOfSteps = round(problem.duration / step)
+    integration.verboseMode = 0
+    integration.adaptiveStep = False
+    integration.newton.absoluteTolerance = tolerance
+    integration.newton.relativeTolerance = tolerance
+    integration.newton.useModifiedNewton = True
+    settings.solution.file.write = False
+    settings.solutionSettings.sensorsWritePeriod = float(problem.times[1])
+    settings.displayComputationTime = False
+    settings.linearSolver.solverType = getattr(exudyn.LinearSolverType, linear)
+    settings.linearSolver.ignoreSingularJacobian = linear == "EigenDense"  # redundant equations
+    return settings
+
+
+def solve(mbs: Any, settings: Any, kind: Any) -> None:
+    """Simulate.
+
+    Raises:
+        UnsupportedError: The solver gives up.
+    """
+    try:
+        mbs.SolveDynamic(settings, solverType=kind)
+    except Exception as error:
+        raise UnsupportedError("the solver stops: " + str(error).splitlines()[0]) from None
+
+
+def single_step(mbs: Any, settings: Any, kind: Any) -> Callable[[], object]:
+    """A run of one step from the start."""
+    integration = settings.timeIntegration
+    step = integration.endTime / integration.numberOfSteps
+    end, count = integration.endTime, integration.numberOfSteps
+
+    def call() -> None:
+        integration.endTime, integration.numberOfSteps = step, 1
+        solve(mbs, settings, kind)
+        integration.endTime, integration.numberOfSteps = end, count
+
+    return call
 
 
 def rotation_to_z(normal: Array) -> Array:

@@ -1,6 +1,6 @@
 """MuJoCo: loops as `connect` constraints between sites, contacts off."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from engines.engine import Engine, TreeSimulator
 
 OFFSET = 0.3  # between the two points of a revolute loop in space [m]
 # time constant of connections in steps, and their impedance; below two steps `refsafe` is off
-STIFFNESSES = ((2.0, 0.9), (2.0, 0.99), (1.5, 0.999), (0.45, 0.9999))
+STIFFNESSES = ((2.0, 0.9), (1.5, 0.999), (1.5, 0.9999), (0.45, 0.9999))
 Setting = tuple[float, float, float]
 
 
@@ -58,6 +58,11 @@ class MuJoCoSimulator(TreeSimulator):
         self._v = np.array([joint.dofadr[0] for joint in joints])
         self._count = round(float(problem.times[1]) / step)
         self._outputs = len(problem.times) - 1
+
+    def single_call(self) -> Callable[[], object]:
+        """A step."""
+        step, data = self._mujoco.mj_step, self._data
+        return lambda: step(self.model, data)
 
     def run(self) -> list[tuple[Array, Array]]:
         """See `Simulator.run`."""

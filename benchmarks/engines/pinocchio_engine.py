@@ -115,10 +115,7 @@ def best_forward(
     for points in (1, 2):
         for iterations, mu in SETTINGS:
             solver = PinocchioForward(system, algorithm, points, iterations, mu)
-            difference = max(
-                float(np.abs(solver(*sample) - a).max() / np.abs(a).max())
-                for sample, a in zip(samples, expected, strict=True)
-            )
+            difference = largest_difference(solver, samples, expected)
             if best is None or not difference >= best[0]:
                 told = {"difference": difference, "iterations": iterations, "mu": mu,
                         "points": points}  # fmt: skip
@@ -127,6 +124,18 @@ def best_forward(
                 return solver, told
     assert best is not None
     return best[1:]
+
+
+def largest_difference(
+    solver: Solver,
+    samples: Sequence[tuple[Array, Array, Array]],
+    expected: Sequence[Array],
+) -> float:
+    """Largest relative difference of the accelerations of a solver."""
+    return max(
+        float(np.abs(solver(*sample) - a).max() / np.abs(a).max())
+        for sample, a in zip(samples, expected, strict=True)
+    )
 
 
 class Pinocchio(Engine):
@@ -169,13 +178,18 @@ class Pinocchio(Engine):
 class PinocchioSimulator(TreeSimulator):
     """Runge-Kutta steps of one length."""
 
-    def __init__(self, problem: Problem, solver: PinocchioForward, step: float):
+    def __init__(self, problem: Problem, solver: Solver, step: float):
         super().__init__(problem.system)
         self._solver, self._step = solver, step
         self._count = round(float(problem.times[1]) / step)
         self._outputs = len(problem.times) - 1
         self._forces = self.system.joint_force_parameters
         self._springs = SpringForces(self.system) if self.system.springs else None
+
+    def single_call(self) -> Callable[[], Array]:
+        """Accelerations of all joints of a closed configuration."""
+        q, v = self.system.q, self.system.v
+        return lambda: self._acceleration(q, v)
 
     def run(self) -> list[tuple[Array, Array]]:
         """See `Simulator.run`."""
