@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 
 from engines import ENGINES
-from problem import problems
+from problem import missing_problems, problems
 from report import paragraph, sentence, table
-from trajectories import Point, available_engines, time_at_error
+from trajectories import Point, available_engines, failures, time_at_error
 from trajectories import measure as measure_engine
 
 QUICK = ("andrews_squeezer", "mini_forwarder", "slider_crank")
@@ -15,7 +15,7 @@ ERRORS = (1e-2, 1e-3, 1e-4, 1e-6, 1e-8)  # of the columns [m]
 def measure(quick: bool, names: Sequence[str] = ()) -> list[Point]:
     """Points of all engines on all problems, on a few, or on those of some names."""
     engines, missing = available_engines()
-    for line in missing:
+    for line in [*missing, *missing_problems()]:
         print(line)
     points: list[Point] = []
     for problem in problems(list(names or (QUICK if quick else ()))):
@@ -39,6 +39,7 @@ def tables(points: Sequence[Point]) -> list[str]:
         rows = [_row(name, [p for p in own if p.engine == name]) for name in names]
         about = f"{problem.duration:g} s. Source: {problem.source.strip()}."
         parts += [f"### {sentence(problem.title)}", paragraph(about), table(head, rows)]
+        parts += ["\n".join(f"- {line}" for line in failures(own))] if failures(own) else []
     return parts
 
 

@@ -275,30 +275,26 @@ class InstanceRoutines:
 
     def _add_evaluations(self, program: Program) -> None:
         """update_outputs(instance); derivatives(instance, rate) of the state."""
-        observe = self._programs["steps"].formula_outputs("observe")
-        rate = self._programs["steps"].formula_outputs("rate")
-        for name, formula, layout, part in (
-            ("update_outputs", "observe", observe, "outputs"),
-            ("derivatives", "rate", rate, "rate"),
-        ):
-            arrays = ("instance",) if name == "update_outputs" else ("instance", "rate")
-            with program.add_routine(name, arrays=arrays) as r:
-                values = r.local_array("values", layout)
-                arguments = (
-                    *self._machine_arguments(r.instance), self._part(r.instance, "inputs"),
-                    self._part(r.instance, "q"), values,
-                )  # fmt: skip
-                if self._k:
-                    held = self._element(r.instance, "bounds", HELD_INDEX)
-                    with r.if_then(held > 0.5):
-                        r.call(f"steps_{formula}{AT_REST_SUFFIX}", *arguments)
-                    with r.if_else():
-                        r.call(f"steps_{formula}", *arguments)
-                else:
-                    r.call(f"steps_{formula}", *arguments)
-                target = self._part(r.instance, "tau") if part == "outputs" else r.rate
-                r.copy(target, values.element_pointer(part), layout.parts[part])
-                r.return_value(DONE)
+        with program.add_routine("update_outputs", arrays=("instance",)) as r:
+            self._write_evaluation(r, "observe", "outputs", self._part(r.instance, "tau"))
+        with program.add_routine("derivatives", arrays=("instance", "rate")) as r:
+            self._write_evaluation(r, "rate", "rate", r.rate)
+
+    def _write_evaluation(self, r: Routine, formula: str, part: str, target: ArrayPointer) -> None:
+        """Write the evaluation of a formula of the stepper at the state and inputs."""
+        layout = self._programs["steps"].formula_outputs(formula)
+        values = r.local_array("values", layout)
+        inputs, state = (self._part(r.instance, x) for x in ("inputs", "q"))
+        arguments = *self._machine_arguments(r.instance), inputs, state, values
+        if self._k:
+            with r.if_then(self._element(r.instance, "bounds", HELD_INDEX) > 0.5):
+                r.call(f"steps_{formula}{AT_REST_SUFFIX}", *arguments)
+            with r.if_else():
+                r.call(f"steps_{formula}", *arguments)
+        else:
+            r.call(f"steps_{formula}", *arguments)
+        r.copy(target, values.element_pointer(part), layout.parts[part])
+        r.return_value(DONE)
 
     def _add_kinematics(self, program: Program) -> None:
         """close_loops, follow_loops, gamma and tip."""

@@ -147,22 +147,18 @@ def _setting_names(control: ValveDrive) -> list[str]:
 def _dynamics_units(program: "InstanceProgram") -> Iterator[str]:
     """Units of `_dynamics`; none where they depend on another parameter."""
     machine, dynamics = program.machine, program.chart.dynamics
-    inertia = ("kg", "m", "m", "m", *("kg m2",) * 6)
+    laws = [_law_units(machine.unit(joint)) for joint in machine.joints]
+    pairs = len(dynamics.forces.lengths.pairs)
+    known = {
+        "inertias": ("kg", "m", "m", "m", *("kg m2",) * 6) * len(machine.joints),
+        "joint_laws": [units.get(name, "") for units in laws for name in LAW_PARAMETER_NAMES],
+        "distances": [
+            *(_law_units("m").get(name, "") for name in LAW_PARAMETER_NAMES), *("m",) * 6,
+        ] * pairs,
+        "gravity": ("m/s2",) * 3,
+    }  # fmt: skip
     for part, size in dynamics.formula_structure.constants_layout.parts.items():
-        if part == "inertias":
-            yield from inertia * len(machine.joints)
-        elif part == "joint_laws":
-            for joint in machine.joints:
-                units = _law_units(machine.unit(joint))
-                yield from (units.get(name, "") for name in LAW_PARAMETER_NAMES)
-        elif part == "distances":
-            names = [*LAW_PARAMETER_NAMES, *("",) * 6]
-            units = _law_units("m")
-            pairs = len(dynamics.forces.lengths.pairs)
-            yield from ([units.get(name, "") if name else "m" for name in names] * pairs)
-        else:
-            unit = {"gravity": "m/s2", "tip_point": "m"}.get(part, "")
-            yield from (unit for _ in range(size))
+        yield from known.get(part, ("m" if part == "tip_point" else "",) * size)
 
 
 def _law_units(unit: str) -> dict[str, str]:

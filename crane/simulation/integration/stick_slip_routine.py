@@ -213,10 +213,10 @@ def _write_stop(
         with m.each_row() as i:
             still = select(rank < n, m.dot(inverse.row_pointer(i, n), vector), 0.0)
             r.store(stopped, i, still)
-        for joint, position in enumerate(active_of_joint):
-            if position is not None:
-                with r.if_then(is_stopped[joint] > 0.0):
-                    r.store(stopped, position, 0.0)
+        pairs = [(joint, i) for joint, i in enumerate(active_of_joint) if i is not None]
+        for joint, position in pairs:
+            with r.if_then(is_stopped[joint] > 0.0):
+                r.store(stopped, position, 0.0)
         change = r.new_variable(0.0)
         with m.each_row() as i:
             size = r.new_variable(_magnitude(stopped[i] - v_a[i]) * rate[i])
