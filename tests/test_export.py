@@ -1,6 +1,7 @@
 """Machines as programs outside of Python: C by compilers that are here."""
 
 import ctypes
+import json
 import re
 import shutil
 import subprocess
@@ -11,6 +12,7 @@ from command_line import typed
 from warned import quiet
 
 import crane
+from crane.codegen.wasm_emitter import emit_wasm_module
 from crane.common.errors import InputError
 from crane.export import InstanceProgram, write_c
 from crane.export.c_sources import CSources
@@ -177,3 +179,52 @@ def test_a_load_that_is_a_function_in_python_is_refused():
     load = crane.description.WrenchFunction(machine.tip, lambda *motion: np.zeros(6))
     with pytest.raises(InputError, match="is a function in Python"):
         InstanceProgram(machine.with_external_forces(load))
+
+
+_NODE_PROGRAM = """
+const fs = require("fs");
+const given = JSON.parse(fs.readFileSync("given.json"));
+const module = new WebAssembly.Module(fs.readFileSync("machine.wasm"));
+const machine = new WebAssembly.Instance(module, { math: Math }).exports;
+const numbers = new Float64Array(machine.memory.buffer), start = 8;
+numbers.set(given.defaults, start);
+const statuses = [machine.initialize(8 * start)], motion = [];
+for (const row of given.inputs.slice(1)) {
+  numbers.set(row, start + given.input);
+  statuses.push(machine.advance(8 * start));
+  motion.push(Array.from(numbers.subarray(start + given.q, start + given.q + given.nq)));
+}
+console.log(JSON.stringify({ statuses, motion }));
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("node"), reason="no node is here")
+def test_a_motion_in_web_assembly_is_that_of_simulate(tmp_path):
+    machine, step, steps = crane.load("patu655"), 0.01, 100
+    program, times = InstanceProgram(machine, quantities=()), step * np.arange(steps + 1)
+    moved, start = signals(program, times), program.layout.start_index
+    command = crane.control.ValveSignals(machine, times, moved)
+    expected = quiet(crane.simulate, machine, command, duration=times[-1], step=step)
+    defaults, inputs = program.defaults.copy(), np.column_stack(list(moved.values()))
+    program.layout.view(defaults).step[:] = step
+    program.layout.view(defaults).inputs[: inputs.shape[1]] = inputs[0]
+    given = {
+        "defaults": defaults.tolist(), "inputs": inputs.tolist(), "input": start("inputs"),
+        "q": start("q"), "nq": machine.model.nv,
+    }  # fmt: skip
+    module = emit_wasm_module(program.functions, program.entries, program.layout.size + 8)
+    (tmp_path / "machine.wasm").write_bytes(module)
+    (tmp_path / "given.json").write_text(json.dumps(given))
+    command_line = ["node", "-e", _NODE_PROGRAM]
+    done = subprocess.run(command_line, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    found = json.loads(done.stdout)
+    assert set(found["statuses"]) == {1}
+    difference = np.array(found["motion"])[:, machine.closure.active] - expected.q[1:]
+    assert np.abs(difference).max() < 1e-12 * np.ptp(expected.q, axis=0).max()
+
+
+def test_dead_time_is_refused():
+    machine = crane.load("patu655", changes={"valve.X_lift.delay": 0.05})
+    with pytest.raises(InputError, match="have a dead time"):
+        InstanceProgram(machine)

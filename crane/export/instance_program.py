@@ -100,6 +100,11 @@ class InstanceProgram:
         self.machine, self.control = machine, control
         if not machine.closure.is_compiled:
             raise InputError(f"the loops of '{machine.name}' have no formulas to export")
+        if isinstance(control, ValveDrive) and control.delays.any():
+            raise InputError(
+                f"valves of '{machine.name}' have a dead time, which is not exported: set delay "
+                "to 0, or delay the signals before"
+            )
         if not machine.has_traceable_forces:
             raise InputError(
                 f"a load of '{machine.name}' is a function in Python, which no other target has: "
