@@ -48,11 +48,15 @@ def view(
         Path | None,
         typer.Option(metavar="RUN", help="A second run of the machine, drawn over the first."),
     ] = None,
+    drive: Annotated[
+        bool, typer.Option("--drive", help="A page on which the machine is driven by its levers.")
+    ] = False,
     no_open: Annotated[bool, typer.Option("--no-open", help="Do not open a browser.")] = False,
 ) -> None:
     """Write a 3D page of a machine or run, and open it.
 
-    The page of a run plays its motion, and plots its forces and all recorded quantities.
+    The page of a run plays its motion, and plots its forces and all recorded quantities. With
+    --drive the page computes the machine while keys, sliders or a gamepad move its levers.
     """
     from crane.recordings.recording_summary import joint_differences
     from crane.view.page.report_page import open_in_browser
@@ -64,11 +68,18 @@ def view(
         recording.refuse(text)
     loaded, first = _load(what, machine, options, recording)
     second = None if over is None else recording.read(over, loaded)
-    if first is None:
+    if drive and first is not None:
+        raise InputError(f"--drive is for machines, and '{what}' is a run, leave it out")
+    if drive:
+        page = output.path(Path(portable_file_name(f"{loaded.name}_drive") + ".html"))
+    elif first is None:
         page = output.path(Path(portable_file_name(loaded.name) + ".html"))
     else:
         page = output.path(_folder(Path(what)) / PAGE)
-    crane.report(loaded, first, page, second)
+    if drive:
+        crane.view.drive_page(loaded, page)
+    else:
+        crane.report(loaded, first, page, second)
     if first is not None and second is not None:
         for one in joint_differences(first, second):
             print(f"{one.joint} differs by at most {' at '.join(one.formatted)}")

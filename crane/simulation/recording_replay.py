@@ -32,13 +32,19 @@ from crane.recordings.measured_recordings import (
     check_strokes,
     locked_joint_conflicts,
 )
-from crane.recordings.recording import VELOCITY_SUFFIX, Recording
+from crane.recordings.recording import (
+    IDEAL_SENSORS,
+    SENSORS_NOTE,
+    VELOCITY_SUFFIX,
+    Recording,
+)
 from crane.recordings.recording_reader import FULL_TIME_SPAN, TimeSpan, read_quantities
 from crane.recordings.sensor_discrepancy import warn_discrepancies
 from crane.recordings.timeseries import TIME, Table, table_column, time_derivative
 from crane.simulation.recorded_run import read_simulation, simulated_columns
 from crane.simulation.simulation_run import Progress, simulate
 
+_PUMP_STATE = "share_supply"  # of the regulator of the main pump, which no sensor reads
 _START_FIT_DURATION = 0.1  # interval of the fit of the initial state [s]
 _MAX_REST_DURATION = 1.0  # longest interval that is tested for rest [s]
 _MIN_FIT_SAMPLES = 5  # samples of that fit
@@ -233,8 +239,12 @@ def replay_inputs(machine: Machine, table: Table) -> ReplayInputs:
         table_column(table, name, "Pa") if name in table.units else None
         for name in (SUPPLY_PRESSURE, TANK_PRESSURE)
     )
+    # a run of this package has a pump of its own, and no noise
+    is_simulated = _PUMP_STATE in table.units and table.notes.get(SENSORS_NOTE) == IDEAL_SENSORS
+    if is_simulated:
+        supply = tank = None
     with missing.collect_errors():
-        pressures = _initial_pressures(circuit.joints, table, time)
+        pressures = _initial_pressures(circuit.joints, table, time, is_simulated)
     table_with_angles = add_inclination_angles(machine, table)
     has_joint_motion = any(joint in table_with_angles.units for joint in machine.joints)
     if has_joint_motion:
@@ -245,7 +255,7 @@ def replay_inputs(machine: Machine, table: Table) -> ReplayInputs:
         check_strokes(machine, table)
         warn_discrepancies(machine, table)
     initial = (
-        _initial_motion(machine, table_with_angles, time, list(signals.values()))
+        _initial_motion(machine, table_with_angles, time, list(signals.values()), is_simulated)
         if has_joint_motion
         else None
     )
@@ -268,7 +278,7 @@ def _spool_signals(machine: Machine, spools: Sequence[str], table: Table) -> dic
 
 
 def _initial_pressures(
-    joints: Sequence[str], table: Table, time: Array
+    joints: Sequence[str], table: Table, time: Array, is_exact: bool
 ) -> dict[str, tuple[float, float]]:
     """Initial pressures in A and B by joint [Pa], from the first samples."""
     pressures: dict[str, tuple[float, float]] = {}
@@ -281,13 +291,16 @@ def _initial_pressures(
                 f"'{missing}' is missing beside '{measured[0]}', add or remove one"
             )
         if measured:
-            a, b = (_value_at_first_sample(time, table_column(table, name), 0) for name in pair)
+            columns = (table_column(table, name) for name in pair)
+            a, b = (
+                float(x[0]) if is_exact else _value_at_first_sample(time, x, 0) for x in columns
+            )
             pressures[joint] = max(a, 0.0), max(b, 0.0)
     return pressures
 
 
 def _initial_motion(
-    machine: Machine, table: Table, time: Array, signals: list[Array]
+    machine: Machine, table: Table, time: Array, signals: list[Array], is_exact: bool
 ) -> tuple[Array, Array]:
     for text in locked_joint_conflicts(
         machine, dict(zip(table.units, table.values.T, strict=True)), table.units
@@ -308,6 +321,8 @@ def _initial_motion(
                 CraneWarning,
                 stacklevel=4,
             )
+    if is_exact:
+        return q_a[0], v_a[0]
     has_moved = [np.abs(x - x[0]) > 1e-9 * max(float(np.ptp(x)), 1e-300) for x in signals]
     # at rest until a valve moves, within bounds
     first = min(float(time[x.argmax()]) if x.any() else np.inf for x in has_moved)

@@ -1,5 +1,6 @@
 """Report page of a machine and its run, for any browser without network."""
 
+import base64
 import json
 import webbrowser
 from collections.abc import Sequence
@@ -96,7 +97,7 @@ def report_html(
         frame_share: Share of the largest number of frames and time spans of a page.
     """
     scene = build_scene(machine, recording, frame_share)
-    page_data = _machine_data(machine, scene, recording)
+    page_data = machine_data(machine, scene, recording)
     if recording is not None:
         page_data |= _run_data(machine, scene, recording, second_recording, frame_share)
     return _render_page(page_data, scene)
@@ -107,7 +108,8 @@ def open_in_browser(path: str | Path) -> bool:
     return webbrowser.open(Path(path).resolve().as_uri())
 
 
-def _machine_data(machine: Machine, scene: Scene, recording: Recording | None) -> dict[str, Any]:
+def machine_data(machine: Machine, scene: Scene, recording: Recording | None) -> dict[str, Any]:
+    """Return what the scripts of a page need of a machine."""
     return {
         "machine": machine.name,
         "task": "home configuration" if recording is None else label(recording),
@@ -189,24 +191,31 @@ def _run_data(
 
 
 def _render_page(page_data: dict[str, Any], scene: Scene) -> str:
-    import base64
-
-    import meshcat
-    import umsgpack  # type: ignore[import-untyped]
-
     assets = files("crane.view.page") / "assets"
     return Template((assets / "page.html").read_text(encoding="utf-8")).substitute(
         title=escape(result_title(page_data["machine"], page_data["task"])),
         style=(assets / "page.css").read_text(encoding="utf-8"),
-        viewer=(files(meshcat) / "viewer" / "dist" / "main.min.js").read_text(encoding="utf-8"),
-        data=_script_json(page_data),
-        commands=_script_json(
-            [base64.b64encode(umsgpack.packb(c)).decode() for c in scene.commands]
-        ),
+        viewer=viewer_script(),
+        data=script_json(page_data),
+        commands=scene_commands(scene),
         script="\n".join(
             (assets / f"{name}.js").read_text(encoding="utf-8") for name in SCRIPT_NAMES
         ),
     )
+
+
+def viewer_script() -> str:
+    """Return the script of meshcat's viewer."""
+    import meshcat
+
+    return (files(meshcat) / "viewer" / "dist" / "main.min.js").read_text(encoding="utf-8")
+
+
+def scene_commands(scene: Scene) -> str:
+    """Return the commands of a scene for the viewer as JSON."""
+    import umsgpack  # type: ignore[import-untyped]
+
+    return script_json([base64.b64encode(umsgpack.packb(c)).decode() for c in scene.commands])
 
 
 def _rotate_view(direction: tuple[float, float, float], heading: float) -> list[float]:
@@ -218,7 +227,7 @@ def _rotate_view(direction: tuple[float, float, float], heading: float) -> list[
     ]
 
 
-def _script_json(value: Any) -> str:
+def script_json(value: Any) -> str:
     """Return JSON that is safe inside a script element."""
     return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
