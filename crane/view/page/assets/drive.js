@@ -97,7 +97,8 @@ function show(state) {
     });
     if (!state.row.length) return;
     for (const gauge of gauges) {
-        const value = gaugeValue(gauge, state);
+        const exact = gaugeValue(gauge, state);
+        const value = Math.abs(exact) < 1e-3 * (gauge.high - gauge.low) ? 0 : exact;
         gauge.value.textContent = `${spoken(value, 3)} ${gauge.unit}`;
         const share = (value - gauge.low) / (gauge.high - gauge.low);
         gauge.bar.style.width = `${100 * Math.max(0, Math.min(1, share))}%`;
