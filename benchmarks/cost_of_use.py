@@ -10,7 +10,6 @@ import ast
 import importlib
 import json
 import os
-import resource
 import statistics
 import subprocess
 import sys
@@ -119,8 +118,12 @@ def costs(problem: Problem, engine: Engine) -> dict[str, Any]:
 
 
 def peak_memory() -> float:
-    """Largest resident memory of this process until now [MB]."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    """Largest resident memory of this process until now [MB].
+
+    That of `getrusage` starts with what the process had that started this one.
+    """
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1024
 
 
 def first_simulator(problem: Problem, engine: Engine) -> tuple[Any, Simulator, float]:
