@@ -82,7 +82,7 @@ def formulas(machine, fast):
         rest = dynamics.constant_pattern, n, dynamics.formula_structure
         yield (
             name,
-            lambda p, name=name, rest=rest: quantities._build_quantity(p, name, fast, *rest),
+            lambda p, name=name, rest=rest: quantities.build_quantity(p, name, fast, *rest),
         )
     if machine.tip:
         for kind in (CompiledPoint, CompiledFrame):
@@ -232,7 +232,7 @@ def text_with(name, fast, dynamics, values):
         except ZeroDivisionError:  # no machine
             return "singular"
     rest = values, len(dynamics.machine.active), dynamics.formula_structure
-    return text(lambda program: quantities._build_quantity(program, name, fast, *rest))
+    return text(lambda program: quantities.build_quantity(program, name, fast, *rest))
 
 
 @pytest.fixture(scope="module")

@@ -48,6 +48,7 @@ COMMANDS = {
          "--processes", "1", "--out", "result"],
         "result",
     ),
+    "export": (["mini_forwarder", "--out", "result"], "result"),
     "excite": (
         ["slider_crank.yaml", "--harmonics", "2", "--periods", "1", "--step", "0.1",
          "--out", "result"],
