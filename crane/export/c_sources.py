@@ -223,11 +223,12 @@ class CSources:
     def test(self) -> str:
         """A program that compares the functions with recorded values of crane."""
         program, name = self._program, self.name
-        vectors, motion = random_vectors(program), recorded_motion(program)
+        (vectors, scales), motion = random_vectors(program), recorded_motion(program)
         sizes = {key: rows[0].size for key, rows in vectors.items()}
         checks = []
         for key in (x for x in vectors if x in DYNAMICS_ROUTINES):
-            arguments = f'"{key}", found, {key}[i], {sizes[key]}'
+            scale = _number(scales[key])
+            arguments = f'"{key}", found, {key}[i], {sizes[key]}, {scale}'
             checks += [f"{name}_{key}(&m, q, v, x, found);", f"compare({arguments});"]
         inputs = _inputs_of(program)
         set_inputs = f"for (j = 0; j < {len(inputs)}; ++j)\n            " + (

@@ -5,6 +5,7 @@ The array is an instance of the machine. It has parameters, inputs, state and ou
 any number of them may be used at once. The routines return a status, 1 for success.
 """
 
+import warnings
 from collections.abc import Sequence
 from functools import cached_property
 from types import MappingProxyType
@@ -12,18 +13,19 @@ from types import MappingProxyType
 import numpy as np
 
 from crane.codegen import (
+    FormulaTooLongError,
     Layout,
     Program,
     Routine,
 )
 from crane.codegen.linked_functions import LinkedFunction, link_functions
-from crane.common.errors import InputError
+from crane.common.errors import CraneWarning, InputError
 from crane.common.samples import Array
 from crane.control.control_law import ControlLaw
 from crane.control.valve_commands import ValveSignals
 from crane.control.valve_drive import ValveDrive
 from crane.description.external_forces import Wrench
-from crane.dynamics.compiled_dynamics import DERIVATIVES_OF, QUANTITIES, build_quantity
+from crane.dynamics.compiled_dynamics import DERIVATIVES_OF, build_quantity
 from crane.dynamics.dynamics import Dynamics
 from crane.export.force_inputs import ForceInputs
 from crane.export.instance_routines import INNER_ROUTINES, InstanceRoutines
@@ -115,7 +117,7 @@ class InstanceProgram:
         self.chart = Chart.from_dynamics(dynamics, control, states)
         is_valve_drive = isinstance(control, ValveDrive)
         self._stepper_class = RosenbrockStepper if is_valve_drive else DormandPrinceStepper
-        self.stepper: ErrorControlledStepper = self._stepper_class(self.chart)
+        self.stepper = self._make_stepper()
         self._quantities = {name: DYNAMICS_ROUTINES[name] for name in quantities}
         self._nq, self._n = machine.model.nv, len(machine.active)
         self._k = len(self.chart.stick_slip.columns)
@@ -123,6 +125,15 @@ class InstanceProgram:
         self.layout = self._make_layout()
         self.names, self.units = parameter_names(self)
         self.defaults = self._default_instance()
+
+    def _make_stepper(self) -> ErrorControlledStepper:
+        try:
+            return self._stepper_class(self.chart)
+        except FormulaTooLongError as error:
+            raise InputError(
+                f"'{self.machine.name}' has {error.operation_count:,} operations in a step, which "
+                "is too long to export: leave bodies out"
+            ) from None
 
     def _make_layout(self) -> Layout:
         stepper, inputs = self.stepper, self.stepper.reference_columns
@@ -172,12 +183,20 @@ class InstanceProgram:
         """Programs of the parts of the machine."""
         dynamics, programs = self.chart.dynamics, {"loops": self._closure.new_program()}
         for name, quantity in self._quantities.items():
-            assert quantity.removeprefix(DERIVATIVES_OF) in QUANTITIES
-            programs[name] = program = Program()
-            build_quantity(
-                program, quantity, self._closure, dynamics.constant_pattern, self._n,
-                dynamics.formula_structure,
-            )  # fmt: skip
+            program = Program()
+            try:
+                build_quantity(
+                    program, quantity, self._closure, dynamics.constant_pattern, self._n,
+                    dynamics.formula_structure,
+                )  # fmt: skip
+            except FormulaTooLongError as error:
+                warnings.warn(
+                    f"'{name}' is left out, it has {error.operation_count:,} operations",
+                    CraneWarning,
+                    stacklevel=2,
+                )
+                continue
+            programs[name] = program
         programs["steps"] = self.stepper.new_program()
         if self._tip is not None:
             programs["tip"] = self._tip.new_program()
@@ -194,8 +213,9 @@ class InstanceProgram:
         known = {*own.functions, *INNER_ROUTINES}
         offset = None if self._tip is None else self._tip.frame_offset
         InstanceRoutines(
-            self.chart, self.stepper, self.layout, self._programs, [*self._quantities], offset
-        ).add_to(own)
+            self.chart, self.stepper, self.layout, self._programs,
+            [name for name in self._quantities if name in self._programs], offset,
+        ).add_to(own)  # fmt: skip
         programs["machine"] = own.functions
         entries = [
             name

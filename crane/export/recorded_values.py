@@ -54,21 +54,29 @@ def recorded_motion(program: InstanceProgram) -> RecordedMotion:
     return RecordedMotion(_TEST_STEP, inputs[1:], np.column_stack(columns)[1:])
 
 
-def random_vectors(program: InstanceProgram) -> dict[str, list[Array]]:
-    """Random closed states about home, and the quantities of the library at them."""
+def random_vectors(program: InstanceProgram) -> tuple[dict[str, list[Array]], dict[str, float]]:
+    """Random closed states about home, the quantities of the library at them, and their sizes.
+
+    The size is the largest value, or more where rounding of the configuration changes the
+    quantity by more than 1e-14 of it, as beside change points.
+    """
     machine, random = program.machine, np.random.default_rng(0)
     dynamics, n = Dynamics(machine), len(machine.active)
     found: dict[str, list[Array]] = {"configurations": [], "velocities": [], "second": []}
+    sizes: dict[str, float] = {}
     units = machine.closure.units[machine.closure.active]
     home = machine.home[machine.closure.active]
+    quantities = {x: DYNAMICS_ROUTINES[x] for x in program.entries if x in DYNAMICS_ROUTINES}
     for _ in range(_TEST_STATES):
         q = machine.closure.solve(home + 0.01 * units * random.uniform(-1, 1, n))
         v, x = random.normal(size=(2, n))
-        found["configurations"].append(q)
-        found["velocities"].append(v)
-        found["second"].append(x)
-        for name, quantity in DYNAMICS_ROUTINES.items():
-            if name in program.entries:
-                value = dynamics.evaluate_closed(quantity, q, v, x)
-                found.setdefault(name, []).append(value)
-    return found
+        rounded = q * (1.0 + 4e-16 * random.uniform(-1, 1, len(q)))
+        for key, row in (("configurations", q), ("velocities", v), ("second", x)):
+            found[key].append(row)
+        for name, quantity in quantities.items():
+            value = dynamics.evaluate_closed(quantity, q, v, x)
+            change = np.abs(dynamics.evaluate_closed(quantity, rounded, v, x) - value).max()
+            found.setdefault(name, []).append(value)
+            size = max(float(np.abs(value).max()), 1e14 * float(change))
+            sizes[name] = max(sizes.get(name, 0.0), size)
+    return found, sizes

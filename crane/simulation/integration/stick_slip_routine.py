@@ -70,12 +70,12 @@ class _ColumnLoops:
     def add_multiple(
         self, target: ArrayPointer, factor: RoutineValue, other: ArrayPointer
     ) -> None:
-        """Target += factor other, of vectors (n,)."""
+        """Add factor other to target, vectors (n,)."""
         with self.each_row() as i:
             self.routine.store(target, i, target[i] + factor * other[i])
 
     def copy_scaled(self, target: ArrayPointer, factor: RoutineValue, other: ArrayPointer) -> None:
-        """Target = factor other, of vectors (n,)."""
+        """Copy factor other to target, vectors (n,)."""
         with self.each_row() as i:
             self.routine.store(target, i, factor * other[i])
 
