@@ -38,6 +38,11 @@ _TEXTS = {
     "to\nslip and stop at the start of a step only.",
     "update_outputs": "Compute the outputs, from `tau` on, at the state and inputs.",
     "derivatives": "Derivatives of the state, from `q` on, at the state and inputs.",
+    "event_indicators": "Quantities whose change of sign is an event: the margin of stick-slip "
+    "transitions,\nthen distances of end stops, contacts, voids.",
+    "update_modes": "Which joints stick or slip at the state; call it after an event.",
+    "directional_derivatives": "Derivatives of `derivatives` and the outputs along a direction "
+    "(state, inputs).",
     "close_loops": "Newton's method in place: q (nq) closed at its active coordinates, the others "
     "as first guess.",
     "follow_loops": "q (nq) at active coordinates q_a (n), by one step from the last ones.",
@@ -108,7 +113,7 @@ class CSources:
             _number(x) if x == y else f"sizeof({self.name}_real) < 8 ? {_number(y)} : {_number(x)}"
             for x, y in zip(program.defaults, program.single_precision_defaults, strict=True)
         ]
-        self._loads = _instance_loads(program)
+        self._loads = instance_loads(program)
 
     def files(self) -> dict[str, str]:
         """Texts of all files by name."""
@@ -119,10 +124,10 @@ class CSources:
             f"{name}_test.c": self.test(),
         }
         for template in _TEMPLATES:
-            found[template.replace("machine", name)] = self._fill(_template(template))
+            found[template.replace("machine", name)] = self.fill(read_template(template))
         return found
 
-    def _fill(self, text: str, further: Mapping[str, str] = MappingProxyType({})) -> str:
+    def fill(self, text: str, further: Mapping[str, str] = MappingProxyType({})) -> str:
         """A template with the values of the machine in place of @VALUE@."""
         machine, inputs = self._program.machine, _inputs_of(self._program)
         values = {
@@ -197,7 +202,7 @@ class CSources:
             "MEMBERS": _join([line for line, _ in self._struct_lines()]),
             "PROTOTYPES": "\n".join(prototypes),
         }
-        return self._fill(_template("machine.h"), values)
+        return self.fill(read_template("machine.h"), values)
 
     def _prototype(self, entry: str, linked: LinkedFunction) -> str:
         real, parameters = f"{self.name}_real", c_parameters(linked).replace("real *", "@*")
@@ -218,7 +223,7 @@ class CSources:
             "DEFAULTS": _join([f"{value}," for _, value in self._struct_lines()]),
             "WRAPPERS": "\n".join(wrappers),
         }
-        return self._fill(_template("machine.c"), values)
+        return self.fill(read_template("machine.c"), values)
 
     def test(self) -> str:
         """A program that compares the functions with recorded values of crane."""
@@ -241,7 +246,7 @@ class CSources:
             "STEP": repr(motion.step), "LARGEST": str(max(sizes.values())),
             "CHECKS": "\n        ".join(checks), "SET_INPUTS": set_inputs,
         }  # fmt: skip
-        return self._fill(_template("self_test.c"), values)
+        return self.fill(read_template("self_test.c"), values)
 
 
 def _join(lines: list[str]) -> str:
@@ -259,7 +264,7 @@ def _inputs_of(program: InstanceProgram) -> range:
     return range(start, start + program.layout.parts["inputs"])
 
 
-def _instance_loads(program: InstanceProgram) -> frozenset[int]:
+def instance_loads(program: InstanceProgram) -> frozenset[int]:
     """Elements of an instance that formulas read."""
     entries = program.entries.values()
     return frozenset().union(*(x.loads.get("instance", frozenset()) for x in entries))
@@ -286,7 +291,7 @@ def _operations(formula: Formula) -> list[int]:
     return [i for i in required if tapes[0].operations[i][0] != "load"]
 
 
-def _template(name: str) -> str:
+def read_template(name: str) -> str:
     folder = files("crane.export") / "templates"
     return (folder / f"{name}.template").read_text(encoding="utf-8")
 

@@ -7,6 +7,7 @@ any number of them may be used at once. The routines return a status, 1 for succ
 
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cached_property
 from types import MappingProxyType
 
@@ -17,8 +18,12 @@ from crane.codegen import (
     Layout,
     Program,
     Routine,
+    Scalar,
+    SymbolicExpression,
 )
+from crane.codegen.differentiation import directional_derivative
 from crane.codegen.linked_functions import LinkedFunction, link_functions
+from crane.codegen.vector_layout import Formula
 from crane.common.errors import CraneWarning, InputError
 from crane.common.samples import Array
 from crane.control.control_law import ControlLaw
@@ -72,6 +77,8 @@ class InstanceProgram:
     Args:
         machine: The machine.
         quantities: Routines of `DYNAMICS_ROUTINES` to include; all by default.
+        for_exchange: Whether to include directional derivatives of rates and outputs, where they
+            are not too long, and all inertial parameters of the body at the tip, for payloads.
 
     Attributes:
         machine: The machine, with the wrench at its tip.
@@ -89,7 +96,12 @@ class InstanceProgram:
         InputError: The formulas are too long, or a load is a function in Python.
     """
 
-    def __init__(self, machine: Machine, quantities: Sequence[str] = tuple(DYNAMICS_ROUTINES)):
+    def __init__(
+        self,
+        machine: Machine,
+        quantities: Sequence[str] = tuple(DYNAMICS_ROUTINES),
+        for_exchange: bool = False,
+    ):
         tip = machine.tip
         loads = [] if tip is None else [Wrench(tip, name=TIP_WRENCH_NAME)]
         machine = machine.with_external_forces(*loads)
@@ -113,7 +125,11 @@ class InstanceProgram:
                 "give a crane.Wrench"
             )
         states = control.circuit.state_count if isinstance(control, ValveDrive) else 0
-        dynamics = Dynamics(machine)
+        dynamics, self._for_exchange = Dynamics(machine), for_exchange
+        if for_exchange and self.tip_frame is not None:
+            start = dynamics.formula_structure.constants_layout.start_index("inertias")
+            start += 10 * (self.tip_frame.body - 1)
+            dynamics.constant_pattern[start : start + 10] = np.nan
         self.chart = Chart.from_dynamics(dynamics, control, states)
         is_valve_drive = isinstance(control, ValveDrive)
         self._stepper_class = RosenbrockStepper if is_valve_drive else DormandPrinceStepper
@@ -174,7 +190,8 @@ class InstanceProgram:
         return values
 
     @cached_property
-    def _tip(self) -> CompiledFrame | None:
+    def tip_frame(self) -> CompiledFrame | None:
+        """The tip; None without one."""
         tip = self.machine.tip
         return None if tip is None else CompiledFrame(self.machine, self.machine.frame(tip))
 
@@ -198,11 +215,43 @@ class InstanceProgram:
                 continue
             programs[name] = program
         programs["steps"] = self.stepper.new_program()
-        if self._tip is not None:
-            programs["tip"] = self._tip.new_program()
+        if self._for_exchange and not self.machine.coordinates.rotation_columns:
+            with suppress(FormulaTooLongError):
+                programs["tangent"] = self._trace_derivatives(programs["steps"])
+        if self.tip_frame is not None:
+            programs["tip"] = self.tip_frame.new_program()
         if isinstance(self.control, ForceInputs):
             programs["fixed"] = RungeKuttaStepper(self.chart).new_program()
         return programs
+
+    def _trace_derivatives(self, steps: Program) -> Program:
+        """rate(geometry, numbers, settings, refs, state, direction): of rate and outputs.
+
+        The direction has the state, then the references.
+        """
+        program, layout = Program(), self.chart.state_layout
+        for name in [x for x in steps.functions if x.startswith("rate")]:
+            formulas = (steps.functions[x] for x in (name, name.replace("rate", "observe")))
+            sizes = layout.size, self.chart.output_layout.size
+            pairs = zip(formulas, sizes, strict=True)
+            outputs = [x for f, size in pairs if isinstance(f, Formula) for x in f.outputs[:size]]
+            tape = next(x.tape for x in outputs if isinstance(x, SymbolicExpression))
+            places = [(4, i) for i in range(layout.size)]
+            places += [(3, i) for i in range(self.stepper.reference_columns)]
+            seeds: dict[int, Scalar] = {
+                tape.load(*place).index: tape.load(5, i) for i, place in enumerate(places)
+            }
+            program.add_formula(name, 6, directional_derivative(outputs, seeds))
+        return program
+
+    @cached_property
+    def routines(self) -> InstanceRoutines:
+        """The writer of its routines."""
+        offset = None if self.tip_frame is None else self.tip_frame.frame_offset
+        quantities = [name for name in self._quantities if name in self._programs]
+        return InstanceRoutines(
+            self.chart, self.stepper, self.layout, self._programs, quantities, offset
+        )
 
     @cached_property
     def _linked(self) -> tuple[dict[str, LinkedFunction], list[LinkedFunction]]:
@@ -211,11 +260,7 @@ class InstanceProgram:
         for prefix, parts in programs.items():
             own.functions |= {f"{prefix}_{name}": x for name, x in parts.items()}
         known = {*own.functions, *INNER_ROUTINES}
-        offset = None if self._tip is None else self._tip.frame_offset
-        InstanceRoutines(
-            self.chart, self.stepper, self.layout, self._programs,
-            [name for name in self._quantities if name in self._programs], offset,
-        ).add_to(own)  # fmt: skip
+        self.routines.add_to(own)
         programs["machine"] = own.functions
         entries = [
             name
