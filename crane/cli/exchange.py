@@ -1,13 +1,15 @@
 """Commands on files: convert for machines, import for recordings, schema for editors."""
 
+import tempfile
 import warnings
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 import crane
-from crane.cli.command import command
+from crane.cli.command import command, refuse_options
 from crane.cli.options import (
     MachineName,
     MachineOptions,
@@ -16,6 +18,7 @@ from crane.cli.options import (
     RequiredOutputFile,
     TimeOptions,
 )
+from crane.cli.terminal import status
 from crane.common.atomic_output import (
     check_file_is_writable,
     check_folder_is_writable,
@@ -24,7 +27,7 @@ from crane.common.atomic_output import (
 from crane.common.errors import CraneError, CraneWarning, InputError, check_name
 
 _FORMATS = ("urdf+", "urdf", "mjcf", "machine")
-_TARGETS = ("c",)
+_TARGETS = ("c", "fmu")
 _SUFFIXES = {".urdf": "urdf+", ".xml": "mjcf", ".mjcf": "mjcf"}
 
 
@@ -69,18 +72,44 @@ def export(
     machine: MachineName,
     options: MachineOptions,
     output: OutputFolder,
-    to: Annotated[str, typer.Option(metavar="TARGET", help="Target: c (C99 sources).")] = "c",
+    to: Annotated[
+        str,
+        typer.Option(metavar="TARGET", help="Target: c (C99 sources) or fmu (one file for FMI)."),
+    ] = "c",
     name: Annotated[
         str,
         typer.Option(metavar="NAME", help="Prefix of all names; that of the machine by default."),
     ] = "",
+    fmi: Annotated[int, typer.Option(metavar="VERSION", help="Version of FMI, 3 or 2.")] = 3,
 ) -> None:
     """Write a machine as a program for another environment."""
     check_name(to, _TARGETS, f"--to is '{to}'")
+    if to == "fmu":
+        refuse_options({"--name": name}, "is for --to c, leave it out")
+        _write_fmu(options.load(machine), output, fmi)
+        return
+    refuse_options({"--fmi": fmi != 3}, "is for --to fmu, leave it out")
     check_folder_is_writable(output.out, output.force)
     loaded = options.load(machine)
     written = crane.export.write_c(loaded, output.out, name=name, overwrite=output.force)
     print(f"written to {written}: see its header, or cmake -B build -S {written}")
+
+
+def _write_fmu(machine: crane.Machine, output: OutputFolder, fmi: int) -> None:
+    """Write a machine as an FMU, with its sketch as icon and its facts as documentation."""
+    from crane.view.notebook import to_html
+
+    out = output.out
+    path = out if out.suffix == ".fmu" else out.with_name(f"{out.name}.fmu")
+    check_file_is_writable(path, output.force)
+    icon = b""
+    with tempfile.TemporaryDirectory() as folder, suppress(CraneError):
+        crane.sketch(machine, Path(folder) / "icon.png")
+        icon = (Path(folder) / "icon.png").read_bytes()
+    about = to_html(machine) or ""
+    with status("compiling the machine"):
+        crane.export.write_fmu(machine, path, fmi, icon=icon, about=about)
+    print(f"written to {path}: an FMU of FMI {fmi} for model exchange and co-simulation")
 
 
 def _output_format(out: Path, to: str | None) -> str:

@@ -62,7 +62,8 @@ def write_fmu(
     fmi: int = 3,
     *,
     overwrite: bool = True,
-    files: Mapping[str, bytes] | None = None,
+    icon: bytes = b"",
+    about: str = "",
 ) -> Path:
     """Write a machine as an FMU for model exchange and co-simulation.
 
@@ -74,7 +75,8 @@ def write_fmu(
         path: The .fmu file.
         fmi: Version of FMI, 3 or 2.
         overwrite: Whether the file is replaced.
-        files: Further files, such as icon and documentation, by their paths in the FMU.
+        icon: A PNG file of the machine.
+        about: HTML about the machine, for its documentation.
 
     Returns:
         The path.
@@ -86,11 +88,14 @@ def write_fmu(
     check_name(fmi, VERSIONS, f"FMI {fmi} is not written")
     check_file_is_writable(Path(path), overwrite)
     loaded = machine if isinstance(machine, Machine) else load(machine)
-    members = FmuFiles(InstanceProgram(loaded, (), for_exchange=True), fmi).members()
+    files = FmuFiles(InstanceProgram(loaded, (), for_exchange=True), fmi)
+    members = files.members(icon, about)
     with replace_file(path) as output, zipfile.ZipFile(output, "w") as archive:
-        for name, content in {**members, **(files or {})}.items():
+        for name, content in members.items():
+            member = zipfile.ZipInfo(name, _DATE)
+            member.external_attr = 0o644 << 16
             data = content.encode() if isinstance(content, str) else content
-            archive.writestr(zipfile.ZipInfo(name, _DATE), data, zipfile.ZIP_DEFLATED)
+            archive.writestr(member, data, zipfile.ZIP_DEFLATED)
     return Path(path)
 
 
@@ -112,8 +117,8 @@ class FmuFiles:
         self._token = hashlib.sha256(text.encode()).hexdigest()
         self.sources["fmu.c"] = self._runtime()
 
-    def members(self) -> dict[str, str | bytes]:
-        """Contents of all files by path."""
+    def members(self, icon: bytes, about: str) -> dict[str, str | bytes]:
+        """Contents of all files by path; see `write_fmu`."""
         found: dict[str, str | bytes] = {"modelDescription.xml": self.description()}
         found |= {f"sources/{name}": text for name, text in self.sources.items()}
         if self._fmi == 3:
@@ -123,7 +128,17 @@ class FmuFiles:
             for name in ("fmu.c", f"{self.name}.c"):
                 ET.SubElement(files, "SourceFile", name=name)
             found["sources/buildDescription.xml"] = _xml(root)
-        found["documentation/index.html"] = self._documentation()
+        found["documentation/index.html"] = self._documentation(about)
+        if icon and self._fmi == 2:
+            found["model.png"] = icon
+        elif icon:
+            root = ET.Element("fmiTerminalsAndIcons", fmiVersion="3.0")
+            picture = ET.SubElement(root, "GraphicalRepresentation")
+            corners = {"x1": "-100", "y1": "-100", "x2": "100", "y2": "100"}
+            ET.SubElement(picture, "CoordinateSystem", corners, suggestedScalingFactorTo_mm="0.1")
+            ET.SubElement(picture, "Icon", corners)
+            found["terminalsAndIcons/terminalsAndIcons.xml"] = _xml(root)
+            found["terminalsAndIcons/icon.png"] = icon
         for folder, library in compile_libraries(self.sources, self.name).items():
             place = folder if self._fmi == 3 else _PLATFORMS[folder][0]
             found[f"binaries/{place}/{self.name}{_PLATFORMS[folder][1]}"] = library
@@ -148,7 +163,7 @@ class FmuFiles:
             "OUTPUT_SIZE": program.chart.output_layout.size, "LENGTHS": first("lengths"),
             "DERIVATIVES": first("derivatives"), "EVENT": first("events"),
             "EVENT_SIZE": parts["events"], "TIP_POSITION": first("tip"), "TIP_SIZE": parts["tip"],
-            "PAYLOAD": first("payload"),
+            "PAYLOAD": first("payload"), "CURSOR": first("cursor"), "CURSOR_SIZE": parts["cursor"],
             "TIP_BODY": body + (10 * (frame.body - 1) if frame is not None else 0),
         }  # fmt: skip
         point = [0.0] * 3 if frame is None else frame.frame_offset.tolist()
@@ -261,8 +276,7 @@ class FmuFiles:
                     given["dependencies"] = " ".join(map(self._index, known))
                 ET.SubElement(parent, element if fmi == 3 else "Unknown", given)
 
-    def _documentation(self) -> str:
-        """A page with all variables, where the caller gives none."""
+    def _documentation(self, about: str) -> str:
         rows = "".join(
             f"<tr><td>{escape(x.name)}</td><td>{x.unit}</td>"
             f"<td>{_ATTRIBUTES[x.kind]['causality']}</td><td>{x.start:.6g}</td></tr>\n"
@@ -271,7 +285,7 @@ class FmuFiles:
         title = escape(self._program.machine.name)
         return (
             f'<!DOCTYPE html><html><head><meta charset="utf-8"><title>{title}</title></head><body>'
-            f"<h1>{title}</h1><p>Written by crane {crane.__version__}.</p><table>"
+            f"<h1>{title}</h1>{about}<p>Written by crane {crane.__version__}.</p><table>"
             f"<tr><th>variable</th><th>unit</th><th>kind</th><th>start</th></tr>\n{rows}</table>"
             "</body></html>\n"
         )
