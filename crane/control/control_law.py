@@ -72,9 +72,11 @@ class ControlLaw(OneLineRepr):
         reference: The reference trajectory, or None.
         settings: (s,) parameters that can change without a new compilation. All other constants of
             a law become part of the machine code.
+        period: Time between calls of `update` [s]; 0 for no calls.
     """
 
     reference: Trajectory | None = None
+    period: float = 0.0
     settings: Array = np.zeros(0)
 
     def __init__(self, machine: Machine):
@@ -89,6 +91,17 @@ class ControlLaw(OneLineRepr):
                 `Dynamics`.
         """
         raise NotImplementedError
+
+    def update(self, time: float, q: Array, v_a: Array, state: Array) -> None:
+        """Set the references of the next period.
+
+        Args:
+            time: [s].
+            q: (nq,) configuration.
+            v_a: (n,) active velocities.
+            state: (k,) states of the controller.
+        """
+        return
 
     def select_driven(self, values: Sequence[Scalar]) -> list[Scalar]:
         """Values of the driven joints, from those of all active joints (n,)."""

@@ -17,7 +17,7 @@ from crane.codegen.routine_statements import as_value
 from crane.codegen.symbolic import add_vectors, scale_vector, subtract_vectors
 from crane.codegen.vector_layout import Formula
 from crane.common.samples import Array
-from crane.export.force_inputs import ForceInputs
+from crane.control.force_inputs import ForceInputs
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.error_controlled_stepper import ErrorControlledStepper
 from crane.simulation.integration.machine_code_stepper import HELD_INDEX
