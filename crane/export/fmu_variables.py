@@ -23,7 +23,7 @@ _KINDS = {
     "time": TIME, "inputs": INPUT, "v_a": OUTPUT, "contacts": LOCAL, "controller": LOCAL,
     "work": OUTPUT, "dissipated": OUTPUT, "tau": OUTPUT, "friction": OUTPUT, "kinetic": OUTPUT,
     "potential": OUTPUT, "friction_at_rest": OUTPUT, "external": OUTPUT, "a": OUTPUT,
-    "channels": OUTPUT, "derivatives": LOCAL, "events": LOCAL, "tip": OUTPUT, "payload": TUNABLE,
+    "channels": OUTPUT, "derivatives": LOCAL, "event": LOCAL, "tip_position": OUTPUT, "payload": TUNABLE,
 }  # fmt: skip
 _TUNABLE_DYNAMICS = ("inertias", "joint_laws", "gravity", "rotor_inertias", "distances")
 _STATE_ACCURACY = 1e-8  # share of a state of a circuit that its scale stands for
@@ -74,7 +74,7 @@ class FmuVariables:
         self.states = [*(q + columns).tolist(), *range(q + machine.model.nv, q + state_size)]
         tip = 0 if program.tip_frame is None else 3
         events = sum(program.routines.event_parts.values())
-        parts = {"derivatives": len(self.states), "events": events, "tip": tip}
+        parts = {"derivatives": len(self.states), "event": events, "tip_position": tip}
         self.layout = Layout(**layout.parts, **parts, payload=tip // 3)
         extra = self.layout.size - layout.size
         self.start = np.concatenate([program.defaults, np.zeros(extra)])
@@ -111,9 +111,9 @@ class FmuVariables:
             yield FmuVariable(
                 at("derivatives") + i, f"der({names[state]})", unit, LOCAL, 0.0, state
             )
-        for i, reference in enumerate(self._indices("events")):
+        for i, reference in enumerate(self._indices("event")):
             yield FmuVariable(reference, f"event_indicator[{i + 1}]", "", LOCAL)
-        for axis, reference in zip("xyz", self._indices("tip"), strict=False):
+        for axis, reference in zip("xyz", self._indices("tip_position"), strict=False):
             yield FmuVariable(reference, f"tip.position_{axis}", "m", OUTPUT)
         for reference in self._indices("payload"):
             yield FmuVariable(reference, "payload.mass", "kg", TUNABLE)
@@ -187,7 +187,7 @@ class FmuVariables:
                 elif q.start + i in self.states:
                     derivative = self.states.index(q.start + i)
                     found[self.layout.start_index("derivatives") + derivative] = closed
-        found |= {i: {*active} for i in (*q, *self._indices("tip")) if i not in found}
+        found |= {i: {*active} for i in (*q, *self._indices("tip_position")) if i not in found}
         return {i: sorted(x) for i, x in found.items()}
 
     def _loads(self, name: str) -> list[set[tuple[int, int]]]:
