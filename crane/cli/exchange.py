@@ -13,7 +13,7 @@ from crane.cli.command import command, refuse_options
 from crane.cli.options import (
     MachineName,
     MachineOptions,
-    OutputFolder,
+    OutputPath,
     OverwriteOptions,
     RequiredOutputFile,
     TimeOptions,
@@ -71,7 +71,7 @@ def convert(
 def export(
     machine: MachineName,
     options: MachineOptions,
-    output: OutputFolder,
+    output: OutputPath,
     to: Annotated[
         str,
         typer.Option(metavar="TARGET", help="Target: c (C99 sources) or fmu (one file for FMI)."),
@@ -85,17 +85,17 @@ def export(
     """Write a machine as a program for another environment."""
     check_name(to, _TARGETS, f"--to is '{to}'")
     if to == "fmu":
-        refuse_options({"--name": name}, "is for --to c, leave it out")
+        refuse_options({"--name": name or None}, "is for --to c, leave it out")
         _write_fmu(options.load(machine), output, fmi)
         return
-    refuse_options({"--fmi": fmi != 3}, "is for --to fmu, leave it out")
+    refuse_options({"--fmi": fmi != 3 or None}, "is for --to fmu, leave it out")
     check_folder_is_writable(output.out, output.force)
     loaded = options.load(machine)
     written = crane.export.write_c(loaded, output.out, name=name, overwrite=output.force)
     print(f"written to {written}: see its header, or cmake -B build -S {written}")
 
 
-def _write_fmu(machine: crane.Machine, output: OutputFolder, fmi: int) -> None:
+def _write_fmu(machine: crane.Machine, output: OutputPath, fmi: int) -> None:
     """Write a machine as an FMU, with its sketch as icon and its facts as documentation."""
     from crane.view.notebook import to_html
 

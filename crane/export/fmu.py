@@ -25,7 +25,7 @@ from crane.machine.machine import Machine
 from crane.motion.limit_violations import limit_tolerances
 from crane.simulation.integration.stick_slip_modes import EVENT_TOLERANCE
 
-VERSIONS = (3, 2)
+VERSIONS = ("3", "2")
 _DATE = (1980, 1, 1, 0, 0, 0)  # of all members, so that equal machines give equal files
 _ATTRIBUTES = {
     TIME: {"causality": "independent", "variability": "continuous"},
@@ -77,12 +77,12 @@ def write_fmu(
         InputError: See `InstanceProgram`; or there is no C compiler.
         OutputError: The file cannot be written.
     """
-    check_name(fmi, VERSIONS, f"FMI {fmi} is not written")
+    check_name(str(fmi), VERSIONS, f"FMI {fmi} is not written")
     check_file_is_writable(Path(path), overwrite)
     compilers = library_compilers()
     loaded = machine if isinstance(machine, Machine) else load(machine)
     files = FmuFiles(InstanceProgram(loaded, (), for_exchange=True), fmi)
-    members = files.texts(about) | {name: icon for name in files.icon_names if icon}
+    members = files.texts(about) | files.icon_members(icon)
     for key, library in compile_libraries(compilers, files.sources, files.name).items():
         platform = PLATFORMS[key]
         folder = key if fmi == 3 else platform.name_in_fmi2
@@ -119,11 +119,6 @@ class FmuFiles:
         self._source_files = ("fmu.c", f"{self.name}.c")
         self._has_derivatives = "directional_derivatives" in program.entries
 
-    @property
-    def icon_names(self) -> tuple[str, ...]:
-        """Paths of the icon."""
-        return ("terminalsAndIcons/icon.png",) if self._fmi == 3 else ("model.png",)
-
     def texts(self, about: str) -> dict[str, str | bytes]:
         """Contents of all text files by path; see `write_fmu`."""
         found: dict[str, str | bytes] = {
@@ -139,13 +134,19 @@ class FmuFiles:
         for name in self._source_files:
             ET.SubElement(files, "SourceFile", name=name)
         found["sources/buildDescription.xml"] = _xml(root)
+        return found
+
+    def icon_members(self, icon: bytes) -> dict[str, str | bytes]:
+        """Contents of the files of an icon by path."""
+        if not icon or self._fmi == 2:
+            return {"model.png": icon} if icon else {}
         root = ET.Element("fmiTerminalsAndIcons", fmiVersion="3.0")
         picture = ET.SubElement(root, "GraphicalRepresentation")
         corners = {"x1": "-100", "y1": "-100", "x2": "100", "y2": "100"}
         ET.SubElement(picture, "CoordinateSystem", corners, suggestedScalingFactorTo_mm="0.1")
         ET.SubElement(picture, "Icon", corners)
-        found["terminalsAndIcons/terminalsAndIcons.xml"] = _xml(root)
-        return found
+        folder = "terminalsAndIcons"
+        return {f"{folder}/terminalsAndIcons.xml": _xml(root), f"{folder}/icon.png": icon}
 
     def _runtime(self) -> str:
         """The C source between the functions of FMI and those of the machine."""

@@ -1,15 +1,15 @@
 """Shared libraries of an FMU from C sources: by ziglang for several platforms, else by cc."""
 
-import importlib.util
 import os
 import platform
-import shutil
 import subprocess
 import sys
 import tempfile
 import warnings
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
+from shutil import which
 from typing import NamedTuple
 
 from crane.common.errors import CraneWarning, InputError
@@ -49,10 +49,10 @@ def library_compilers() -> dict[str, list[str]]:
     processor = {"amd64": "x86_64", "arm64": "aarch64"}.get(processor, processor)
     own = f"{processor}-{platform.system().lower()}"
     found: dict[str, list[str]] = {}
-    if importlib.util.find_spec("ziglang") is not None:
+    if find_spec("ziglang") is not None:
         zig = [sys.executable, "-m", "ziglang", "cc", "-s", "-target"]
         found = {key: [*zig, x.zig_target] for key, x in PLATFORMS.items() if x.zig_target}
-    compiler = os.environ.get("CC") or next(filter(shutil.which, ("cc", "gcc", "clang")), "")
+    compiler = os.environ.get("CC") or next(filter(which, ("cc", "gcc", "clang")), "")
     if own in PLATFORMS and own not in found and compiler:
         found[own] = [*compiler.split(), "-fPIC"]
     if not found:

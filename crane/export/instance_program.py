@@ -126,14 +126,15 @@ class InstanceProgram:
             )
         states = control.circuit.state_count if isinstance(control, ValveDrive) else 0
         dynamics, self._for_exchange = Dynamics(machine), for_exchange
-        if for_exchange and self.tip_frame is not None:
-            start = dynamics.formula_structure.constants_layout.start_index("inertias")
-            start += 10 * (self.tip_frame.body - 1)
-            dynamics.constant_pattern[start : start + 10] = np.nan
         self.chart = Chart.from_dynamics(dynamics, control, states)
         is_valve_drive = isinstance(control, ValveDrive)
         self._stepper_class = RosenbrockStepper if is_valve_drive else DormandPrinceStepper
         self.stepper = self._make_stepper()
+        # of its formulas for other targets, not of its machine code
+        if for_exchange and self.tip_frame is not None:
+            start = dynamics.formula_structure.constants_layout.start_index("inertias")
+            start += 10 * (self.tip_frame.body - 1)
+            dynamics.constant_pattern[start : start + 10] = np.nan
         self._quantities = {name: DYNAMICS_ROUTINES[name] for name in quantities}
         self._nq, self._n = machine.model.nv, len(machine.active)
         self._k = len(self.chart.stick_slip.columns)
