@@ -44,16 +44,18 @@ def fmus(tmp_path_factory):
 class Instance:
     """An instance of an FMU of FMI 2 or 3, by the names of its variables."""
 
-    def __init__(self, path, co_simulation=True, **start):
+    def __init__(self, path, log=None, co_simulation=True, **start):
         self.description = d = fmpy.read_model_description(str(path))
         self.folder = fmpy.extract(str(path))
         kind = "Slave" if co_simulation else "Model"
         self.is_fmi3 = d.fmiVersion == "3.0"
         module = fmpy.fmi3 if self.is_fmi3 else fmpy.fmi2
         self.fmu = getattr(module, f"FMU{d.fmiVersion[0]}{kind}")(
-            guid=d.guid, unzipDirectory=self.folder, modelIdentifier=d.modelExchange.modelIdentifier
+            guid=d.guid,
+            unzipDirectory=self.folder,
+            modelIdentifier=d.modelExchange.modelIdentifier,
         )
-        self.log = []
+        self.log = [] if log is None else log
         self.fmu.instantiate(**self._logger())
         self.references = {x.name: x.valueReference for x in d.modelVariables}
         self.states = [x.variable.derivative.name for x in d.derivatives]
@@ -66,7 +68,9 @@ class Instance:
 
     def _logger(self):
         if self.is_fmi3:
-            return {"logMessage": lambda environment, status, category, text: self.log.append(text)}
+            return {
+                "logMessage": lambda environment, status, category, text: self.log.append(text)
+            }
         logger = fmpy.fmi2.fmi2CallbackLoggerTYPE(lambda *values: self.log.append(values[4]))
         self._callbacks = fmpy.fmi2.fmi2CallbackFunctions()
         self._callbacks.logger = logger
@@ -86,7 +90,7 @@ class Instance:
         self.time += length
 
     def rates(self, states):
-        array = (ctypes.c_double * len(states))
+        array = ctypes.c_double * len(states)
         found = array()
         self.fmu.setContinuousStates(array(*states), len(states))
         derivatives = "getContinuousStateDerivatives" if self.is_fmi3 else "getDerivatives"
@@ -189,9 +193,7 @@ def test_model_exchange_by_cvode_is_that_of_simulate(fmus, name):
         forces = 1.02 * crane.Dynamics(machine).gravity(machine.home[machine.closure.active])
         control = Constant(machine, forces)
         start = {f"{x}.force": y for x, y in zip(machine.active, forces, strict=True)}
-    expected = quiet(
-        crane.simulate, machine, control, duration=1.0, step=STEP, tolerance=1e-10
-    )
+    expected = quiet(crane.simulate, machine, control, duration=1.0, step=STEP, tolerance=1e-10)
     found = fmpy.simulate_fmu(
         path, fmi_type="ModelExchange", stop_time=1.0, output_interval=STEP, start_values=start,
         relative_tolerance=1e-9, output=coordinates(machine), solver="CVode", record_events=False,
@@ -287,11 +289,8 @@ def test_wrong_values_end_in_a_status_with_a_message(fmus):
         ({"kinetic": 1.0}, "kinetic cannot be set, it is computed"),
     ):
         log = []
-        with pytest.raises(failure), pytest.MonkeyPatch.context() as patch:
-            patch.setattr(Instance, "_logger", lambda self, log=log: {
-                "logMessage": lambda environment, status, category, text: log.append(text)
-            })  # fmt: skip
-            Instance(path, **start)
+        with pytest.raises(failure):
+            Instance(path, log, **start)
         assert text in str(log[-1]), log
     instance = Instance(path)
     for call, text in (
@@ -321,7 +320,7 @@ def test_the_command_adds_a_sketch_and_the_facts(tmp_path, monkeypatch):
     quiet(typed, "export", "mini_forwarder", "--to", "fmu", "--out", str(out))
     members = zipfile.ZipFile(out)
     assert members.read("terminalsAndIcons/icon.png").startswith(b"\x89PNG")
-    assert b"<svg" in members.read("documentation/index.html")
+    assert b"image/svg" in members.read("documentation/index.html")
     assert validate_fmu(str(out)) == []
 
 
@@ -329,7 +328,7 @@ def test_without_a_compiler_one_line_says_what_to_install(tmp_path, monkeypatch)
     monkeypatch.setattr(fmu_libraries, "find_spec", lambda name: None)
     monkeypatch.setattr(fmu_libraries, "which", lambda name: None)
     monkeypatch.delenv("CC", raising=False)
-    with pytest.raises(InputError, match=r"no C compiler is here .* pip install 'crane-dynamics"):
+    with pytest.raises(InputError, match="no C compiler is here .* pip install"):
         write_fmu("mini_forwarder", tmp_path / "x.fmu")
     with pytest.raises(InputError, match="FMI 1 is not written"):
         write_fmu("mini_forwarder", tmp_path / "x.fmu", 1)

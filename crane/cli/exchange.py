@@ -3,6 +3,7 @@
 import tempfile
 import warnings
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +14,7 @@ from crane.cli.command import command, refuse_options
 from crane.cli.options import (
     MachineName,
     MachineOptions,
-    OutputPath,
+    OutputFolder,
     OverwriteOptions,
     RequiredOutputFile,
     TimeOptions,
@@ -25,6 +26,15 @@ from crane.common.atomic_output import (
     replace_file,
 )
 from crane.common.errors import CraneError, CraneWarning, InputError, check_name
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputPath(OutputFolder):
+    """The folder or file that a machine is written to; the command checks it."""
+
+    def check(self) -> None:
+        """Check nothing."""
+
 
 _FORMATS = ("urdf+", "urdf", "mjcf", "machine")
 _TARGETS = ("c", "fmu")

@@ -408,14 +408,6 @@ class OutputFolder(OptionalOutputFolder):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OutputPath(OutputFolder):
-    """The folder or file that a result is written to, which the command checks."""
-
-    def check(self) -> None:
-        """Check nothing."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class OverwriteOptions(OptionBlock):
     """Whether files are replaced."""
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.common.errors import InputError, SimulationError, check_name
+from crane.common.optional_libraries import import_optional_library
 from crane.common.samples import Array
 from crane.control.valve_commands import SampledCommand
 from crane.machine.machine import Machine
@@ -51,11 +52,10 @@ class FmuController(SampledCommand):
         parameters: Mapping[str, float] | None = None,
     ):
         super().__init__(self._control, machine, step)
-        try:
-            import fmpy
-        except ModuleNotFoundError:
-            raise InputError("FMUs need FMPy: pip install 'crane-dynamics[fmu]'") from None
-        self._path, self._machine, self._fmu = Path(path), machine, None
+        fmpy = import_optional_library("fmpy", "a controller that is an FMU")
+        self._path, self._machine = Path(path), machine
+        self._fmu: Any = None
+        self._time = 0.0
         if not self._path.is_file():
             raise InputError(f"{path}: there is no such FMU, give the path of a .fmu file")
         folder = tempfile.mkdtemp()
@@ -65,7 +65,9 @@ class FmuController(SampledCommand):
             self._folder = fmpy.extract(str(path), unzipdir=folder)
         if self._description.coSimulation is None:
             raise InputError(f"{path}: it has no co-simulation, export the controller with it")
-        self._inputs = [(self._reference(x, "input"), self._quantity(y)) for x, y in inputs.items()]
+        self._inputs = [
+            (self._reference(x, "input"), self._quantity(y)) for x, y in inputs.items()
+        ]
         for name in outputs:
             check_name(name, self.output_names, f"{path}: no valve or drive '{name}'")
         self._outputs = [self._reference(x, "output") for x in outputs.values()]
@@ -87,6 +89,7 @@ class FmuController(SampledCommand):
         if callable(quantity):
             return quantity
         active, circuit = self._machine.active, self._machine.hydraulics
+        names: dict[str, tuple[int, Any]]
         names = {f"{kind}_{joint}": (i + 1, j) for i, kind in enumerate("qv")
                  for j, joint in enumerate(active)}  # fmt: skip
         for j, joint in enumerate(circuit.joints if circuit is not None else ()):
@@ -108,6 +111,9 @@ class FmuController(SampledCommand):
         from fmpy.fmi2 import FMU2Slave
         from fmpy.fmi3 import FMU3Slave
 
+        if self._fmu is not None:
+            self._fmu.terminate()
+            self._fmu.freeInstance()
         given = self._description
         is_fmi3 = given.fmiVersion.startswith("3")
         fmu = (FMU3Slave if is_fmi3 else FMU2Slave)(
@@ -132,9 +138,6 @@ class FmuController(SampledCommand):
         values = [float(f(time, q_a, v_a, pressures)) for _, f in self._inputs]
         with self._errors(f"at t = {time:g} s it stops", SimulationError):
             if self._fmu is None or time <= self._time:
-                if self._fmu is not None:
-                    self._fmu.terminate()
-                    self._fmu.freeInstance()
                 self._fmu = self._start(time, values)
             self._set([x for x, _ in self._inputs], values)
             self._fmu.doStep(time, self.period)

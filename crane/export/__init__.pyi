@@ -1,3 +1,3 @@
 from .c_sources import write_c as write_c
-from .fmu import write_fmu as write_fmu
+from .fmu_files import write_fmu as write_fmu
 from .instance_program import InstanceProgram as InstanceProgram

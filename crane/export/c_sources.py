@@ -292,6 +292,7 @@ def _operations(formula: Formula) -> list[int]:
 
 
 def read_template(name: str) -> str:
+    """The text of a template."""
     folder = files("crane.export") / "templates"
     return (folder / f"{name}.template").read_text(encoding="utf-8")
 

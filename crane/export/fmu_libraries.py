@@ -13,6 +13,7 @@ from shutil import which
 from typing import NamedTuple
 
 from crane.common.errors import CraneWarning, InputError
+from crane.common.optional_libraries import installation_hint
 
 
 class LibraryPlatform(NamedTuple):
@@ -57,13 +58,13 @@ def library_compilers() -> dict[str, list[str]]:
         found[own] = [*compiler.split(), "-fPIC"]
     if not found:
         raise InputError(
-            f"no C compiler is here for the library of an FMU on {own}: pip install "
-            "'crane-dynamics[fmu]', or install gcc or clang"
+            f"no C compiler is here for the library of an FMU on {own}: install gcc or clang, or "
+            f"ziglang: {installation_hint('fmu')}"
         )
     if [*found] == [own]:
         warnings.warn(
-            f"the FMU has a library for {own} alone, others need ziglang: pip install "
-            "'crane-dynamics[fmu]'; its C sources are inside",
+            f"the FMU has a library for {own} alone, and its C sources; for Windows and other "
+            f"processors ziglang is needed, {installation_hint('fmu')}",
             CraneWarning,
             stacklevel=3,
         )
@@ -94,8 +95,7 @@ def compile_libraries(
                 cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
             )  # fmt: skip
         errors = {key: process.communicate()[1] for key, process in processes.items()}
-        for key, process in processes.items():
-            if process.returncode:
-                first = next(iter(errors[key].strip().splitlines()), "it gives no reason")
-                raise InputError(f"the C compiler for {key} fails: {first}")
+        for key in (key for key, process in processes.items() if process.returncode):
+            first = next(iter(errors[key].strip().splitlines()), "it gives no reason")
+            raise InputError(f"the C compiler for {key} fails: {first}")
         return {key: (Path(folder) / key / name).read_bytes() for key in processes}

@@ -2,7 +2,8 @@
 
 import re
 from collections.abc import Iterator
-from functools import cached_property
+from functools import cached_property, reduce
+from operator import or_
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +24,8 @@ _KINDS = {
     "time": TIME, "inputs": INPUT, "v_a": OUTPUT, "contacts": LOCAL, "controller": LOCAL,
     "work": OUTPUT, "dissipated": OUTPUT, "tau": OUTPUT, "friction": OUTPUT, "kinetic": OUTPUT,
     "potential": OUTPUT, "friction_at_rest": OUTPUT, "external": OUTPUT, "a": OUTPUT,
-    "channels": OUTPUT, "derivatives": LOCAL, "event": LOCAL, "tip_position": OUTPUT, "payload": TUNABLE,
+    "channels": OUTPUT, "derivatives": LOCAL, "event": LOCAL, "tip_position": OUTPUT,
+    "payload": TUNABLE,
 }  # fmt: skip
 _TUNABLE_DYNAMICS = ("inertias", "joint_laws", "gravity", "rotor_inertias", "distances")
 _STATE_ACCURACY = 1e-8  # share of a state of a circuit that its scale stands for
@@ -99,12 +101,11 @@ class FmuVariables:
         kinds |= dict.fromkeys(self._indices("q"), GUESS)
         kinds |= {i: STATE_START for i in self.states if i in self._indices("q")}
         kinds |= dict(self._parameters())
-        for i, kind in kinds.items():
-            if i < program.layout.size:
-                unit = units[i]
-                if i in self._indices("settings"):
-                    unit = self._setting_unit(program.names[i])
-                yield FmuVariable(i, names[i], unit, kind, float(self.start[i]))
+        own = [i for i in kinds if i < program.layout.size]
+        settings = self._indices("settings")
+        units = [_setting_unit(names[i]) if i in settings else x for i, x in enumerate(units)]
+        for i in own:
+            yield FmuVariable(i, names[i], units[i], kinds[i], float(self.start[i]))
         for i, state in enumerate(self.states):
             numerator, _, denominator = (units[state] or "1").partition("/")
             unit = f"{numerator}/{denominator}{'/' if denominator else ''}s".replace("s/s", "s2")
@@ -136,10 +137,6 @@ class FmuVariables:
                         if i in loads)  # fmt: skip
         yield from ((i, TUNABLE) for i in self._indices("settings") if i in loads)
 
-    def _setting_unit(self, name: str) -> str:
-        ends = (x for x in _SETTING_UNITS if re.search(rf"_{x}(_[ab])?$", name))
-        return _SETTING_UNITS.get(next(ends, ""), "")
-
     def _structured_name(self, name: str) -> str:
         """q_X_lift as X_lift.stroke, pressure_X_lift_a as X_lift.pressure_a."""
         machine = self.program.machine
@@ -151,8 +148,10 @@ class FmuVariables:
         owner = match[0].strip("_") if match[0].strip("_") in owners else match[0]
         rest = "_".join(filter(None, (name[: match.start()], name[match.end() :]))) or "value"
         is_length = owner in machine.joints and machine.unit(owner) == "m"
-        words = {"q": "stroke" if is_length else "angle", "v": "rate",
-                 "tau": "force" if is_length else "torque", "rest": "friction_at_rest"}  # fmt: skip
+        words = {
+            "q": "stroke" if is_length else "angle", "v": "rate",
+            "tau": "force" if is_length else "torque", "rest": "friction_at_rest",
+        }  # fmt: skip
         return f"{_identifier(owner)}.{_identifier(words.get(rest, rest))}"
 
     @cached_property
@@ -174,20 +173,19 @@ class FmuVariables:
     @cached_property
     def dependencies(self) -> dict[int, list[int]]:
         """Value references of states and inputs that outputs and derivatives depend on."""
-        layout, q = self.program.layout, self._indices("q")
-        active = [i for i in self.states if i in q]
-        found: dict[int, set[int]] = {i: {i} for i in self.states}
-        for formula, first in (("rate", q.start), ("observe", layout.start_index("tau"))):
-            for i, loads in enumerate(self._loads(formula)):
-                known = {layout.start_index("inputs") + x for array, x in loads if array == 3}
-                known |= {q.start + x for array, x in loads if array == 4}
-                closed = known if not known & {*q} else known - {*q} | {*active}
-                if first != q.start:
-                    found[first + i] = closed
-                elif q.start + i in self.states:
-                    derivative = self.states.index(q.start + i)
-                    found[self.layout.start_index("derivatives") + derivative] = closed
-        found |= {i: {*active} for i in (*q, *self._indices("tip_position")) if i not in found}
+        at, q = self.layout.start_index, self._indices("q")
+        active = {i for i in self.states if i in q}
+
+        def closed(loads: set[tuple[int, int]]) -> set[int]:
+            known = {at("inputs") + x for array, x in loads if array == 3}
+            known |= {q.start + x for array, x in loads if array == 4}
+            return known - {*q} | active if known & {*q} else known
+
+        rates = [closed(x) for x in self._loads("rate")]
+        found = {at("derivatives") + i: rates[x - q.start] for i, x in enumerate(self.states)}
+        found |= {at("tau") + i: closed(x) for i, x in enumerate(self._loads("observe"))}
+        found |= {i: active for i in (*q, *self._indices("tip_position"))}
+        found |= {i: {i} for i in self.states}
         return {i: sorted(x) for i, x in found.items()}
 
     def _loads(self, name: str) -> list[set[tuple[int, int]]]:
@@ -216,11 +214,15 @@ def _formula_loads(formula: Formula, size: int) -> list[set[tuple[int, int]]]:
             mask = 1 << len(places)
             places.append((operands[0], operands[1]))
         elif kind != "load":
-            for x in operands:
-                mask |= masks[x] if type(x) is int else 0
+            mask = reduce(or_, (masks[x] for x in operands if type(x) is int), 0)
         masks.append(mask)
     found = [masks[x.index] if isinstance(x, SymbolicExpression) else 0 for x in outputs]
     return [{place for i, place in enumerate(places) if mask >> i & 1} for mask in found]
+
+
+def _setting_unit(name: str) -> str:
+    ends = (x for x in _SETTING_UNITS if re.search(rf"[._]{x}(_[ab])?$", name))
+    return _SETTING_UNITS.get(next(ends, ""), "")
 
 
 def _identifier(name: str) -> str:
@@ -238,15 +240,13 @@ def base_unit(unit: str) -> dict[str, int]:
         InputError: It is unknown.
     """
     total: dict[str, int] = {}
-    for place, part in enumerate(unit.split("/")):
-        for word in part.split():
-            match = re.fullmatch(r"([A-Za-z]+?)(\d*)|1", word)
-            base = _DERIVED_UNITS.get(match[1] or "1") if match else None
-            if base is None or match is None:
-                raise InputError(f"unit '{unit}' is no unit of an FMU")
-            exponent = int(match[2] or 1) * (-1 if place else 1)
-            for name, power in base.items():
-                total[name] = total.get(name, 0) + exponent * power
+    words = [(word, -1 if i else 1) for i, x in enumerate(unit.split("/")) for word in x.split()]
+    for word, sign in words:
+        match = re.fullmatch(r"([A-Za-z]+|1)(\d*)", word)
+        if match is None or match[1] not in _DERIVED_UNITS:
+            raise InputError(f"unit '{unit}' is no unit of an FMU")
+        for name, power in _DERIVED_UNITS[match[1]].items():
+            total[name] = total.get(name, 0) + sign * int(match[2] or 1) * power
     return {name: power for name, power in total.items() if power}
 
 
@@ -256,4 +256,3 @@ _DERIVED_UNITS: dict[str, dict[str, int]] = {
     "Pa": {"kg": 1, "m": -1, "s": -2}, "W": {"kg": 1, "m": 2, "s": -3},
     "V": {"kg": 1, "m": 2, "s": -3, "A": -1},
 }  # fmt: skip
-

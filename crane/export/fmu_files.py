@@ -15,7 +15,16 @@ from crane.common.errors import check_name
 from crane.export.c_sources import CSources, read_template
 from crane.export.fmu_libraries import PLATFORMS, compile_libraries, library_compilers
 from crane.export.fmu_variables import (
-    FIXED, GUESS, INPUT, LOCAL, OUTPUT, STATE_START, TIME, TUNABLE, FmuVariable, FmuVariables,
+    FIXED,
+    GUESS,
+    INPUT,
+    LOCAL,
+    OUTPUT,
+    STATE_START,
+    TIME,
+    TUNABLE,
+    FmuVariable,
+    FmuVariables,
     base_unit,
 )  # fmt: skip
 from crane.export.instance_program import InstanceProgram
@@ -190,12 +199,12 @@ class FmuFiles:
     def description(self) -> str:
         """modelDescription.xml."""
         fmi, machine = self._fmi, self._program.machine
-        own = {"instantiationToken": self._token} if fmi == 3 else {
-            "guid": self._token,
-            "numberOfEventIndicators": str(self._values.layout.parts["event"]),
-        }  # fmt: skip
+        events = str(self._values.layout.parts["event"])
+        own: dict[str, str] = {"instantiationToken": self._token}
+        if fmi == 2:
+            own = {"guid": self._token, "numberOfEventIndicators": events}
         root = ET.Element(
-            "fmiModelDescription", fmiVersion=f"{fmi}.0", modelName=machine.name, **own,
+            "fmiModelDescription", own, fmiVersion=f"{fmi}.0", modelName=machine.name,
             description=f"{machine.name}, written by crane", variableNamingConvention="structured",
             generationTool=f"crane {crane.__version__}",
         )  # fmt: skip
@@ -211,8 +220,7 @@ class FmuFiles:
             element = ET.SubElement(root, kind, {**abilities, **further})
             if fmi == 2:
                 files = ET.SubElement(element, "SourceFiles")
-                for name in self._source_files:
-                    ET.SubElement(files, "File", name=name)
+                files.extend(ET.Element("File", name=name) for name in self._source_files)
         units = ET.SubElement(root, "UnitDefinitions")
         for unit in sorted({x.unit for x in self._variables} - {""}):
             base = {name: str(power) for name, power in base_unit(unit).items()}
@@ -262,17 +270,19 @@ class FmuFiles:
         }  # fmt: skip
         names = {"Output": "Outputs", "ContinuousStateDerivative": "Derivatives",
                  "InitialUnknown": "InitialUnknowns"}  # fmt: skip
-        attribute = "valueReference" if self._fmi == 3 else "index"
-        for kind, variables in unknowns.items():
-            if self._fmi == 2 and kind not in names:
-                continue
+        kinds = unknowns if self._fmi == 3 else names
+        for kind in kinds:
             parent = structure if self._fmi == 3 else ET.SubElement(structure, names[kind])
-            for variable in variables:
-                given = {attribute: self._index(variable.reference)}
-                known = self._values.dependencies.get(variable.reference)
-                if known is not None and kind != "InitialUnknown":
-                    given["dependencies"] = " ".join(map(self._index, known))
-                ET.SubElement(parent, kind if self._fmi == 3 else "Unknown", given)
+            for variable in unknowns[kind]:
+                self._add_unknown(parent, kind, variable)
+
+    def _add_unknown(self, parent: ET.Element, kind: str, variable: FmuVariable) -> None:
+        attribute = "valueReference" if self._fmi == 3 else "index"
+        given = {attribute: self._index(variable.reference)}
+        known = self._values.dependencies.get(variable.reference)
+        if known is not None and kind != "InitialUnknown":
+            given["dependencies"] = " ".join(map(self._index, known))
+        ET.SubElement(parent, kind if self._fmi == 3 else "Unknown", given)
 
     def _documentation(self, about: str) -> str:
         rows = "".join(
