@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from warned import quiet
 
 import crane
 from crane.common.errors import InputError
