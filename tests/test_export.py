@@ -14,8 +14,11 @@ from warned import quiet
 import crane
 from crane.codegen.wasm_emitter import emit_wasm_module
 from crane.common.errors import InputError
+from crane.control import interpolate_references
 from crane.export import InstanceProgram, write_c
 from crane.export.c_sources import CSources
+from crane.export.instance_program import DYNAMICS_ROUTINES
+from crane.export.instance_routines import TOO_MANY_CALLS
 
 COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic"]
@@ -48,8 +51,9 @@ def run(path, *before):
 class Library:
     """The functions of a machine in C, and an instance as numpy arrays by part."""
 
-    def __init__(self, machine, folder, *flags):
-        self.program = InstanceProgram(machine)
+    def __init__(self, machine, folder, *flags, controller=None, quantities=None):
+        quantities = DYNAMICS_ROUTINES if quantities is None else quantities
+        self.program = InstanceProgram(machine, controller, quantities)
         texts = CSources(self.program, "m").files()
         for name in ("m.h", "m.c"):
             (folder / name).write_text(texts[name])
@@ -74,9 +78,8 @@ def signals(program, times):
     return found
 
 
-def largest_difference(machine, folder, steps=150, step=0.01):
+def largest_difference(machine, library, steps=150, step=0.01):
     """Of the active coordinates in C and by `simulate`, over their motion; transitions."""
-    library = Library(machine, folder)
     program, times = library.program, step * np.arange(steps + 1)
     moved = signals(program, times)
     command = crane.control.ValveSignals(machine, times, moved)
@@ -106,7 +109,7 @@ def test_sources_compile_without_warnings_and_their_self_test_passes(tmp_path):
 @pytest.mark.slow
 def test_a_motion_with_joints_that_stick_is_that_of_simulate(tmp_path):
     machine = crane.load("patu655")
-    difference, expected = largest_difference(machine, tmp_path)
+    difference, expected = largest_difference(machine, Library(machine, tmp_path))
     assert difference < 1e-12
     stick = np.array([x for name, x in expected.channels.items() if name.startswith("rest_")])
     assert 0 < np.count_nonzero(stick) < stick.size
@@ -233,7 +236,77 @@ def test_a_motion_in_web_assembly_is_that_of_simulate(tmp_path):
     assert np.abs(difference).max() < 1e-12 * np.ptp(expected.q, axis=0).max()
 
 
-def test_dead_time_is_refused():
-    machine = crane.load("patu655", changes={"valve.X_lift.delay": 0.05})
-    with pytest.raises(InputError, match="have a dead time"):
-        InstanceProgram(machine)
+def tracking_difference(machine, task, make_controller, folder, steps, step=0.01):
+    """Of the active coordinates in C and by `simulate` with a reference by samples, relative."""
+    reference = crane.task_trajectory(machine, task)
+    law, times = make_controller(machine, reference), step * np.arange(steps + 1)
+    rows, start = law.references(times), reference.position(0.0)
+    sampled = interpolate_references(law, times, rows)
+    expected = quiet(
+        crane.simulate, machine, sampled, initial=start, duration=times[-1], step=step
+    )
+    library = Library(machine, folder, controller=law, quantities=())
+    library.at.step[:] = step
+    library.at.q[machine.closure.active] = start
+    library.at.inputs[: len(rows.T)] = rows[0]
+    assert library("initialize") == 1
+    worst = 0.0
+    for row, q_a in zip(rows[1:], expected.q[1:], strict=True):
+        library.at.inputs[: len(row)] = row
+        assert library("advance") == 1
+        worst = max(worst, np.abs(library.at.q[machine.closure.active] - q_a).max())
+    motion, errors = np.ptp(expected.q, axis=0).max(), expected.q - reference.position(times)
+    return worst / motion, np.abs(errors).max() / motion
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "task", "controller", "steps"),
+    [
+        ("mini_forwarder", "lift", crane.PI, 1000),
+        ("patu655", "reach", crane.control.ValvePD, 400),
+    ],
+)
+def test_a_closed_loop_is_that_of_simulate(tmp_path, name, task, controller, steps):
+    machine = crane.load(name)
+    difference, error = tracking_difference(machine, task, controller, tmp_path, steps)
+    assert difference < 1e-12
+    assert error < 0.5  # the loop is closed
+
+
+def test_a_controller_has_its_gains_and_references_by_name():
+    machine = crane.load("mini_forwarder")
+    controller = crane.control.make_controller("pi", machine)
+    program = InstanceProgram(machine, controller, quantities=())
+    at = program.layout.view(np.array(program.names))
+    assert at.inputs.tolist()[:3] == ["reference_q1", "reference_X1", "reference_X2"]
+    assert at.settings.tolist()[:4] == ["q1_kp", "X1_kp", "X2_kp", "q1_ki"]
+    assert at.controller.tolist()[0] == "error_integral_q1"
+    home = program.layout.view(program.defaults).inputs[:3]
+    assert home == pytest.approx(machine.home[machine.closure.active])
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_dead_times_of_valves_are_those_of_simulate(tmp_path):
+    """Not whole milliseconds, nor equal for all valves."""
+    machine = crane.load("patu655", {"valve.X_lift.delay": 0.0437, "valve.X_ext.delay": 0.02})
+    library = Library(machine, tmp_path, quantities=())
+    assert "X_lift_delay" in library.program.names
+    assert largest_difference(machine, library, steps=100)[0] < 1e-12
+    for step, most in ((1e-3, 200), (1e-4, 100)):  # that of `simulate`, and a tenth of it
+        library.at.step[:] = step
+        statuses = {library("advance") for _ in range(most)}
+        assert statuses == ({1} if step == 1e-3 else {1, TOO_MANY_CALLS})
+
+
+def test_controllers_that_are_programs_in_python_are_refused():
+    machine = crane.load("patu655", {"valve.X_lift.delay": 0.05})
+    for controller, text in (
+        (lambda time, q_a, v_a: 0.0 * q_a, "function is computed in Python"),
+        (crane.control.SampledCommand(lambda *at: np.zeros(4), machine), "SampledCommand is comp"),
+        (crane.control.make_controller("valve-pd", machine), "ValvePD with valves that have a de"),
+    ):
+        with pytest.raises(InputError, match=text):
+            InstanceProgram(machine, controller)

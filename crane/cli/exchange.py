@@ -16,6 +16,7 @@ from crane.cli.options import (
     RequiredOutputFile,
     TimeOptions,
 )
+from crane.cli.simulate import ExportedController
 from crane.common.atomic_output import (
     check_file_is_writable,
     check_folder_is_writable,
@@ -70,6 +71,7 @@ def export(
     options: MachineOptions,
     output: OutputFolder,
     to: Annotated[str, typer.Option(metavar="TARGET", help="Target: c (C99 sources).")] = "c",
+    controller: ExportedController = None,
     name: Annotated[
         str,
         typer.Option(metavar="NAME", help="Prefix of all names; that of the machine by default."),
@@ -79,7 +81,10 @@ def export(
     check_name(to, _TARGETS, f"--to is '{to}'")
     check_folder_is_writable(output.out, output.force)
     loaded = options.load(machine)
-    written = crane.export.write_c(loaded, output.out, name=name, overwrite=output.force)
+    law = None if controller is None else crane.control.make_controller(controller, loaded)
+    written = crane.export.write_c(
+        loaded, output.out, controller=law, name=name, overwrite=output.force
+    )
     print(f"written to {written}: see its header, or cmake -B build -S {written}")
 
 

@@ -56,6 +56,15 @@ ControllerName = Annotated[
         "configuration; without it, drive forces are zero and valves stay at neutral.",
     ),
 ]
+ExportedController = Annotated[
+    str | None,
+    typer.Option(
+        "--controller",
+        metavar="NAME",
+        help="Controller whose references are the inputs: pi, computed-torque, valve-pd or "
+        "valve-feedforward; by default forces of drives or signals of valves are.",
+    ),
+]
 Duration = Annotated[
     float | None, number_option("s", "Duration; that of the task or path by default.")
 ]
@@ -258,11 +267,7 @@ def task_control(
     """
     if task is None:
         refuse_options({"--sway": sway}, "changes a reference, name a --task or a --path")
-        if controller is None:
-            return None
-        home = machine.home[machine.closure.active]
-        trajectory = crane.point_to_point(home, home, 1.0)
-        return crane.control.make_controller(controller, machine, trajectory)
+        return None if controller is None else crane.control.make_controller(controller, machine)
     check_name(task, machine.tasks, f"machine '{machine.name}' has no task '{task}'")
     if machine.tasks[task].space == "joystick":
         text = f"does not go with task '{task}', which moves levers, leave it out"

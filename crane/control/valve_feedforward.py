@@ -254,6 +254,8 @@ class ValveFeedforward(ValvePD):
         valves = circuit.valves.values()
         lags = [2.0 * x.damping / x.bandwidth if x.bandwidth else 0.0 for x in valves]
         self._damps_sway = damping > 0
+        openings = {f"opening_{name}": "" for name in circuit.spools}
+        self.reference_units = {} if self._damps_sway else {**self.reference_units, **openings}
         count = max(8, int(np.ceil(reference.duration * _KNOTS_PER_SECOND)) + 1)
         self._knot_times = np.linspace(0.0, reference.duration, count)
         q_a, v_a, a_a = reference(self._knot_times)

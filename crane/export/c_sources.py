@@ -15,6 +15,8 @@ from crane.codegen.symbolic import SymbolicExpression, required_operations
 from crane.codegen.vector_layout import Formula
 from crane.common.atomic_output import check_folder_is_writable, replace_folder
 from crane.common.samples import Array
+from crane.control.control_law import Controller
+from crane.control.valve_commands import ValveCommand
 from crane.export.instance_program import DYNAMICS_ROUTINES, InstanceProgram
 from crane.export.instance_routines import STATUS_TEXTS
 from crane.export.recorded_values import random_vectors, recorded_motion
@@ -23,7 +25,7 @@ from crane.machine.machine import Machine
 
 _ARRAYS = (
     "q", "v_a", "contacts", "tau", "friction", "friction_at_rest", "a", "cursor", "lengths",
-    "bounds", "tolerances",
+    "bounds", "tolerances", "history",
 )  # fmt: skip
 _PARAMETERS = ("geometry", "dynamics", "settings")
 _TEMPLATES = (
@@ -64,7 +66,12 @@ def c_identifier(name: str) -> str:
 
 
 def write_c(
-    machine: Machine | str | Path, folder: str | Path, *, name: str = "", overwrite: bool = True
+    machine: Machine | str | Path,
+    folder: str | Path,
+    *,
+    controller: Controller | ValveCommand | None = None,
+    name: str = "",
+    overwrite: bool = True,
 ) -> Path:
     """Write a machine as C99 sources, with a self-test, examples and a CMakeLists.txt.
 
@@ -75,6 +82,7 @@ def write_c(
     Args:
         machine: The machine, or what `crane.load` takes.
         folder: Folder of the files.
+        controller: See `InstanceProgram`; the inputs are forces or valve signals without it.
         name: Prefix of all public names; that of the machine by default.
         overwrite: Whether files of the same names are replaced.
 
@@ -87,7 +95,7 @@ def write_c(
     """
     check_folder_is_writable(Path(folder), overwrite)
     loaded = machine if isinstance(machine, Machine) else load(machine)
-    texts = CSources(InstanceProgram(loaded), name).files()
+    texts = CSources(InstanceProgram(loaded, controller), name).files()
     with replace_folder(folder, overwrite) as output_folder:
         for file, text in texts.items():
             (output_folder / file).write_text(text, encoding="utf-8")

@@ -21,8 +21,8 @@ from crane.codegen import (
 from crane.codegen.linked_functions import LinkedFunction, link_functions
 from crane.common.errors import CraneWarning, InputError
 from crane.common.samples import Array
-from crane.control.control_law import ControlLaw
-from crane.control.valve_commands import ValveSignals
+from crane.control.control_law import ControlLaw, Controller
+from crane.control.valve_commands import ValveCommand, ValveSignals
 from crane.control.valve_drive import ValveDrive
 from crane.description.external_forces import Wrench
 from crane.dynamics.compiled_dynamics import DERIVATIVES_OF, build_quantity
@@ -39,13 +39,14 @@ from crane.simulation.integration.error_controlled_stepper import (
 )
 from crane.simulation.integration.machine_code_stepper import RungeKuttaStepper
 from crane.simulation.integration.rosenbrock import RosenbrockStepper
-from crane.simulation.simulation_setup import machine_under_control
+from crane.simulation.simulation_setup import machine_under_control, resolve_controller
 
 TIP_WRENCH_NAME = "tip"
 SINGLE_PRECISION_TOLERANCE = 1e-4  # of a step
 # over those of double precision: residuals of rounding, of closed loops; last step of Newton
 _SINGLE_PRECISION_BOUNDS = np.array([1e9, 1e8, 1e6])
 MAX_STEPS, MAX_EVENTS = 10_000, 200  # of one call of `advance`, by default
+_DELAYED_STEP = 1e-3  # shortest steps of which a dead time remembers all [s]
 DYNAMICS_ROUTINES = MappingProxyType(
     {
         "inverse_dynamics": "inverse",
@@ -63,14 +64,49 @@ DYNAMICS_ROUTINES = MappingProxyType(
 )
 
 
+def _exported_control(
+    machine: Machine, controller: Controller | ValveCommand | None
+) -> ControlLaw:
+    """The law of an instance: a given one, or one whose references are forces or signals.
+
+    Raises:
+        InputError: It is computed in Python.
+    """
+    if controller is None:
+        if machine.hydraulics is None:
+            return ForceInputs(machine)
+        return ValveDrive(machine, ValveSignals(machine, [0.0], {}))
+    control = resolve_controller(controller, machine)
+    name = type(controller).__name__
+    drive = control if isinstance(control, ValveDrive) else None
+    if not isinstance(control, ControlLaw) or (drive and drive.command.period):
+        raise InputError(
+            f"{name} is computed in Python, which no other target has: give a crane.control."
+            "ControlLaw, or a ValveCommand without a period"
+        )
+    if drive and drive.period:
+        raise InputError(
+            f"{name} with valves that have a dead time is computed in Python, which no other "
+            "target has: set their delay to 0"
+        )
+    if drive and drive.command.has_measured_pressures:
+        raise InputError(
+            f"{name} has measured pressures, which are no inputs of a program: leave them out"
+        )
+    return control
+
+
 class InstanceProgram:
     """A machine with its drives as one program.
 
     The inputs are the forces of the drives [N], [N m], or the signals at the valves [V] of a
-    machine with a circuit; then force [N] and moment [N m] at the tip, in the axes of the world.
+    machine with a circuit, or the references of a controller; then force [N] and moment [N m] at
+    the tip, in the axes of the world.
 
     Args:
         machine: The machine.
+        controller: Control law or valve command, as for `simulate`. Its references at time 0 are
+            the defaults of the inputs; its settings are parameters, and its states states.
         quantities: Routines of `DYNAMICS_ROUTINES` to include; all by default.
 
     Attributes:
@@ -86,33 +122,29 @@ class InstanceProgram:
         functions: All linked functions, each after what it calls.
 
     Raises:
-        InputError: The formulas are too long, or a load is a function in Python.
+        InputError: The formulas are too long, or a load or the controller is a function in Python.
     """
 
-    def __init__(self, machine: Machine, quantities: Sequence[str] = tuple(DYNAMICS_ROUTINES)):
+    def __init__(
+        self,
+        machine: Machine,
+        controller: Controller | ValveCommand | None = None,
+        quantities: Sequence[str] = tuple(DYNAMICS_ROUTINES),
+    ):
         tip = machine.tip
         loads = [] if tip is None else [Wrench(tip, name=TIP_WRENCH_NAME)]
         machine = machine.with_external_forces(*loads)
-        control: ControlLaw
-        if machine.hydraulics is None:
-            control = ForceInputs(machine)
-        else:
-            control = ValveDrive(machine, ValveSignals(machine, [0.0], {}))
+        control = _exported_control(machine, controller)
         machine = machine_under_control(machine, control)
         self.machine, self.control = machine, control
         if not machine.closure.is_compiled:
             raise InputError(f"the loops of '{machine.name}' have no formulas to export")
-        if isinstance(control, ValveDrive) and control.delays.any():
-            raise InputError(
-                f"valves of '{machine.name}' have a dead time, which is not exported: set delay "
-                "to 0, or delay the signals before"
-            )
         if not machine.has_traceable_forces:
             raise InputError(
                 f"a load of '{machine.name}' is a function in Python, which no other target has: "
                 "give a crane.Wrench"
             )
-        states = control.circuit.state_count if isinstance(control, ValveDrive) else 0
+        states = len(control.start(machine.home[machine.closure.active]))
         dynamics = Dynamics(machine)
         self.chart = Chart.from_dynamics(dynamics, control, states)
         is_valve_drive = isinstance(control, ValveDrive)
@@ -136,7 +168,10 @@ class InstanceProgram:
             ) from None
 
     def _make_layout(self) -> Layout:
-        stepper, inputs = self.stepper, self.stepper.reference_columns
+        stepper, inputs, control = self.stepper, self.stepper.reference_columns, self.control
+        spools, rows = 0, 0
+        if isinstance(control, ValveDrive) and control.delays.any():
+            spools, rows = len(control.delays), int(control.delays.max() / _DELAYED_STEP) + 4
         return Layout(
             time=1, step=1, inputs_start=inputs, inputs=inputs,
             **self.chart.state_layout.parts, **self.chart.output_layout.parts,
@@ -144,7 +179,7 @@ class InstanceProgram:
             tolerances=stepper.tolerance.size, max_events=1,
             geometry=self._closure.geometry.constants.size,
             dynamics=self.chart.dynamics.formula_constants.size,
-            settings=self.control.settings.size,
+            settings=control.settings.size, delays=spools, history=rows * (1 + spools),
         )  # fmt: skip
 
     def _default_instance(self) -> Array:
@@ -159,9 +194,10 @@ class InstanceProgram:
         at.bounds[:], at.tolerances[:] = self.stepper.bounds, self.stepper.tolerance
         at.geometry[:] = self._closure.geometry.constants
         at.dynamics[:], at.settings[:] = dynamics.formula_constants, self.control.settings
-        if isinstance(self.control, ValveDrive):
-            neutral = [x.neutral for x in self.control.circuit.hydraulics.spools.values()]
-            at.inputs[: len(neutral)] = at.inputs_start[: len(neutral)] = neutral
+        references = self.control.references(np.zeros(1))[0]
+        at.inputs[: len(references)] = at.inputs_start[: len(references)] = references
+        if at.delays.size:
+            at.delays[:] = self.control.delays  # type: ignore[attr-defined]
         return values
 
     @cached_property
@@ -200,7 +236,7 @@ class InstanceProgram:
         programs["steps"] = self.stepper.new_program()
         if self._tip is not None:
             programs["tip"] = self._tip.new_program()
-        if isinstance(self.control, ForceInputs):
+        if not isinstance(self.control, ValveDrive):
             programs["fixed"] = RungeKuttaStepper(self.chart).new_program()
         return programs
 

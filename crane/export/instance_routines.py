@@ -1,6 +1,6 @@
 """Routines of an instance of a machine, see `crane.export.instance_program`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 
 from crane.codegen import (
@@ -16,7 +16,8 @@ from crane.codegen import (
 from crane.codegen.routine_statements import as_value
 from crane.codegen.symbolic import add_vectors, scale_vector, subtract_vectors
 from crane.common.samples import Array
-from crane.export.force_inputs import ForceInputs
+from crane.control.valve_drive import ValveDrive
+from crane.export.dead_times import DEAD_TIME_ROUTINES, DeadTimes
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.error_controlled_stepper import ErrorControlledStepper
 from crane.simulation.integration.machine_code_stepper import HELD_INDEX
@@ -24,7 +25,7 @@ from crane.simulation.integration.machine_formulas import AT_REST_SUFFIX
 from crane.simulation.integration.stick_slip_routine import add_stick_slip_routines
 
 # Statuses of the routines, besides the number of what was done.
-DONE, NOT_CLOSED, BEYOND_CHART, HALTED, TOO_MANY_EVENTS = 1, -1, -2, -3, -4
+DONE, NOT_CLOSED, BEYOND_CHART, HALTED, TOO_MANY_EVENTS, TOO_MANY_CALLS = 1, -1, -2, -3, -4, -5
 STATUS_TEXTS = MappingProxyType(
     {
         DONE: "done",
@@ -32,6 +33,7 @@ STATUS_TEXTS = MappingProxyType(
         BEYOND_CHART: "the active joints do not determine the motion: a dead centre",
         HALTED: "the step failed: the motion diverges, or too many steps were needed",
         TOO_MANY_EVENTS: "joints stick and slip too often",
+        TOO_MANY_CALLS: "the dead time of a valve takes more calls than are kept: longer steps",
     }
 )
 _FIRST_STEP_SHARE, _LONGEST_FIRST_STEP = 0.01, 5e-4  # as `ErrorControlledStepper.run`
@@ -39,7 +41,7 @@ _STEP_REDUCTION_AFTER_EVENT = 0.2
 _TIME_TOLERANCE = 1e-9  # of a step
 INNER_ROUTINES = (
     "find_modes", "orthogonalize", "least_squares", "transposed_least_squares",
-    "bounded_least_squares",
+    "bounded_least_squares", *DEAD_TIME_ROUTINES,
 )  # fmt: skip
 
 
@@ -71,9 +73,12 @@ class InstanceRoutines:
         self._nq, self._n = machine.model.nv, len(machine.active)
         self._k = len(chart.stick_slip.columns)
         self._closure = machine.closure.compiled_closure
+        self._dead_times = DeadTimes(layout) if layout.parts["delays"] else None
 
     def add_to(self, program: Program) -> None:
         """Add all routines to a program that has the functions of `programs`."""
+        if self._dead_times is not None:
+            self._dead_times.add_to(program)
         self._add_stiction(program)
         self._add_initialize(program)
         self._add_advance(program)
@@ -160,6 +165,8 @@ class InstanceRoutines:
                 start = layout.start_index("controller")
                 r.copy(state.element_pointer(start), values, states)
             r.copy(self._part(r.instance, "inputs_start"), refs, self.layout.parts["inputs"])
+            if self._dead_times is not None:
+                self._dead_times.write_start(r)
             cursor = self._part(r.instance, "cursor")
             r.copy(cursor, state, self._nq)
             r.copy(cursor.element_pointer(self._nq), result.element_pointer("gamma"), size)
@@ -180,39 +187,42 @@ class InstanceRoutines:
         columns = self.stepper.reference_columns
         tape = Tape()
         start, end = (tape.load_vector(i, 0, columns) for i in range(2))
-        first = tape.load(2, 0)
-        shares = first, 0.5 + 0.5 * first, 1.0
+        first, last = tape.load_vector(2, 0, 2)
         ramp = subtract_vectors(end, start)
-        rows = [add_vectors(start, scale_vector(share, ramp)) for share in shares[:2]]
-        program.add_formula("ramp", 3, [x for row in (*rows, end) for x in row])
+        rows = [
+            add_vectors(start, scale_vector(share, ramp))
+            for share in (first, 0.5 * (first + last), last)
+        ]
+        program.add_formula("ramp", 3, [x for row in rows for x in row])
         with program.add_routine("advance", arrays=("instance",)) as r:
             self._write_advance(r)
-        if isinstance(self.control, ForceInputs):
+        if not isinstance(self.control, ValveDrive):
             with program.add_routine("advance_fixed", arrays=("instance",)) as r:
                 self._write_fixed_step(r)
 
     def _write_advance(self, r: Routine) -> None:
         columns = self.stepper.reference_columns
-        refs, first = r.local_array("refs", max(1, 3 * columns)), r.local_array("first", 1)
-        row = r.local_array("row", 1)
+        refs, row = r.local_array("refs", max(1, 3 * columns)), r.local_array("row", 1)
         state, lengths = self._part(r.instance, "q"), self._part(r.instance, "lengths")
         bounds, tolerances = (self._part(r.instance, x) for x in ("bounds", "tolerances"))
-        inputs, start = (self._part(r.instance, x) for x in ("inputs", "inputs_start"))
         step = r.new_variable(self._element(r.instance, "step"))
         with r.if_then(~(step > 0.0)):
             r.return_value(HALTED)
+        if self._dead_times is not None:
+            with r.if_then(r.call("append_node", r.instance) < 1):
+                r.return_value(TOO_MANY_CALLS)
         # a run that goes on to the next output instant, see `ErrorControlledStepper.run`
         with r.if_then(~((lengths[0] >= step) & (lengths[0] <= step))):
             r.store(lengths, 0, step)
             longest = select(step < _LONGEST_FIRST_STEP, step, _LONGEST_FIRST_STEP)
             r.store(lengths, 1, longest * _FIRST_STEP_SHARE)
-        time, events = r.new_variable(step * -1.0), r.new_variable(0.0)
+        time, end, events = (r.new_variable(x) for x in (step * -1.0, 0.0, 0.0))
+        write_references = self._references_writer(r, refs, step)
         with r.loop_forever():
-            r.store(first, 0, (time + step) / step)
-            r.call("ramp", start, inputs, first, refs)
+            write_references(time, end)
             r.store(lengths, 2, time)
-            r.store(lengths, 3, time * -1.0)
-            r.store(lengths, 4, 0.0)
+            r.store(lengths, 3, end - time)
+            r.store(lengths, 4, end)
             r.store(lengths, 6, 0.0)
             r.call(
                 "steps_run", 1, *self._machine_arguments(r.instance), refs, state, row, lengths,
@@ -224,18 +234,42 @@ class InstanceRoutines:
                 r.assign(events, events + 1.0)
                 with r.if_then(events > self._element(r.instance, "max_events")):
                     r.return_value(TOO_MANY_EVENTS)
-                r.store(first, 0, (time + step) / step)
-                r.call("ramp", start, inputs, first, refs)
+                write_references(time, end)
                 self._write_find_modes(r, refs)
-            with r.if_else():
-                with r.if_then(~(time < step * -_TIME_TOLERANCE)):
-                    r.break_loop()
+            with r.if_else(), r.if_then(time < end - step * _TIME_TOLERANCE):
                 self._write_halt(r, state)
             with r.if_then(~(time < step * -_TIME_TOLERANCE)):
                 r.break_loop()
         self._store(r, "time", self._element(r.instance, "time") + step)
-        r.copy(start, inputs, columns)
+        r.copy(self._part(r.instance, "inputs_start"), self._part(r.instance, "inputs"), columns)
         r.return_value(DONE)
+
+    def _references_writer(
+        self, r: Routine, refs: ArrayPointer, step: RoutineValue
+    ) -> Callable[[RoutineValue, RoutineValue], None]:
+        """Function that writes the references from a time to `end`, before the end of the call.
+
+        It sets `end` to the next change of a slope, or 0, where valves have dead times.
+        """
+        columns, shares = self.stepper.reference_columns, r.local_array("shares", 2)
+        now, kink = (r.local_array(x, 1) for x in ("now", "kink"))
+        inputs, start = (self._part(r.instance, x) for x in ("inputs", "inputs_start"))
+        goal = r.new_variable(self._element(r.instance, "time") + step)
+
+        def write(time: RoutineValue, end: RoutineValue) -> None:
+            if self._dead_times is not None:
+                r.store(now, 0, goal + time)
+                r.call("find_kink", r.instance, now, kink)
+                r.assign(end, kink[0] - goal)
+                r.assign(end, select(end < step * -_TIME_TOLERANCE, end, 0.0))
+            r.store(shares, 0, (time + step) / step)
+            r.store(shares, 1, (end + step) / step)
+            r.call("ramp", start, inputs, shares, refs)
+            for i, share in enumerate((0.0, 0.5, 1.0) if self._dead_times is not None else ()):
+                r.store(now, 0, goal + time + (end - time) * share)
+                r.call("delay_signals", r.instance, now, refs.row_pointer(i, columns))
+
+        return write
 
     def _write_halt(self, r: Routine, state: ArrayPointer) -> None:
         """Return why a step failed."""
@@ -250,13 +284,14 @@ class InstanceRoutines:
 
     def _write_fixed_step(self, r: Routine) -> None:
         columns, size = self.stepper.reference_columns, self.chart.row_layout.size
-        refs, first = r.local_array("refs", max(1, 3 * columns)), r.local_array("first", 1)
+        refs, shares = r.local_array("refs", max(1, 3 * columns)), r.local_array("shares", 2)
         row, sizes = r.local_array("row", size), r.local_array("sizes", 3)
         state, bounds = self._part(r.instance, "q"), self._part(r.instance, "bounds")
         inputs, start = (self._part(r.instance, x) for x in ("inputs", "inputs_start"))
         step = r.new_variable(self._element(r.instance, "step"))
-        r.store(first, 0, 0.0)
-        r.call("ramp", start, inputs, first, refs)
+        r.store(shares, 0, 0.0)
+        r.store(shares, 1, 1.0)
+        r.call("ramp", start, inputs, shares, refs)
         r.store(sizes, 0, step)
         r.store(sizes, 1, step * 0.5)
         r.store(sizes, 2, 0.0)
@@ -285,6 +320,11 @@ class InstanceRoutines:
         layout = self._programs["steps"].formula_outputs(formula)
         values = r.local_array("values", layout)
         inputs, state = (self._part(r.instance, x) for x in ("inputs", "q"))
+        if self._dead_times is not None:
+            row = r.local_array("row", self.layout.parts["inputs"])
+            r.copy(row, inputs, self.layout.parts["inputs"])
+            r.call("delay_signals", r.instance, self._part(r.instance, "time"), row)
+            inputs = row
         arguments = *self._machine_arguments(r.instance), inputs, state, values
         if self._k:
             with r.if_then(self._element(r.instance, "bounds", HELD_INDEX) > 0.5):

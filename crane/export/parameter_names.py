@@ -1,8 +1,9 @@
 """Names and units of the elements of an instance, in the order of `InstanceProgram.layout`."""
 
 from collections.abc import Iterable, Iterator
-from itertools import compress
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from crane.control.valve_drive import ValveDrive
 from crane.description.external_forces import WRENCH_COMPONENTS
@@ -60,6 +61,16 @@ def _elements(program: "InstanceProgram") -> Iterator[tuple[str, str, str]]:
         for name, unit in program.control.channels:
             yield "channels", name, unit
         yield from (("settings", name, "") for name in _setting_names(program.control))
+        command = program.control.command
+        yield from (("settings", name, unit) for name, unit in command.setting_units.items())
+        if program.layout.parts["delays"]:
+            yield from (("delays", f"{name}_delay", "s") for name in circuit.hydraulics.spools)
+    else:
+        for part, named in (
+            ("controller", program.control.state_units),
+            ("settings", program.control.setting_units),
+        ):
+            yield from ((part, name, unit) for name, unit in named.items())
     yield "work", "work", "J"
     loads = [force.name for force in machine.external_forces]
     yield from (("work", f"work_{name}", "J") for name in loads)
@@ -83,12 +94,11 @@ def _elements(program: "InstanceProgram") -> Iterator[tuple[str, str, str]]:
 
 def _inputs(program: "InstanceProgram") -> Iterator[tuple[str, str]]:
     machine = program.machine
-    if isinstance(program.control, ValveDrive):
-        yield from ((f"signal_{name}", "V") for name in program.control.circuit.hydraulics.spools)
-    else:
-        driven = compress(machine.active, machine.is_driven)
-        units = {"m": "N", "rad": "N m"}
-        yield from ((f"force_{joint}", units.get(machine.unit(joint), "")) for joint in driven)
+    names = program.control.reference_units
+    if not names:
+        count = program.control.references(np.zeros(1)).shape[1]
+        names = {f"reference_{i}": "" for i in range(count)}
+    yield from names.items()
     for force in machine.external_forces:
         count = reference_counts([force])[0]
         pairs = zip(WRENCH_COMPONENTS, _WRENCH_UNITS, strict=True)
@@ -140,7 +150,7 @@ def _setting_names(control: ValveDrive) -> list[str]:
     circuit = control.circuit
     names = circuit.constant_names
     names += [f"{joint}_lower_limit" for joint in circuit.hydraulics.joints]
-    count = len(control.settings) - len(names)
+    count = len(control.settings) - len(names) - len(control.command.setting_units)
     return names + [f"signal_setting_{i}" for i in range(count)]
 
 

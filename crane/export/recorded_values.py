@@ -7,13 +7,16 @@ import numpy as np
 
 from crane.common.errors import CraneWarning
 from crane.common.samples import Array
-from crane.control.valve_commands import ValveSignals
+from crane.control.control_law import ControlLaw
+from crane.control.reference_samples import interpolate_references
+from crane.control.valve_commands import ValveCommand, ValveSignals, require_circuit
 from crane.control.valve_drive import ValveDrive
 from crane.dynamics.dynamics import Dynamics
 from crane.export.instance_program import DYNAMICS_ROUTINES, InstanceProgram
 from crane.simulation.simulation_run import simulate
 
 _TEST_STATES, _TEST_STEPS, _TEST_STEP = 20, 50, 0.01
+_FOLLOWED = 0.01  # displacement of references [m], [rad]
 
 
 class RecordedMotion(NamedTuple):
@@ -31,17 +34,25 @@ class RecordedMotion(NamedTuple):
 
 
 def recorded_motion(program: InstanceProgram) -> RecordedMotion:
-    """A motion by `simulate`: valves open slowly, or the machine moves without forces."""
+    """A motion by `simulate`: valves open slowly, or the machine follows or moves freely."""
     machine, control = program.machine, program.control
-    times = _TEST_STEP * np.arange(_TEST_STEPS + 1)
+    times = np.linspace(0.0, _TEST_STEP * _TEST_STEPS, _TEST_STEPS + 1)
     start = program.layout.view(program.defaults).inputs
-    inputs, controller = np.tile(start, (len(times), 1)), None
+    inputs, shares = np.tile(start, (len(times), 1)), times / times[-1]
+    controller: ControlLaw | ValveCommand = control
     if isinstance(control, ValveDrive):
-        spools = control.circuit.hydraulics.spools
+        controller = control.command
+    if isinstance(controller, ValveSignals):
+        spools = require_circuit(machine).spools
         for i, spool in enumerate(spools.values()):
-            inputs[:, i] += 0.6 * (spool.full - spool.neutral) * times / times[-1] * (-1) ** i
+            inputs[:, i] += 0.6 * (spool.full - spool.neutral) * shares * (-1) ** i
         signals = {name: inputs[:, i] for i, name in enumerate(spools)}
         controller = ValveSignals(machine, times, signals)
+    else:
+        for i, unit in enumerate(control.reference_units.values()):
+            inputs[:, i] += _FOLLOWED * shares * (unit in ("m", "rad"))
+        rows = inputs[:, : control.references(times).shape[1]]
+        controller = interpolate_references(controller, times, rows)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
         recording = simulate(machine, controller, duration=times[-1], step=_TEST_STEP)
