@@ -4,7 +4,7 @@ import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -186,8 +186,8 @@ def simulate(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="A recording whose valve signals are replayed, and whose other columns are "
-            "compared with the simulation.",
+            help="A recording whose valve signals are replayed, or with --controller whose "
+            "references are followed; its other columns are compared with the simulation.",
         ),
     ] = None,
     load: Annotated[
@@ -218,10 +218,12 @@ def simulate(
     loaded = loaded.with_external_forces(*map(parse_load, load or ()))
     result: Result
     if inputs is not None:
-        for block in (motion, integration):
+        for block in (replace(motion, controller=None), integration):
             block.refuse("does not go with --inputs, leave it out")
         with _write_stopped_run(output, npz), progress_bar("simulating") as progress:
-            _, result = crane.replay(loaded, inputs, step, progress, reading.columns, reading.span)
+            _, result = crane.replay(
+                loaded, inputs, step, progress, reading.columns, reading.span, motion.controller
+            )
     else:
         reading.refuse("is for --inputs, leave it out")
         control, duration = motion.control(loaded, step)

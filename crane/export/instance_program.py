@@ -24,7 +24,7 @@ from crane.common.samples import Array
 from crane.control.control_law import ControlLaw, Controller
 from crane.control.valve_commands import ValveCommand, ValveSignals
 from crane.control.valve_drive import ValveDrive
-from crane.description.external_forces import Wrench
+from crane.description.external_forces import TIP_WRENCH_NAME, Wrench
 from crane.dynamics.compiled_dynamics import DERIVATIVES_OF, build_quantity
 from crane.dynamics.dynamics import Dynamics
 from crane.export.force_inputs import ForceInputs
@@ -41,7 +41,6 @@ from crane.simulation.integration.machine_code_stepper import RungeKuttaStepper
 from crane.simulation.integration.rosenbrock import RosenbrockStepper
 from crane.simulation.simulation_setup import machine_under_control, resolve_controller
 
-TIP_WRENCH_NAME = "tip"
 SINGLE_PRECISION_TOLERANCE = 1e-4  # of a step
 # over those of double precision: residuals of rounding, of closed loops; last step of Newton
 _SINGLE_PRECISION_BOUNDS = np.array([1e9, 1e8, 1e6])

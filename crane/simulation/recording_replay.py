@@ -17,7 +17,8 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.progress import progress_reporter
 from crane.common.result import Result
 from crane.common.samples import Array, as_number
-from crane.control.valve_commands import ValveSignals, require_circuit
+from crane.control.control_law import ControlLaw
+from crane.control.valve_commands import ValveCommand, ValveSignals, require_circuit
 from crane.control.valve_drive import ValveDrive
 from crane.description.sensors import SUPPLY_PRESSURE, TANK_PRESSURE, VALVE_SIGNAL_PREFIX
 from crane.machine.machine import Machine
@@ -41,6 +42,7 @@ from crane.recordings.recording import (
 from crane.recordings.recording_reader import FULL_TIME_SPAN, TimeSpan, read_quantities
 from crane.recordings.sensor_discrepancy import warn_discrepancies
 from crane.recordings.timeseries import TIME, Table, table_column, time_derivative
+from crane.simulation.recorded_inputs import add_recorded_tip_force, recorded_references
 from crane.simulation.recorded_run import read_simulation, simulated_columns
 from crane.simulation.simulation_run import Progress, simulate
 
@@ -122,8 +124,9 @@ def replay(
     progress: Progress | None = None,
     columns: str | Path | None = None,
     span: TimeSpan = FULL_TIME_SPAN,
+    controller: str | None = None,
 ) -> tuple[Recording, Comparison]:
-    """Simulate a hydraulic machine with measured valve signals.
+    """Simulate a hydraulic machine with measured valve signals, or a closed loop again.
 
     The file has a column voltage_X [V] for every valve that was moved, pressures of pump and tank
     where they were measured (pressure_supply, pressure_tank), and whatever else is to be compared:
@@ -131,6 +134,9 @@ def replay(
     simulation starts from the measured configuration and velocity, at rest or fitted over the
     first tenth of a second, and from the measured pressures. Where they are not measured, it
     starts at home and rest, and with pressures that hold the machine.
+
+    A force at the tip that the file has (load_tip_force_x [N]) acts on it. With a controller the
+    references of the file are followed in place of the signals.
 
     Args:
         machine: The machine.
@@ -140,6 +146,7 @@ def replay(
         columns: Assignment of the columns of a log, if not that of the sensors of the machine,
             see `crane.recordings.logs`.
         span: Time span [s] by the clock of the file; the simulation starts at zero.
+        controller: Name of a built-in controller whose references the file has.
 
     Returns:
         The simulated recording, and its comparison with the file.
@@ -152,15 +159,21 @@ def replay(
     step = as_number(step, "the step", "s", greater_than=0)
     table = read_quantities(path, machine, columns, span)
     try:
-        inputs = replay_inputs(machine, table)
-        drive, time = inputs.valve_drive(machine), inputs.time
+        machine = add_recorded_tip_force(machine, table)
+        drive: ControlLaw | ValveCommand
+        initial: tuple[Array, Array] | None
+        if controller is not None:
+            time, drive, initial = recorded_references(machine, table, controller)
+        else:
+            inputs = replay_inputs(machine, table)
+            drive, time, initial = inputs.valve_drive(machine), inputs.time, inputs.initial
         steps = int(time[-1] / step + 1e-9)
         if steps < 1:
             raise RecordingError(f"is shorter than a step of {step:g} s, shorten the step")
         recording = simulate(
             machine,
             drive,
-            inputs.initial,
+            initial,
             steps * step,
             step,
             label=Path(path).stem,
