@@ -32,6 +32,7 @@ _TEMPLATES = (
 _TEXTS = {
     "initialize": "Close the loops from the active coordinates in q, the others as first guess,\n"
     "and start at rest; pressures hold the machine, joints with stiction stick or slip.",
+    "update_modes": "After a change of parameters during a motion: find which joints stick.",
     "advance": "Integrate over `step` with controlled errors. The inputs go linearly from those\n"
     "of the last call to those that are set now.",
     "advance_fixed": "One step of the classical Runge-Kutta method of length `step`. Joints begin "

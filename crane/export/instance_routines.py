@@ -16,7 +16,7 @@ from crane.codegen import (
 from crane.codegen.routine_statements import as_value
 from crane.codegen.symbolic import add_vectors, scale_vector, subtract_vectors
 from crane.common.samples import Array
-from crane.export.force_inputs import ForceInputs
+from crane.control.force_inputs import ForceInputs
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.error_controlled_stepper import ErrorControlledStepper
 from crane.simulation.integration.machine_code_stepper import HELD_INDEX
@@ -133,7 +133,10 @@ class InstanceRoutines:
         self._store(r, "bounds", held, HELD_INDEX)
 
     def _add_initialize(self, program: Program) -> None:
-        """initialize(instance): at rest at the active coordinates in q, with other q as guess."""
+        """initialize(instance): at rest at the active coordinates in q, with other q as guess.
+
+        update_modes(instance): after a change of parameters.
+        """
         tape, layout = Tape(), self.chart.state_layout
         machine = self.stepper.trace_controlled_machine(tape)
         dynamics, loads = machine.dynamics_formulas, machine.external_forces.active_forces
@@ -166,6 +169,10 @@ class InstanceRoutines:
             self._store(r, "time", 0.0)
             self._store(r, "lengths", 0.0)
             self._write_find_modes(r, refs)
+            r.return_value(DONE)
+        with program.add_routine("update_modes", arrays=("instance",)) as r:
+            self._store(r, "lengths", 0.0)
+            self._write_find_modes(r, self._part(r.instance, "inputs"))
             r.return_value(DONE)
 
     @property
