@@ -53,7 +53,7 @@ class Library:
 
     def __init__(self, machine, folder, *flags, controller=None, quantities=None):
         quantities = DYNAMICS_ROUTINES if quantities is None else quantities
-        self.program = InstanceProgram(machine, controller, quantities)
+        self.program = InstanceProgram(machine, quantities, controller=controller)
         texts = CSources(self.program, "m").files()
         for name in ("m.h", "m.c"):
             (folder / name).write_text(texts[name])
@@ -278,7 +278,7 @@ def test_a_closed_loop_is_that_of_simulate(tmp_path, name, task, controller, ste
 def test_a_controller_has_its_gains_and_references_by_name():
     machine = crane.load("mini_forwarder")
     controller = crane.control.make_controller("pi", machine)
-    program = InstanceProgram(machine, controller, quantities=())
+    program = InstanceProgram(machine, (), controller=controller)
     at = program.layout.view(np.array(program.names))
     assert at.inputs.tolist()[:3] == ["reference_q1", "reference_X1", "reference_X2"]
     assert at.settings.tolist()[:4] == ["q1_kp", "X1_kp", "X2_kp", "q1_ki"]
@@ -309,4 +309,4 @@ def test_controllers_that_are_programs_in_python_are_refused():
         (crane.control.make_controller("valve-pd", machine), "ValvePD with valves that have a de"),
     ):
         with pytest.raises(InputError, match=text):
-            InstanceProgram(machine, controller)
+            InstanceProgram(machine, controller=controller)

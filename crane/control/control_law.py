@@ -3,6 +3,7 @@
 import itertools
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from functools import cached_property
 from types import MappingProxyType
 from typing import NamedTuple, Protocol
@@ -120,6 +121,13 @@ class ControlLaw(OneLineRepr):
     def references(self, times: Array) -> Array:
         """Inputs that depend on time alone, (N, c) at times (N,) [s]; none by default."""
         return np.zeros((len(times), 0))
+
+    def for_machine(self, machine: Machine) -> "ControlLaw":
+        """The same law for another machine with the same joints."""
+        found = copy(self)
+        found.machine = machine
+        vars(found).pop("_dynamics", None)
+        return found
 
     def start(self, q_a: Array) -> Array:
         """See `Controller`."""

@@ -34,6 +34,7 @@ _TEMPLATES = (
 _TEXTS = {
     "initialize": "Close the loops from the active coordinates in q, the others as first guess,\n"
     "and start at rest; pressures hold the machine, joints with stiction stick or slip.",
+    "update_modes": "After a change of parameters during a motion: find which joints stick.",
     "advance": "Integrate over `step` with controlled errors. The inputs go linearly from those\n"
     "of the last call to those that are set now.",
     "advance_fixed": "One step of the classical Runge-Kutta method of length `step`. Joints begin "
@@ -95,7 +96,7 @@ def write_c(
     """
     check_folder_is_writable(Path(folder), overwrite)
     loaded = machine if isinstance(machine, Machine) else load(machine)
-    texts = CSources(InstanceProgram(loaded, controller), name).files()
+    texts = CSources(InstanceProgram(loaded, controller=controller), name).files()
     with replace_folder(folder, overwrite) as output_folder:
         for file, text in texts.items():
             (output_folder / file).write_text(text, encoding="utf-8")

@@ -22,12 +22,12 @@ from crane.codegen.linked_functions import LinkedFunction, link_functions
 from crane.common.errors import CraneWarning, InputError
 from crane.common.samples import Array
 from crane.control.control_law import ControlLaw, Controller
+from crane.control.force_inputs import ForceInputs
 from crane.control.valve_commands import ValveCommand, ValveSignals
 from crane.control.valve_drive import ValveDrive
 from crane.description.external_forces import TIP_WRENCH_NAME, Wrench
 from crane.dynamics.compiled_dynamics import DERIVATIVES_OF, build_quantity
 from crane.dynamics.dynamics import Dynamics
-from crane.export.force_inputs import ForceInputs
 from crane.export.instance_routines import INNER_ROUTINES, InstanceRoutines
 from crane.export.parameter_names import parameter_names
 from crane.machine.machine import Machine
@@ -104,9 +104,11 @@ class InstanceProgram:
 
     Args:
         machine: The machine.
+        quantities: Routines of `DYNAMICS_ROUTINES` to include; all by default.
+        variants: The machine with other parameters. What differs between them stays an element of
+            the instance, where numbers such as 0 are else part of the formulas.
         controller: Control law or valve command, as for `simulate`. Its references at time 0 are
             the defaults of the inputs; its settings are parameters, and its states states.
-        quantities: Routines of `DYNAMICS_ROUTINES` to include; all by default.
 
     Attributes:
         machine: The machine, with the wrench at its tip.
@@ -117,49 +119,49 @@ class InstanceProgram:
         names: Name of each element of an instance.
         units: Unit of each.
         defaults: An instance at home, not initialized.
+        variant_defaults: The same of each of `variants`.
         entries: Routines by name; each takes an instance, and further arrays.
         functions: All linked functions, each after what it calls.
 
     Raises:
-        InputError: The formulas are too long, or a load or the controller is a function in Python.
+        InputError: The formulas are too long, a load or the controller is a function in Python, or
+            a variant has other formulas.
     """
 
     def __init__(
         self,
         machine: Machine,
-        controller: Controller | ValveCommand | None = None,
         quantities: Sequence[str] = tuple(DYNAMICS_ROUTINES),
+        variants: Sequence[Machine] = (),
+        controller: Controller | ValveCommand | None = None,
     ):
-        tip = machine.tip
-        loads = [] if tip is None else [Wrench(tip, name=TIP_WRENCH_NAME)]
-        machine = machine.with_external_forces(*loads)
-        control = _exported_control(machine, controller)
-        machine = machine_under_control(machine, control)
-        self.machine, self.control = machine, control
-        if not machine.closure.is_compiled:
-            raise InputError(f"the loops of '{machine.name}' have no formulas to export")
-        if not machine.has_traceable_forces:
-            raise InputError(
-                f"a load of '{machine.name}' is a function in Python, which no other target has: "
-                "give a crane.Wrench"
-            )
-        states = len(control.start(machine.home[machine.closure.active]))
-        dynamics = Dynamics(machine)
-        self.chart = Chart.from_dynamics(dynamics, control, states)
+        self.chart = _controlled_chart(machine, controller)
+        self.machine, self.control = machine, control = self.chart.machine, self.chart.control
+        dynamics = self.chart.dynamics
+        others = [_controlled_chart(x, controller) for x in variants]
+        for other in others:
+            if other.dynamics.formula_structure != dynamics.formula_structure:
+                raise InputError(f"a variant of '{machine.name}' has bodies of another kind")
+            changes = other.dynamics.formula_constants != dynamics.formula_constants
+            dynamics.constant_pattern[changes] = np.nan
         is_valve_drive = isinstance(control, ValveDrive)
         self._stepper_class = RosenbrockStepper if is_valve_drive else DormandPrinceStepper
-        self.stepper = self._make_stepper()
+        self.stepper = self._make_stepper(self.chart)
         self._quantities = {name: DYNAMICS_ROUTINES[name] for name in quantities}
         self._nq, self._n = machine.model.nv, len(machine.active)
         self._k = len(self.chart.stick_slip.columns)
         self._closure = machine.closure.compiled_closure
         self.layout = self._make_layout()
         self.names, self.units = parameter_names(self)
-        self.defaults = self._default_instance()
+        self.defaults = self._default_instance(self.chart)
+        self.variant_defaults = []
+        for other in others:  # of the same formulas
+            other.dynamics.constant_pattern[:] = dynamics.constant_pattern
+            self.variant_defaults.append(self._default_instance(other))
 
-    def _make_stepper(self) -> ErrorControlledStepper:
+    def _make_stepper(self, chart: Chart) -> ErrorControlledStepper:
         try:
-            return self._stepper_class(self.chart)
+            return self._stepper_class(chart)
         except FormulaTooLongError as error:
             raise InputError(
                 f"'{self.machine.name}' has {error.operation_count:,} operations in a step, which "
@@ -181,22 +183,23 @@ class InstanceProgram:
             settings=control.settings.size, delays=spools, history=rows * (1 + spools),
         )  # fmt: skip
 
-    def _default_instance(self) -> Array:
+    def _default_instance(self, chart: Chart) -> Array:
         values = np.zeros(self.layout.size)
-        at, dynamics = self.layout.view(values), self.chart.dynamics
-        self.chart.stick_slip.slip_signs[:] = 0.0
-        self.chart.stick_slip.apply_to(dynamics)
+        at, dynamics, machine = self.layout.view(values), chart.dynamics, chart.machine
+        closure, stepper = machine.closure.compiled_closure, self._make_stepper(chart)
+        chart.stick_slip.slip_signs[:] = 0.0
+        chart.stick_slip.apply_to(dynamics)
         at.step[:], at.max_events[:] = 1e-3, MAX_EVENTS
-        at.q[:] = self.machine.home
-        at.cursor[:] = self._closure.new_cursor().state
+        at.q[:] = machine.home
+        at.cursor[:] = closure.new_cursor().state
         at.lengths[5] = MAX_STEPS
-        at.bounds[:], at.tolerances[:] = self.stepper.bounds, self.stepper.tolerance
-        at.geometry[:] = self._closure.geometry.constants
-        at.dynamics[:], at.settings[:] = dynamics.formula_constants, self.control.settings
-        references = self.control.references(np.zeros(1))[0]
+        at.bounds[:], at.tolerances[:] = stepper.bounds, stepper.tolerance
+        at.geometry[:] = closure.geometry.constants
+        at.dynamics[:], at.settings[:] = dynamics.formula_constants, chart.control.settings
+        references = chart.control.references(np.zeros(1))[0]
         at.inputs[: len(references)] = at.inputs_start[: len(references)] = references
         if at.delays.size:
-            at.delays[:] = self.control.delays  # type: ignore[attr-defined]
+            at.delays[:] = chart.control.delays
         return values
 
     @cached_property
@@ -272,3 +275,24 @@ class InstanceProgram:
     def functions(self) -> list[LinkedFunction]:
         """All linked functions, each after what it calls."""
         return self._linked[1]
+
+
+def _controlled_chart(machine: Machine, controller: Controller | ValveCommand | None) -> Chart:
+    """A machine with a wrench at its tip and its drives.
+
+    Raises:
+        InputError: It cannot be exported.
+    """
+    loads = [] if machine.tip is None else [Wrench(machine.tip, name=TIP_WRENCH_NAME)]
+    machine = machine.with_external_forces(*loads)
+    control = _exported_control(machine, controller)
+    machine = machine_under_control(machine, control)
+    if not machine.closure.is_compiled:
+        raise InputError(f"the loops of '{machine.name}' have no formulas to export")
+    if not machine.has_traceable_forces:
+        raise InputError(
+            f"a load of '{machine.name}' is a function in Python, which no other target has: "
+            "give a crane.Wrench"
+        )
+    states = len(control.start(machine.home[machine.closure.active]))
+    return Chart.from_dynamics(Dynamics(machine), control, states)

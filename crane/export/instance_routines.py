@@ -138,7 +138,10 @@ class InstanceRoutines:
         self._store(r, "bounds", held, HELD_INDEX)
 
     def _add_initialize(self, program: Program) -> None:
-        """initialize(instance): at rest at the active coordinates in q, with other q as guess."""
+        """initialize(instance): at rest at the active coordinates in q, with other q as guess.
+
+        update_modes(instance): after a change of parameters.
+        """
         tape, layout = Tape(), self.chart.state_layout
         machine = self.stepper.trace_controlled_machine(tape)
         dynamics, loads = machine.dynamics_formulas, machine.external_forces.active_forces
@@ -173,6 +176,10 @@ class InstanceRoutines:
             self._store(r, "time", 0.0)
             self._store(r, "lengths", 0.0)
             self._write_find_modes(r, refs)
+            r.return_value(DONE)
+        with program.add_routine("update_modes", arrays=("instance",)) as r:
+            self._store(r, "lengths", 0.0)
+            self._write_find_modes(r, self._part(r.instance, "inputs"))
             r.return_value(DONE)
 
     @property

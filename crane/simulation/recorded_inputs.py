@@ -11,6 +11,7 @@ from crane.description.external_forces import TIP_WRENCH_NAME, Wrench
 from crane.machine.machine import Machine
 from crane.recordings.measured_configurations import joint_motion
 from crane.recordings.timeseries import TIME, Table, check_columns_present, table_column
+from crane.simulation.simulation_setup import resolve_controller
 
 _TIP_FORCE = tuple(f"load_{TIP_WRENCH_NAME}_force_{axis}" for axis in "xyz")
 
@@ -33,8 +34,8 @@ def add_recorded_tip_force(machine: Machine, table: Table) -> Machine:
 
 def recorded_references(
     machine: Machine, table: Table, name: str
-) -> tuple[Array, ControlLaw | ValveCommand, tuple[Array, Array]]:
-    """Instants (N,) [s] from zero, a controller with the recorded references, and the start.
+) -> tuple[Array, ControlLaw, tuple[Array, Array]]:
+    """Instants (N,) [s] from zero, a control law with the recorded references, and the start.
 
     Args:
         machine: The machine.
@@ -46,7 +47,7 @@ def recorded_references(
         InputError: The controller is unknown, or has no references by name.
     """
     controller = make_controller(name, machine)
-    assert isinstance(controller, ControlLaw | ValveCommand)
+    assert isinstance(controller, ControlLaw | ValveCommand)  # as all in the registry
     check_columns_present([[column] for column in controller.reference_units], table.units)
     rows = np.column_stack(
         [table_column(table, column, unit) for column, unit in controller.reference_units.items()]
@@ -54,4 +55,6 @@ def recorded_references(
     q_a, v_a = joint_motion(machine, table)
     time = table_column(table, TIME)
     time = time - time[0]
-    return time, interpolate_references(controller, time, rows), (q_a[0], v_a[0])
+    control = resolve_controller(interpolate_references(controller, time, rows), machine)
+    assert isinstance(control, ControlLaw)
+    return time, control, (q_a[0], v_a[0])

@@ -18,7 +18,8 @@ from crane.common.progress import progress_reporter
 from crane.common.result import Result
 from crane.common.samples import Array, as_number
 from crane.control.control_law import ControlLaw
-from crane.control.valve_commands import ValveCommand, ValveSignals, require_circuit
+from crane.control.force_inputs import ForceInputs
+from crane.control.valve_commands import ValveSignals, require_circuit
 from crane.control.valve_drive import ValveDrive
 from crane.description.sensors import SUPPLY_PRESSURE, TANK_PRESSURE, VALVE_SIGNAL_PREFIX
 from crane.machine.machine import Machine
@@ -34,6 +35,8 @@ from crane.recordings.measured_recordings import (
     locked_joint_conflicts,
 )
 from crane.recordings.recording import (
+    CHANGES_NOTE,
+    FORCE_SUFFIX,
     IDEAL_SENSORS,
     SENSORS_NOTE,
     VELOCITY_SUFFIX,
@@ -41,7 +44,14 @@ from crane.recordings.recording import (
 )
 from crane.recordings.recording_reader import FULL_TIME_SPAN, TimeSpan, read_quantities
 from crane.recordings.sensor_discrepancy import warn_discrepancies
-from crane.recordings.timeseries import TIME, Table, table_column, time_derivative
+from crane.recordings.timeseries import (
+    TIME,
+    Table,
+    check_columns_present,
+    table_column,
+    time_derivative,
+)
+from crane.simulation.parameter_schedule import ParameterSchedule
 from crane.simulation.recorded_inputs import add_recorded_tip_force, recorded_references
 from crane.simulation.recorded_run import read_simulation, simulated_columns
 from crane.simulation.simulation_run import Progress, simulate
@@ -126,14 +136,15 @@ def replay(
     span: TimeSpan = FULL_TIME_SPAN,
     controller: str | None = None,
 ) -> tuple[Recording, Comparison]:
-    """Simulate a hydraulic machine with measured valve signals, or a closed loop again.
+    """Simulate a machine with measured valve signals, or without a circuit with measured forces.
 
     The file has a column voltage_X [V] for every valve that was moved, pressures of pump and tank
     where they were measured (pressure_supply, pressure_tank), and whatever else is to be compared:
     strokes or angles, velocities, pressures (see `crane.recordings.measured_recordings`). The
     simulation starts from the measured configuration and velocity, at rest or fitted over the
     first tenth of a second, and from the measured pressures. Where they are not measured, it
-    starts at home and rest, and with pressures that hold the machine.
+    starts at home and rest, and with pressures that hold the machine. Parameters change where the
+    file says so, see `crane.simulation.parameter_schedule`.
 
     A force at the tip that the file has (load_tip_force_x [N]) acts on it. With a controller the
     references of the file are followed in place of the signals.
@@ -153,32 +164,33 @@ def replay(
 
     Raises:
         RecordingError: The file is malformed, or has no signals.
-        InputError: The machine has no valves.
+        InputError: A parameter that changes is unknown.
     """
     progress = progress_reporter(progress)
     step = as_number(step, "the step", "s", greater_than=0)
     table = read_quantities(path, machine, columns, span)
     try:
         machine = add_recorded_tip_force(machine, table)
-        drive: ControlLaw | ValveCommand
+        schedule = ParameterSchedule.from_note(table.notes.get(CHANGES_NOTE, ""))
+        drive: ControlLaw
         initial: tuple[Array, Array] | None
         if controller is not None:
             time, drive, initial = recorded_references(machine, table, controller)
+        elif machine.hydraulics is None:
+            time, drive, initial = _force_inputs(machine, table)
         else:
             inputs = replay_inputs(machine, table)
-            drive, time, initial = inputs.valve_drive(machine), inputs.time, inputs.initial
+            time, drive, initial = inputs.time, inputs.valve_drive(machine), inputs.initial
         steps = int(time[-1] / step + 1e-9)
         if steps < 1:
             raise RecordingError(f"is shorter than a step of {step:g} s, shorten the step")
-        recording = simulate(
-            machine,
-            drive,
-            initial,
-            steps * step,
-            step,
-            label=Path(path).stem,
-            progress=progress,
-        )
+        label = Path(path).stem
+        if schedule.changes:
+            recording = schedule.simulate(machine, drive, initial, steps, step, label, progress)
+        else:
+            recording = simulate(
+                machine, drive, initial, steps * step, step, label=label, progress=progress
+            )
         names = simulated_columns(machine, table, recording)
     except RecordingError as error:
         raise RecordingError(prefix_location(str(path), error)) from None
@@ -195,6 +207,19 @@ def replay(
         )
     ]
     return recording, Comparison(time[inside], tuple(channels), recording)
+
+
+def _force_inputs(
+    machine: Machine, table: Table
+) -> tuple[Array, ForceInputs, tuple[Array, Array]]:
+    """Instants (N,) [s] from zero, forces of the drives there, and the initial motion."""
+    time = table_column(table, TIME)
+    names = [joint + FORCE_SUFFIX for joint in machine.driven_joints]
+    check_columns_present([[name] for name in names], table.units)
+    forces = np.column_stack([table_column(table, name) for name in names])
+    q_a, v_a = joint_motion(machine, table)
+    time = time - time[0]
+    return time, ForceInputs(machine, time, forces), (q_a[0], v_a[0])
 
 
 @dataclass(frozen=True, eq=False)
