@@ -7,6 +7,8 @@ import numpy as np
 
 from crane.common.errors import CraneError, InputError
 from crane.common.samples import Array
+from crane.control.control_law import Controller
+from crane.control.valve_commands import ValveCommand
 from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.dynamics.tipping_stability import TippingStability, find_supports, has_supports
@@ -27,13 +29,20 @@ class DriveConditions:
 
     Args:
         machine: The machine.
+        quantities: See `InstanceProgram`.
+        controller: See `InstanceProgram`.
 
     Attributes:
         program: The machine with these parameters as elements of an instance.
         masses: Payloads to choose from [kg], with that of the machine; one without a choice.
     """
 
-    def __init__(self, machine: Machine, quantities: tuple[str, ...] = ()):
+    def __init__(
+        self,
+        machine: Machine,
+        quantities: tuple[str, ...] = (),
+        controller: Controller | ValveCommand | None = None,
+    ):
         self._machine = machine
         self.masses = [float(machine.parameter_changes.get(PAYLOAD, 0.0))]
         variants, tilted = MachineVariants(machine), []
@@ -45,10 +54,10 @@ class DriveConditions:
         with suppress(CraneError):  # another structure with a payload
             masses = sorted({*self.masses, *_payload_masses(machine)})
             payloads = [variants.machine(self._changes({PAYLOAD: x})) for x in masses]
-            self.program = InstanceProgram(machine, quantities, [*payloads, *tilted])
+            self.program = InstanceProgram(machine, quantities, [*payloads, *tilted], controller)
             self.masses, self._payloads = masses, payloads
             return
-        self.program = InstanceProgram(machine, quantities, tilted)
+        self.program = InstanceProgram(machine, quantities, tilted, controller)
 
     def _changes(self, changes: dict[str, float]) -> dict[str, float]:
         return dict(self._machine.parameter_changes) | changes

@@ -13,6 +13,7 @@ from crane.export.instance_program import InstanceProgram
 from crane.machine.machine import Machine
 from crane.motion.kinematics import Kinematics
 from crane.motion.workspaces.workspace_section import find_slewing_joint
+from crane.view.page.drive_hand import target_data
 
 ROLES = ("slew", "boom", "stick", "tool")  # of levers, in their order from the ground
 _ACCELERATIONS = {"m": 0.5, "rad": 1.5}  # by a full lever, of a drive of unknown effort
@@ -23,7 +24,7 @@ _STEP = 1e-5  # of a difference [m], [rad]
 def lever_data(program: InstanceProgram) -> list[dict[str, Any]]:
     """Levers of a machine.
 
-    A lever moves a spool, else the force of a drive. Its `role` and `sign` say where it is on the
+    A lever moves a target of a controller, or a spool, else the force of a drive. Its `role` and `sign` say where it is on the
     sticks: boom and stick along y, which is forwards, slew and tool along x, to the right. Forwards
     the boom goes down and the stick out, to the right the machine slews clockwise and the tool
     goes out.
@@ -31,7 +32,10 @@ def lever_data(program: InstanceProgram) -> list[dict[str, Any]]:
     Raises:
         InputError: Nothing drives the machine.
     """
-    levers = list(_valves(program) if isinstance(program.control, ValveDrive) else _forces(program))
+    levers = [{"name": x["name"], "joint": x["joint"]} for x in target_data(program)]
+    if not levers:
+        is_valve_drive = isinstance(program.control, ValveDrive)
+        levers = list(_valves(program) if is_valve_drive else _forces(program))
     if not levers:
         raise InputError(f"nothing drives '{program.machine.name}', name active joints by --active")
     for lever, (role, sign) in zip(levers, _roles(program.machine, levers), strict=True):

@@ -17,6 +17,7 @@ from crane.codegen.wasm_emitter import emit_wasm_module
 from crane.common.atomic_output import portable_file_name
 from crane.common.errors import ClosureError
 from crane.common.samples import Array
+from crane.control.controller_registry import make_controller
 from crane.control.valve_drive import ValveDrive
 from crane.description.external_forces import TIP_WRENCH_NAME, WRENCH_COMPONENTS
 from crane.dynamics.tipping_stability import has_supports
@@ -25,10 +26,11 @@ from crane.export.instance_routines import STATUS_TEXTS
 from crane.hydraulics.circuit_elements import MAIN_PUMP
 from crane.hydraulics.circuit_states import BALANCE_UNITS
 from crane.machine.machine import Machine
-from crane.recordings.recording import FORCE_UNITS, VELOCITY_UNITS
+from crane.recordings.recording import FORCE_UNITS, REFERENCE_PREFIX, VELOCITY_UNITS
 from crane.recordings.recording_summary import DISPLAY_UNITS, result_title
 from crane.view.page.drive_conditions import DriveConditions
 from crane.view.page.drive_goals import goal_data
+from crane.view.page.drive_hand import pull_data, target_data
 from crane.view.page.drive_levers import lever_data
 from crane.view.page.html_document import write_page
 from crane.view.page.page_motion import frame_data, joint_tree, pack_base64
@@ -38,37 +40,41 @@ from crane.view.page.scene import build_scene, link_poses, read_visuals, scene_b
 INTERVAL = 0.01  # of the recording, at whose ends the inputs are given [s]
 RAMP = 0.15  # time from neutral to the end of a lever [s]
 _SCRIPTS = (
-    "data", "kinematics", "scene", "drive_scene", "drive_levers", "drive_gauges",
+    "data", "kinematics", "scene", "drive_scene", "drive_levers", "drive_gauges", "drive_pull",
     "drive_recording", "drive",
 )  # fmt: skip
-_WORKER_SCRIPTS = ("kinematics", "drive_stability", "drive_goals", "drive_worker")
+_WORKER_SCRIPTS = ("kinematics", "drive_stability", "drive_goals", "drive_hand", "drive_worker")
 _RESERVED_NUMBERS = 4096  # of the memory, besides the instance
 
 
-def drive_page(machine: Machine, path: str | Path) -> Path:
+def drive_page(machine: Machine, path: str | Path, controller: str | None = None) -> Path:
     """Write a page on which a machine is driven by keys, sliders or a gamepad, as one HTML file.
 
     Its levers move the valves of a machine with a circuit, else the forces of its drives up to
-    their efforts. Payload and slope change between steps. The drive can be saved as a recording,
-    which `simulate --inputs` repeats.
+    their efforts, or the targets of a controller. A spring pulls the tip to the pointer. Payload
+    and slope change between steps. The drive can be saved as a recording, which `simulate
+    --inputs` repeats.
 
     Args:
         machine: The machine.
         path: The file to write; replaced if it exists.
+        controller: Name of a controller, see `crane.control.make_controller`.
 
     Raises:
         InputError: See `crane.export.InstanceProgram`; or nothing drives the machine.
         OutputError: The file's suffix is not .html or .htm, or it cannot be written.
     """
-    return write_page(path, lambda: drive_html(machine))
+    return write_page(path, lambda: drive_html(machine, controller))
 
 
-def drive_html(machine: Machine) -> str:
+def drive_html(machine: Machine, controller: str | None = None) -> str:
     """Return the page of `drive_page` as HTML."""
-    quantities = ("gravity",) if machine.hydraulics is None else ()
-    conditions = DriveConditions(machine, quantities)
+    law = None if controller is None else make_controller(controller, machine)
+    quantities = ("gravity",) if machine.hydraulics is None and law is None else ()
+    conditions = DriveConditions(machine, quantities, law)
     scene = build_scene(machine)
-    data = machine_data(machine, scene, None) | {"task": "", "drive": _drive_data(conditions)}
+    drive = _drive_data(conditions, controller)
+    data = machine_data(machine, scene, None) | {"task": "", "drive": drive}
     data["lower"], data["upper"] = (x.tolist() for x in _motion_bounds(machine, scene))
     assets = files("crane.view.page") / "assets"
 
@@ -86,15 +92,14 @@ def drive_html(machine: Machine) -> str:
     )
 
 
-def _drive_data(conditions: DriveConditions) -> dict[str, Any]:
+def _drive_data(conditions: DriveConditions, controller: str | None) -> dict[str, Any]:
     """What the scripts need of the program."""
     program = conditions.program
     machine, start = program.machine, program.layout.start_index
     levers = lever_data(program)
-    module = emit_wasm_module(
-        program.functions, program.entries, program.layout.size + _RESERVED_NUMBERS
-        + machine.model.nv * len(machine.active)
-    )  # fmt: skip
+    nq, n = machine.model.nv, len(machine.active)
+    hand = program.layout.size + _RESERVED_NUMBERS + nq * n
+    module = emit_wasm_module(program.functions, program.entries, hand + nq + 4 * n + 64 + 6)
     columns = list(_columns(program))
     order = {header: i for i, (header, _) in enumerate(columns)}
     inputs = range(start("inputs"), start("inputs") + program.layout.parts["inputs"])
@@ -112,6 +117,9 @@ def _drive_data(conditions: DriveConditions) -> dict[str, Any]:
         "hasTip": machine.tip is not None,
         "tree": joint_tree(machine),
         "levers": levers,
+        "pull": pull_data(program),
+        "targets": target_data(program),
+        "handMemory": hand,
         "columns": [index for _, index in columns],
         "headers": [header for header, _ in columns],
         "dials": list(_dials(program, order)),
@@ -121,15 +129,18 @@ def _drive_data(conditions: DriveConditions) -> dict[str, Any]:
             {"name": force.name, "frame": frame_data(machine, force.frame), "column": order[header]}
             for force in machine.external_forces
             if (header := f"load_{force.name}_force_x [N]") in order
+            and force.name != TIP_WRENCH_NAME
         ],
         "goals": goal_data(machine, conditions.masses),
         "statuses": dict(STATUS_TEXTS),
         "notes": [
-            "crane recording", f"machine name: {machine.name}", "task: drive", "controller: levers",
+            "crane recording", f"machine name: {machine.name}", "task: drive",
+            f"controller: {controller or 'levers'}",
             "sensors: ideal", *([f"free: {', '.join(machine.free)}"] if machine.free else []),
         ],
         "expression": [machine.load_name, machine.load_options],
-        "command": f"crane simulate {machine.command_line_arguments}",
+        "command": f"crane simulate {machine.command_line_arguments}"
+        + (f" --controller {controller}" if controller else ""),
         "file": portable_file_name(f"{machine.name}_drive"),
     } | conditions.data()  # fmt: skip
 
@@ -152,12 +163,14 @@ def _columns(program: InstanceProgram) -> Iterator[tuple[str, int]]:
             yield f"{joint} [{machine.unit(joint)}]", start("q") + column
     for name in ("kinetic", "potential", "work", "dissipated"):
         yield f"{name} [J]", start(name)
+    for i in range(start("inputs"), start("inputs") + len(program.control.reference_units)):
+        if program.names[i].startswith(REFERENCE_PREFIX):
+            yield f"{program.names[i]} [{program.units[i]}]", i
     first = start("external")
     for k, force in enumerate(machine.external_forces):
-        if force.name != TIP_WRENCH_NAME:
-            for i, axis in enumerate("xyz"):
-                yield f"load_{force.name}_force_{axis} [N]", first + i
-            yield f"work_{force.name} [J]", start("work") + 1 + k
+        for i, axis in enumerate("xyz"):
+            yield f"load_{force.name}_force_{axis} [N]", first + i
+        yield f"work_{force.name} [J]", start("work") + 1 + k
         first += len(WRENCH_COMPONENTS)
         for name, unit in force.channels:
             yield f"{name} [{unit}]" if unit else name, first

@@ -12,8 +12,10 @@ const levers = new Levers(drive.levers);
 const dials = drive.dials.map(addDial);
 const joints = drive.joints.map(addJoint);
 const loads = drive.loads.map(addLoad);
+const handGauges = new HandGauges();
 const conditions = new Conditions();
 const goals = new Goals();
+const pull = space && drive.pull && new Pull();
 listenToKeys(levers);
 
 worker.postMessage({
@@ -46,6 +48,8 @@ function show(state) {
     goals.show(state);
     if (!state.row.length) return;
     for (const dial of dials) showDial(dial, state);
+    handGauges.show(state);
+    if (pull) pull.show(state);
     for (const joint of joints) showJoint(joint, state);
     for (const load of loads) showLoad(load, state);
     if (space) space.show(state);

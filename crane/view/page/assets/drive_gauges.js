@@ -18,7 +18,9 @@ function addDial(dial) {
     return { ...dial, value, arc };
 }
 
-function dialValue(dial, { row, before }) {
+function dialValue(dial, state) {
+    const { row, before } = state;
+    if (dial.read) return dial.read(state);
     const from = drive.columns.length;
     if (dial.kind === "speed") return before.length ? Math.hypot(...[0, 1, 2].map((k) => row[from + k] - before[from + k])) / drive.interval : 0;
     if (dial.kind === "stability") return 100 * row[from + (drive.hasTip ? 3 : 0)];

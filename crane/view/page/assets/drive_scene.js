@@ -37,7 +37,6 @@ class DriveSpace extends Space {
     constructor(data) {
         super(data);
         this.marks = new THREE.Group();
-        this.marks.rotateX(-Math.PI / 2);
         viewer.scene.add(this.marks);
         this.load = this.ball(1, 0x8a6a3b, 1);
         this.marks.add(this.load);

@@ -2,7 +2,7 @@
 
 let given, machine, numbers, instance, scratch, levers, wanted, inputs, status, stability, goals;
 let running = false, due = 0, last = 0, computed = 0, busy = 0, spent = 0, holds = true;
-let rows, record, conditions, base;
+let rows, record, conditions, base, hand;
 
 const START = 64; // of the instance in the memory, in numbers
 const HERE = 8 * START;
@@ -18,6 +18,7 @@ async function begin(message) {
     base = conditions;
     stability = given.stability && new Stability(given);
     goals = new GoalRun(given);
+    hand = new Hand(given, START + given.handMemory);
     reset();
     setTimeout(lap);
 }
@@ -39,6 +40,7 @@ function reset() {
     part("step")[0] = given.interval;
     status = machine.initialize(HERE);
     goals.begin();
+    hand.begin();
     if (status === 1) keep();
     tell();
 }
@@ -112,8 +114,10 @@ function advance() {
     const most = given.interval / given.ramp;
     given.levers.forEach((lever, i) => {
         levers[i] += Math.max(-most, Math.min(most, wanted[i] - levers[i]));
-        instance[lever.index] = signal(lever, levers[i]);
+        if (lever.index !== undefined) instance[lever.index] = signal(lever, levers[i]);
     });
+    if (given.targets.length) hand.follow(levers);
+    hand.pull();
     if (given.holdsWeight && holds) holdWeight();
     for (const [name, value] of Object.entries(inputs)) instance[given.inputs[name]] = value;
     status = machine.advance(HERE);
@@ -170,7 +174,7 @@ function lap() {
 function tell() {
     postMessage({
         status, running, levers, conditions, time: instance[0], factor: busy > 0.2 ? computed / busy : 1,
-        q: Array.from(part("q")), goal: goals.state(), results: record.results,
+        hand: hand.state(), q: Array.from(part("q")), goal: goals.state(), results: record.results,
         changed: record.changed, changes: record.changes, hasMoved: rows.length > 1,
         row: rows.length ? Array.from(rows[rows.length - 1]) : [],
         before: rows.length > 1 ? Array.from(rows[rows.length - 2]) : [],
@@ -181,6 +185,8 @@ onmessage = ({ data }) => {
     if (data.begin) begin(data.begin);
     if (data.levers) wanted = data.levers;
     if (data.inputs) Object.assign(inputs, data.inputs);
+    if (data.pull !== undefined) hand.point = data.pull;
+    if (data.target !== undefined) hand.goal = data.target;
     if (data.holds !== undefined) holds = data.holds;
     if (data.conditions) setConditions({ ...conditions, ...data.conditions });
     if (data.goal !== undefined) goals.choose(data.goal);
