@@ -163,9 +163,10 @@ def _columns(program: InstanceProgram) -> Iterator[tuple[str, int]]:
             yield f"{joint} [{machine.unit(joint)}]", start("q") + column
     for name in ("kinetic", "potential", "work", "dissipated"):
         yield f"{name} [J]", start(name)
-    for i in range(start("inputs"), start("inputs") + len(program.control.reference_units)):
-        if program.names[i].startswith(REFERENCE_PREFIX):
-            yield f"{program.names[i]} [{program.units[i]}]", i
+    references = program.control.reference_units
+    if any(name.startswith(REFERENCE_PREFIX) for name in references):
+        for i, (name, unit) in enumerate(references.items()):
+            yield f"{name} [{unit}]" if unit else name, start("inputs") + i
     first = start("external")
     for k, force in enumerate(machine.external_forces):
         for i, axis in enumerate("xyz"):

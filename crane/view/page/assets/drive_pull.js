@@ -16,7 +16,7 @@ class Pull {
         this.marker.visible = false;
         space.marks.add(this.marker);
         if (drive.targets.length && drive.hasTip) this.addChoice();
-        const note = drive.targets.length ? "Levers, or dragging, move the target; a spring from the tip to the pointer pulls." : "Drag the tip: a spring to the pointer pulls it.";
+        const note = drive.targets.length ? "Levers move the target. Dragging the tip pulls it by a spring, or moves its target; with shift the other of both." : "Drag the tip: a spring pulls it to the pointer.";
         element("facts").append(make("p", { textContent: note }));
         // before the camera's controls hear of it
         this.pane.addEventListener("pointerdown", (event) => this.take(event), { capture: true });
