@@ -34,7 +34,6 @@ from crane.recordings.measured_recordings import (
     locked_joint_conflicts,
 )
 from crane.recordings.recording import (
-    CHANGES_NOTE,
     FORCE_SUFFIX,
     IDEAL_SENSORS,
     SENSORS_NOTE,
@@ -163,7 +162,7 @@ def replay(
     step = as_number(step, "the step", "s", greater_than=0)
     table = read_quantities(path, machine, columns, span)
     try:
-        schedule = ParameterSchedule.from_note(table.notes.get(CHANGES_NOTE, ""))
+        schedule = ParameterSchedule.from_notes(table.notes)
         drive: ValveDrive | ForceInputs
         if machine.hydraulics is None:
             time, drive, initial = _force_inputs(machine, table)
@@ -174,7 +173,7 @@ def replay(
         if steps < 1:
             raise RecordingError(f"is shorter than a step of {step:g} s, shorten the step")
         label = Path(path).stem
-        if schedule.changes:
+        if schedule.changes or schedule.keeps_chart:
             recording = schedule.simulate(machine, drive, initial, steps, step, label, progress)
         else:
             recording = simulate(

@@ -25,8 +25,14 @@ from crane.export.instance_routines import STATUS_TEXTS
 from crane.hydraulics.circuit_elements import MAIN_PUMP
 from crane.hydraulics.circuit_states import BALANCE_UNITS
 from crane.machine.machine import Machine
-from crane.recordings.recording import FORCE_UNITS, VELOCITY_UNITS
+from crane.recordings.recording import (
+    COORDINATES_NOTE,
+    FORCE_UNITS,
+    KEPT_COORDINATES,
+    VELOCITY_UNITS,
+)
 from crane.recordings.recording_summary import DISPLAY_UNITS, result_title
+from crane.simulation.integration.chart_switching import KEPT_CHART_RELAXATION
 from crane.view.page.drive_conditions import DriveConditions
 from crane.view.page.drive_goals import goal_data
 from crane.view.page.drive_levers import lever_data
@@ -95,17 +101,19 @@ def _drive_data(conditions: DriveConditions) -> dict[str, Any]:
         program.functions, program.entries, program.layout.size + _RESERVED_NUMBERS
         + machine.model.nv * len(machine.active)
     )  # fmt: skip
+    defaults = np.nan_to_num(program.defaults, posinf=1e300)
+    program.layout.view(defaults).bounds[3:5] *= KEPT_CHART_RELAXATION
     columns = list(_columns(program))
     order = {header: i for i, (header, _) in enumerate(columns)}
     inputs = range(start("inputs"), start("inputs") + program.layout.parts["inputs"])
     return {
         "wasm": base64.b64encode(module).decode(),
-        "defaults": pack_base64(np.nan_to_num(program.defaults, posinf=1e300), "f8"),
+        "defaults": pack_base64(defaults, "f8"),
         "interval": INTERVAL,
         "ramp": RAMP,
         "parts": {
             part: [start(part), program.layout.parts[part]]
-            for part in ("step", "q", "v_a", "tau", "dynamics")
+            for part in ("step", "q", "v_a", "dynamics")
         },
         "inputs": {program.names[i]: i for i in inputs},
         "holdsWeight": "gravity" in program.entries,
@@ -126,7 +134,8 @@ def _drive_data(conditions: DriveConditions) -> dict[str, Any]:
         "statuses": dict(STATUS_TEXTS),
         "notes": [
             "crane recording", f"machine name: {machine.name}", "task: drive", "controller: levers",
-            "sensors: ideal", *([f"free: {', '.join(machine.free)}"] if machine.free else []),
+            "sensors: ideal", f"{COORDINATES_NOTE}: {KEPT_COORDINATES}",
+            *([f"free: {', '.join(machine.free)}"] if machine.free else []),
         ],
         "expression": [machine.load_name, machine.load_options],
         "command": f"crane simulate {machine.command_line_arguments}",
