@@ -58,6 +58,8 @@ FREE_JOINTS_NOTE = "free"  # note of free joints
 MACHINE_NAME_NOTE = "machine name"  # note of a name that is not that of the file
 START = "start"  # note of a run that does not start at home
 CHANGES_NOTE = "changes"  # note of parameters that change during a run
+# note of a run in the active coordinates throughout, also near their dead centres
+COORDINATES_NOTE, KEPT_COORDINATES = "coordinates", "kept"
 STOPPED = "stopped"  # note of a run that ended early
 _ACCELERATION_SUFFIX = "_acceleration"
 

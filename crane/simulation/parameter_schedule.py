@@ -13,7 +13,12 @@ from crane.control.control_law import ControlLaw
 from crane.dynamics.dynamics import Dynamics
 from crane.formats.machine_loading import MachineVariants
 from crane.machine.machine import Machine
-from crane.recordings.recording import CHANGES_NOTE, Recording
+from crane.recordings.recording import (
+    CHANGES_NOTE,
+    COORDINATES_NOTE,
+    KEPT_COORDINATES,
+    Recording,
+)
 from crane.simulation.recorded_run import IntegrationResult, record_run, stop_with_recording
 from crane.simulation.simulation_run import Progress, integrate
 from crane.simulation.simulation_setup import machine_under_control
@@ -30,12 +35,14 @@ class ParameterSchedule:
 
     Attributes:
         changes: Times [s], increasing, and new values by name, see `crane.description.parameters`.
+        keeps_chart: See `crane.simulation.integration.chart_switching`.
     """
 
     changes: Sequence[tuple[float, Mapping[str, float]]]
+    keeps_chart: bool = False
 
     @classmethod
-    def from_note(cls, text: str) -> "ParameterSchedule":
+    def from_notes(cls, notes: Mapping[str, str]) -> "ParameterSchedule":
         """Read the note `changes` of a recording, as [[3.25, {"payload.mass": 200}]].
 
         Raises:
@@ -44,7 +51,7 @@ class ParameterSchedule:
         try:
             pairs = [
                 (float(time), {str(name): float(x) for name, x in values.items()})
-                for time, values in json.loads(text or "[]")
+                for time, values in json.loads(notes.get(CHANGES_NOTE, "[]"))
             ]
         except (ValueError, TypeError, AttributeError, RecursionError):
             pairs = [(0.0, {})]
@@ -54,7 +61,7 @@ class ParameterSchedule:
                 f"the line '# {CHANGES_NOTE}:' is no list of increasing times and parameters, "
                 'write [[3.25, {"payload.mass": 200}]]'
             )
-        return cls(pairs)
+        return cls(pairs, notes.get(COORDINATES_NOTE) == KEPT_COORDINATES)
 
     def simulate(
         self,
@@ -96,8 +103,9 @@ class ParameterSchedule:
                 progress((start + share * (end - start)) / step_count)
 
             run = integrate(
-                Dynamics(variant), law, initial, last - first, step, progress=report, earlier=run
-            )
+                Dynamics(variant), law, initial, last - first, step, progress=report, earlier=run,
+                keeps_chart=self.keeps_chart,
+            )  # fmt: skip
             if run.stop is not None:
                 raise stop_with_recording(variant, law, run, run.stop, label, step_count * step)
             part = record_run(variant, law, run.time, run.rows, label)
@@ -107,5 +115,6 @@ class ParameterSchedule:
             for name in parts[0]
             if all(name in part.columns() for part in parts)
         }
-        text = json.dumps([[time, dict(changed)] for time, changed in self.changes])
+        pairs = [[time, dict(changed)] for time, changed in self.changes]
+        text = json.dumps(pairs) if pairs else ""
         return replace(parts[0].with_columns(columns), changes=text)

@@ -35,7 +35,6 @@ from crane.recordings.measured_recordings import (
     locked_joint_conflicts,
 )
 from crane.recordings.recording import (
-    CHANGES_NOTE,
     FORCE_SUFFIX,
     IDEAL_SENSORS,
     SENSORS_NOTE,
@@ -171,7 +170,7 @@ def replay(
     table = read_quantities(path, machine, columns, span)
     try:
         machine = add_recorded_tip_force(machine, table)
-        schedule = ParameterSchedule.from_note(table.notes.get(CHANGES_NOTE, ""))
+        schedule = ParameterSchedule.from_notes(table.notes)
         drive: ControlLaw
         initial: tuple[Array, Array] | None
         if controller is not None:
@@ -185,7 +184,7 @@ def replay(
         if steps < 1:
             raise RecordingError(f"is shorter than a step of {step:g} s, shorten the step")
         label = Path(path).stem
-        if schedule.changes:
+        if schedule.changes or schedule.keeps_chart:
             recording = schedule.simulate(machine, drive, initial, steps, step, label, progress)
         else:
             recording = simulate(

@@ -206,6 +206,7 @@ def integrate(
     records_transitions: bool = False,
     ends_with_command: bool = False,
     earlier: IntegrationResult | None = None,
+    keeps_chart: bool = False,
 ) -> IntegrationResult:
     """Integrate a run without computing its channels; see `simulate`.
 
@@ -221,6 +222,7 @@ def integrate(
         records_transitions: Whether the stick-slip modes of the chart record their transitions.
         ends_with_command: Whether the run ends with the command of the valves.
         earlier: A run of a variant of the machine, whose last state is the initial one.
+        keeps_chart: See `ChartSwitchingIntegrator`.
 
     Returns:
         The run; it is shorter where it was stopped, or where the command ended.
@@ -241,7 +243,9 @@ def integrate(
     chart = Chart.from_dynamics(dynamics, control, controller_states)
     if records_transitions:
         chart.stick_slip.transitions = []
-    integrator = ChartSwitchingIntegrator(chart, integrator_factory(chart, method, tolerance))
+    integrator = ChartSwitchingIntegrator(
+        chart, integrator_factory(chart, method, tolerance), keeps_chart
+    )
     times = step * np.arange(first, first + step_count + 1, dtype=np.float64)
     # stored by columns, so that channels are views
     rows = scratch_arrays.empty_array(step_count + 1, chart.row_layout.size)

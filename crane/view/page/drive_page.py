@@ -26,8 +26,15 @@ from crane.export.instance_routines import STATUS_TEXTS
 from crane.hydraulics.circuit_elements import MAIN_PUMP
 from crane.hydraulics.circuit_states import BALANCE_UNITS
 from crane.machine.machine import Machine
-from crane.recordings.recording import FORCE_UNITS, REFERENCE_PREFIX, VELOCITY_UNITS
+from crane.recordings.recording import (
+    COORDINATES_NOTE,
+    FORCE_UNITS,
+    KEPT_COORDINATES,
+    REFERENCE_PREFIX,
+    VELOCITY_UNITS,
+)
 from crane.recordings.recording_summary import DISPLAY_UNITS, result_title
+from crane.simulation.integration.chart_switching import KEPT_CHART_RELAXATION
 from crane.view.page.drive_conditions import DriveConditions
 from crane.view.page.drive_goals import goal_data
 from crane.view.page.drive_hand import pull_data, target_data
@@ -100,17 +107,19 @@ def _drive_data(conditions: DriveConditions, controller: str | None) -> dict[str
     nq, n = machine.model.nv, len(machine.active)
     hand = program.layout.size + _RESERVED_NUMBERS + nq * n
     module = emit_wasm_module(program.functions, program.entries, hand + nq + 4 * n + 64 + 6)
+    defaults = np.nan_to_num(program.defaults, posinf=1e300)
+    program.layout.view(defaults).bounds[3:5] *= KEPT_CHART_RELAXATION
     columns = list(_columns(program))
     order = {header: i for i, (header, _) in enumerate(columns)}
     inputs = range(start("inputs"), start("inputs") + program.layout.parts["inputs"])
     return {
         "wasm": base64.b64encode(module).decode(),
-        "defaults": pack_base64(np.nan_to_num(program.defaults, posinf=1e300), "f8"),
+        "defaults": pack_base64(defaults, "f8"),
         "interval": INTERVAL,
         "ramp": RAMP,
         "parts": {
             part: [start(part), program.layout.parts[part]]
-            for part in ("step", "q", "v_a", "tau", "dynamics")
+            for part in ("step", "q", "v_a", "dynamics")
         },
         "inputs": {program.names[i]: i for i in inputs},
         "holdsWeight": "gravity" in program.entries,
@@ -135,8 +144,9 @@ def _drive_data(conditions: DriveConditions, controller: str | None) -> dict[str
         "statuses": dict(STATUS_TEXTS),
         "notes": [
             "crane recording", f"machine name: {machine.name}", "task: drive",
-            f"controller: {controller or 'levers'}",
-            "sensors: ideal", *([f"free: {', '.join(machine.free)}"] if machine.free else []),
+            f"controller: {controller or 'levers'}", "sensors: ideal",
+            f"{COORDINATES_NOTE}: {KEPT_COORDINATES}",
+            *([f"free: {', '.join(machine.free)}"] if machine.free else []),
         ],
         "expression": [machine.load_name, machine.load_options],
         "command": f"crane simulate {machine.command_line_arguments}"

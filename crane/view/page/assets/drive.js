@@ -25,8 +25,8 @@ worker.postMessage({
     },
 });
 worker.onmessage = ({ data }) => {
-    if (data.rows) save(data);
-    else shown = data;
+    if (!data.rows) shown = data;
+    else if (data.purpose === "file") save(data);
 };
 
 function stateText({ status, running, factor, time }) {
@@ -75,7 +75,7 @@ element("reset").onclick = () => {
     levers.held.clear();
     worker.postMessage({ reset: true });
 };
-element("save").onclick = () => worker.postMessage({ take: true });
+element("save").onclick = () => worker.postMessage({ take: "file" });
 element("machine").textContent = page.machine;
 
 // --- what is chosen and told in the card
@@ -103,10 +103,9 @@ window.crane = {
     get state() { return shown; }, get frames() { return frames; }, levers, setRunning, worker,
     setInputs(inputs) { worker.postMessage({ inputs }); },
     take() {
-        return new Promise((resolve) => worker.addEventListener("message", function listen({ data }) {
-            if (!data.rows) return;
-            worker.removeEventListener("message", listen);
-            resolve(recordingText(data));
-        }));
+        return new Promise((resolve) => {
+            worker.addEventListener("message", ({ data }) => { if (data.rows) resolve(recordingText(data)); });
+            worker.postMessage({ take: "text" });
+        });
     },
 };

@@ -197,5 +197,5 @@ onmessage = ({ data }) => {
         tell();
     }
     if (data.goal !== undefined) tell();
-    if (data.take) postMessage({ rows, record });
+    if (data.take) postMessage({ rows, record, purpose: data.take });
 };
