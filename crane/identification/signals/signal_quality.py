@@ -189,11 +189,14 @@ def signal_delay(time: Array, one: Array, other: Array) -> float:
     return float((at - reach + shift) * step)
 
 
-def shifted_correlation(one: Array, other: Array, shift: int) -> float:
-    """Correlation of one signal with another one shifted by a number of samples."""
-    count = len(one) - abs(shift)
-    offsets = max(shift, 0), max(-shift, 0)
-    return float(np.corrcoef(one[offsets[1] :][:count], other[offsets[0] :][:count])[0, 1])
+def shifted_correlation(
+    one: Array, other: Array, shift: int, samples: np.ndarray | None = None
+) -> float:
+    """Correlation of some samples of one signal, all by default, with another, shifted one."""
+    samples = np.arange(len(one)) if samples is None else samples
+    shifted = samples + shift
+    is_overlap = (shifted >= 0) & (shifted < len(other))
+    return float(np.corrcoef(one[samples[is_overlap]], other[shifted[is_overlap]])[0, 1])
 
 
 def _products(one: Array, other: Array, reach: int) -> Array:
