@@ -139,14 +139,15 @@ def check_forces(
         # like inertia a quarter of a period later
         if not 0.5 < ratio < 2.0:
             continue
-        # static friction balances whatever acts: rows at rest determine no delay
+        # static friction balances whatever acts: rows in motion have to confirm it
         speed = np.abs(motion.v[:, i])
         moving = np.flatnonzero(speed >= STANDSTILL_SHARE * speed.max())
-        correlation, unshifted = (
-            shifted_correlation(expected, measured, shift, moving)
-            for shift in (round(lag / sampling_step(motion.time)), 0)
-        )
-        if abs(lag) > longest_delay and correlation > max(0.9, unshifted + 0.05):
+        shift = round(lag / sampling_step(motion.time))
+        if abs(lag) > longest_delay and all(
+            shifted_correlation(expected, measured, shift, rows)
+            > max(0.9, shifted_correlation(expected, measured, 0, rows) + 0.05)
+            for rows in (None, moving)
+        ):
             reject_delay(f"{joint}_force", lag, "its model", trust)
     if messages:
         warnings.warn(
