@@ -1,6 +1,7 @@
 """Hydraulic cylinders of steel: dimensions, masses and shapes of barrel and rod."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -122,21 +123,26 @@ def tube_inertia(start: float, end: float, inner: float, outer: float) -> pin.In
     )
 
 
-def add_bar_visual(link: etree._Element, start: float, end: float, diameter: float) -> None:
-    """Add the shape of a round bar along x to a link."""
+def add_cylinder_visuals(
+    barrel: etree._Element,
+    rod: etree._Element,
+    cylinder: SteelCylinder,
+    offsets: Sequence[float] = (0.0,),
+) -> None:
+    """Add the shapes of tube and rod to their links, of several beside each other along y."""
+    length, part = cylinder.retracted_length, cylinder.part_length
+    for y in offsets:
+        _add_bar_visual(barrel, 0, length - part, y, (1 + 2 * _WALL_SHARE) * cylinder.bore)
+        _add_bar_visual(rod, 2 * part - length, 0, y, cylinder.rod)
+
+
+def _add_bar_visual(
+    link: etree._Element, start: float, end: float, y: float, diameter: float
+) -> None:
     visual = etree.SubElement(link, "visual")
-    add_origin(visual, ((start + end) / 2, 0, 0), (0, math.pi / 2, 0))
+    add_origin(visual, ((start + end) / 2, y, 0), (0, math.pi / 2, 0))
     etree.SubElement(
         etree.SubElement(visual, "geometry"),
         "cylinder",
         {"radius": format_numbers([diameter / 2]), "length": format_numbers([end - start])},
     )
-
-
-def add_cylinder_visuals(
-    barrel: etree._Element, rod: etree._Element, cylinder: SteelCylinder
-) -> None:
-    """Add the shapes of tube and rod to their links."""
-    length, part = cylinder.retracted_length, cylinder.part_length
-    add_bar_visual(barrel, 0, length - part, (1 + 2 * _WALL_SHARE) * cylinder.bore)
-    add_bar_visual(rod, 2 * part - length, 0, cylinder.rod)

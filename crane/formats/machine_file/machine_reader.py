@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 from crane.common.errors import DescriptionError, InputError, suggest_names
 from crane.common.package_search import load_options
 from crane.common.unit_conversions import accepted_units, is_quantity, unit_size
+from crane.description.circuit_schema import CYLINDER_SIZE_KEYS
 from crane.description.estimation_settings import (
     EstimationSettings,
     ParameterPrior,
@@ -59,6 +60,7 @@ from crane.formats.machine_file.structure_sections import (
     TreeBuilder,
     read_chains,
     read_couplings,
+    read_drawn_chain,
     read_drives,
     read_home,
     read_loops,
@@ -121,15 +123,24 @@ def read_plain_data(path: Path) -> dict[str, Any]:
 def _read_machine(path: Path) -> MachineSpec:
     top = YamlSection.read(path, MACHINE)
     name, source = top.text("name"), top.text("source")
-    chains, tree, friction, couplings, springs, gravity = read_chains(top, path)
+    drawn = None
+    with error_recovery():
+        drawn = read_drawn_chain(top, path)
+    top.is_complete &= drawn is not None or "drawing" not in top
+    chains, tree, friction, couplings, springs, gravity = read_chains(top, path, drawn)
     top.turns |= dict.fromkeys(TIP_COORDINATES, False)
     top.turns |= {x: True for group in ATTITUDE_COORDINATES for x in group}
     top.turns |= {name: joint.kind != "prismatic" for name, joint in tree.joints.items()}
     loops = read_loops(top, tree)
+    if drawn is not None:
+        loops = drawn.loops + loops
+        _fill_circuit(top)
     couplings += read_couplings(top, tree)
     active: tuple[str, ...] = UnknownNames()
     with error_recovery():
         active = top.names("active")
+        if drawn is not None and "active" not in top:
+            active = drawn.active or ()
     for joint in active:
         with error_recovery():
             tree.check_joint(joint, top.source_location("active"))
@@ -138,6 +149,11 @@ def _read_machine(path: Path) -> MachineSpec:
     free = _read_free_joints(top, tree, active)
     locations = {key: top.source_location(key) for key in top} | source_locations(loops, couplings)
     home, home_locations = read_home(top, tree)
+    if drawn is not None:
+        home = dict(drawn.home) | home
+        home_locations = {
+            x: drawn.source_locations[x] for x in drawn.source_locations if x.startswith("home ")
+        } | home_locations
     locations |= home_locations
     rotor_inertias = _read_or_default(
         top.value_map, {}, "rotor_inertia", YamlSection.number, tree.check_joint
@@ -191,6 +207,13 @@ def _read_machine(path: Path) -> MachineSpec:
         gravity=gravity,
         written_numbers=top.written_numbers(),
     )
+
+
+def _fill_circuit(top: YamlSection) -> None:
+    """Let the cylinders of the circuit have the dimensions that the drawing has."""
+    drawing, circuit = top.section("drawing"), top.section("hydraulics")
+    if drawing is not None and circuit is not None:
+        circuit.fill_items("cylinders", drawing, CYLINDER_SIZE_KEYS)
 
 
 def _read_supports(
