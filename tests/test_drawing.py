@@ -290,7 +290,7 @@ def test_masses_may_be_estimated(loaded):
     with pytest.warns(crane.CraneWarning, match=r"masses are estimated of 'boom' \(\d+ kg\)"):
         machine = loaded("mass: 900, width: 0.8", "width: 0.8")
     length = np.hypot(2.4, 1.4)
-    steel = 2 * 7850 * np.pi / 4 * 0.12**2 * length
+    steel = 1.5 * 7850 * 2 * np.pi / 4 * 0.12**2 * length  # of the two lift cylinders
     assert machine.tree.links["boom"].inertial.mass == pytest.approx(steel)
 
 

@@ -22,9 +22,9 @@ from crane.formats.drawing.body_inertia import (
 from crane.formats.machine_file.yaml_section import YamlSection
 from crane.formats.steel_cylinder import STEEL_DENSITY, SteelCylinder, sum_inertias
 
-# Of a body without mass: twice the section of the largest piston that acts on it, over its length.
-# Booms, arms and buckets of excavators and log cranes have 1.5 to 2.5 times.
-_ESTIMATED_SECTION = 2.0
+# Of a body without mass: times the section of the largest pistons that act on it, over its length.
+# Boom and arm of the bundled excavator have 1.6 and 1.9, the lift boom of the log crane 0.8.
+_ESTIMATED_SECTION = 1.5
 _BAR_SHARE = 0.05  # of the size of a body, as the thickness of lines between its points
 # Angles count counterclockwise in the drawing, whose z points up: about -y.
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, 1.0)}
@@ -153,7 +153,7 @@ class _DrawingReader:
     def __init__(self, section: YamlSection):
         self._section = section
         self._points: dict[str, Array] = {}
-        self._bores: dict[str, float] = {}  # by point the largest of the cylinders at it
+        self._piston_areas: dict[str, float] = {}  # by point the largest of cylinders there
         self._estimates: list[str] = []
 
     def read(self) -> Drawing:
@@ -210,7 +210,8 @@ class _DrawingReader:
             SteelCylinder.from_dimensions, values["bore"], values["rod"], stroke, shortest
         )
         for point in points:
-            self._bores[point] = max(self._bores.get(point, 0.0), cylinder.bore)
+            area = count * np.pi / 4 * cylinder.bore**2
+            self._piston_areas[point] = max(self._piston_areas.get(point, 0.0), area)
         offsets = tuple(np.linspace(-spacing / 2, spacing / 2, int(count)).tolist())
         return DrawnSlide(
             points, shortest, stroke, item.source_location(), cylinder=cylinder,
@@ -316,11 +317,11 @@ class _DrawingReader:
                 yield [bar], tube_inertia(bar.ends, **values)
 
     def _estimate_mass(self, name: str, item: YamlSection, points: Sequence[str]) -> float:
-        bores = [self._bores[point] for point in points if point in self._bores]
-        bore = max(bores or self._bores.values(), default=0.0)
+        known = self._piston_areas
+        area = max([known[x] for x in points if x in known] or known.values(), default=0.0)
         places = self._coordinates(points)
         length = max(float(np.linalg.norm(a - b)) for a in places for b in places)
-        mass = _ESTIMATED_SECTION * STEEL_DENSITY * np.pi / 4 * bore**2 * length
+        mass = _ESTIMATED_SECTION * STEEL_DENSITY * area * length
         if not mass:
             raise item.error_at(None, f"{item.title} has no mass, give it mass, plates or tubes")
         self._estimates.append(f"'{name}' ({mass:.3g} kg)")

@@ -73,7 +73,7 @@ def open_drawing(file: Path) -> XmlFile:
     top = YamlSection.read(file, MACHINE)
     section = top.section("drawing")
     if section is None:
-        raise top.error_at(None, "there is no section 'drawing'")
+        raise top.error_at(None, "this is no URDF and has no section 'drawing'")
     return _DrawingTranslation(read_drawing(section), top.text("name")).build_robot(file)
 
 

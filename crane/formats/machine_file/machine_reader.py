@@ -123,37 +123,20 @@ def read_plain_data(path: Path) -> dict[str, Any]:
 def _read_machine(path: Path) -> MachineSpec:
     top = YamlSection.read(path, MACHINE)
     name, source = top.text("name"), top.text("source")
-    drawn = None
-    with error_recovery():
-        drawn = read_drawn_chain(top, path)
-    top.is_complete &= drawn is not None or "drawing" not in top
+    drawn = read_drawn_chain(top, path)
     chains, tree, friction, couplings, springs, gravity = read_chains(top, path, drawn)
     top.turns |= dict.fromkeys(TIP_COORDINATES, False)
     top.turns |= {x: True for group in ATTITUDE_COORDINATES for x in group}
     top.turns |= {name: joint.kind != "prismatic" for name, joint in tree.joints.items()}
-    loops = read_loops(top, tree)
-    if drawn is not None:
-        loops = drawn.loops + loops
-        _fill_circuit(top)
+    loops = drawn.loops + read_loops(top, tree)
+    _fill_circuit(top)
     couplings += read_couplings(top, tree)
-    active: tuple[str, ...] = UnknownNames()
-    with error_recovery():
-        active = top.names("active")
-        if drawn is not None and "active" not in top:
-            active = drawn.active or ()
-    for joint in active:
-        with error_recovery():
-            tree.check_joint(joint, top.source_location("active"))
-    if not all(joint in tree.joints for joint in active):
-        active = UnknownNames()
+    active = _read_active_joints(top, tree, drawn)
     free = _read_free_joints(top, tree, active)
     locations = {key: top.source_location(key) for key in top} | source_locations(loops, couplings)
     home, home_locations = read_home(top, tree)
-    if drawn is not None:
-        home = dict(drawn.home) | home
-        home_locations = {
-            x: drawn.source_locations[x] for x in drawn.source_locations if x.startswith("home ")
-        } | home_locations
+    home = dict(drawn.home) | home
+    locations |= {f"home {joint}": drawn.source_locations[f"home {joint}"] for joint in drawn.home}
     locations |= home_locations
     rotor_inertias = _read_or_default(
         top.value_map, {}, "rotor_inertia", YamlSection.number, tree.check_joint
@@ -207,6 +190,18 @@ def _read_machine(path: Path) -> MachineSpec:
         gravity=gravity,
         written_numbers=top.written_numbers(),
     )
+
+
+def _read_active_joints(
+    top: YamlSection, tree: TreeBuilder, drawn: MachineSpec
+) -> tuple[str, ...]:
+    active: tuple[str, ...] = UnknownNames()
+    with error_recovery():
+        active = top.names("active") if "active" in top else drawn.active or ()
+    for joint in active:
+        with error_recovery():
+            tree.check_joint(joint, top.source_location("active"))
+    return active if all(joint in tree.joints for joint in active) else UnknownNames()
 
 
 def _fill_circuit(top: YamlSection) -> None:

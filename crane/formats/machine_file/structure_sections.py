@@ -179,18 +179,21 @@ class TreeBuilder:
         return leaves[0] if len(leaves) == 1 else None
 
 
-def read_drawn_chain(top: YamlSection, path: Path) -> MachineSpec | None:
-    """The machine that the section `drawing` has, as the first chain; None without one."""
-    if "drawing" not in top:
-        return None
-    spec = read_urdf(path)
-    (chain,) = spec.chains
-    location = top.source_location("drawing")
-    return replace(spec, chains=(replace(chain, name="drawing", source_location=location),))
+def read_drawn_chain(top: YamlSection, path: Path) -> MachineSpec:
+    """The machine that the section `drawing` has, of one chain; of none without the section."""
+    if "drawing" in top:
+        with error_recovery():
+            spec = read_urdf(path)
+            chain = replace(
+                spec.chains[0], name="drawing", source_location=top.source_location("drawing")
+            )
+            return replace(spec, chains=(chain,))
+        top.is_complete = False
+    return MachineSpec(name="", source="", path=path, chains=(), tree=Tree({}, {}))
 
 
 def read_chains(
-    top: YamlSection, path: Path, drawn: MachineSpec | None
+    top: YamlSection, path: Path, drawn: MachineSpec
 ) -> tuple[
     tuple[Chain, ...], TreeBuilder, dict[str, Friction], tuple[Coupling, ...],
     tuple[ForceElement, ...], tuple[float, ...],
@@ -202,9 +205,9 @@ def read_chains(
     couplings: tuple[Coupling, ...] = ()
     springs: tuple[ForceElement, ...] = ()
     gravities: dict[tuple[float, ...], str] = {}  # name of a chain that states each
-    if drawn is not None:
-        tree.add_chain(drawn.chains[0], drawn)
-        chains.append(drawn.chains[0])
+    for chain in drawn.chains:
+        tree.add_chain(chain, drawn)
+        chains.append(chain)
     for item in top.list_items("chains"):
         tree.is_complete &= top.is_complete
         was_complete = tree.is_complete
