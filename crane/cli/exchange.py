@@ -13,8 +13,8 @@ from crane.cli.options import (
     MachineOptions,
     OutputFolder,
     OverwriteOptions,
+    RecordingOptions,
     RequiredOutputFile,
-    TimeOptions,
 )
 from crane.common.atomic_output import (
     check_file_is_writable,
@@ -107,13 +107,7 @@ def import_log(
     log: Annotated[
         Path, typer.Argument(metavar="LOG", help="A CSV or npz file of another program.")
     ],
-    columns: Annotated[
-        Path,
-        typer.Argument(
-            metavar="COLUMNS", help="A text file with one line per column of the recording."
-        ),
-    ],
-    window: TimeOptions,
+    reading: RecordingOptions,
     output: RequiredOutputFile,
 ) -> None:
     """Convert a log of another program to a recording."""
@@ -123,6 +117,11 @@ def import_log(
 
     if output.out.suffix.lower() != ".csv":
         raise InputError(f"{output.out}: a recording is written as .csv, name it so")
+    if (columns := reading.columns) is None:
+        raise InputError(
+            "nothing says what the columns of the log are, give a file with a line per column of "
+            "the recording (--columns FILE)"
+        )
     check_file_is_writable(output.out, output.force)
     machine, name = None, read_log_columns(columns)[0].get("machine", "")
     try:
@@ -133,7 +132,7 @@ def import_log(
             CraneWarning,
             stacklevel=2,
         )
-    table = select_time_span(read_sensor_readings(log, machine, columns), window.span, log)
+    table = select_time_span(read_sensor_readings(log, machine, columns), reading.span, log)
     timeseries.write_table(output.out, table)
     print(f"{len(table.values)} samples of {len(table.units)} columns written to {output.out}")
 
