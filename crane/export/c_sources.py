@@ -47,6 +47,9 @@ _TEXTS = {
     "inverse_dynamics_with_friction": "Active forces (n) at accelerations x (n).",
     "forward_dynamics": "Accelerations (n) under active forces x (n), without friction.",
     "forward_dynamics_with_friction": "Accelerations (n) under active forces x (n).",
+    "set_payload": "Hang a payload (10) on the tip: mass, centre of mass (3) and inertia about it "
+    "(xx,\nxy, xz, yy, yz, zz), in the frame of the tip; it replaces the last one. The body of the"
+    "\ntip without it is `unladen_`.",
     "mass_matrix": "(n, n); v_a and x are not used, as for gravity and energy.",
     "bias": "Forces (n) of inertia, gravity and springs at a_a = 0.",
     "gravity": "Active forces (n) that hold the machine.",

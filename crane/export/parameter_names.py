@@ -18,6 +18,7 @@ _POSITION = ["position_x", "position_y", "position_z"]
 _INERTIA = ["mass", *(f"com_{x}" for x in "xyz")] + [
     f"inertia_{x}" for x in ("xx", "xy", "xz", "yy", "yz", "zz")
 ]
+_INERTIA_UNITS = ("kg", "m", "m", "m", *("kg m2",) * 6)
 _WRENCH_UNITS = ("N", "N", "N", "N m", "N m", "N m")
 
 
@@ -79,6 +80,9 @@ def _elements(program: "InstanceProgram") -> Iterator[tuple[str, str, str]]:
     yield from (
         ("dynamics", name, unit) for name, unit in zip(_dynamics(program), units, strict=True)
     )
+    if program.layout.parts["unladen"]:
+        for name, unit in zip(_INERTIA, _INERTIA_UNITS, strict=True):
+            yield "unladen", f"unladen_{name}", unit
 
 
 def _inputs(program: "InstanceProgram") -> Iterator[tuple[str, str]]:
@@ -150,7 +154,7 @@ def _dynamics_units(program: "InstanceProgram") -> Iterator[str]:
     laws = [_law_units(machine.unit(joint)) for joint in machine.joints]
     pairs = len(dynamics.forces.lengths.pairs)
     known = {
-        "inertias": ("kg", "m", "m", "m", *("kg m2",) * 6) * len(machine.joints),
+        "inertias": _INERTIA_UNITS * len(machine.joints),
         "joint_laws": [units.get(name, "") for units in laws for name in LAW_PARAMETER_NAMES],
         "distances": [
             *(_law_units("m").get(name, "") for name in LAW_PARAMETER_NAMES), *("m",) * 6,
