@@ -16,9 +16,8 @@ from crane.codegen import (
     FormulaTooLongError,
     Layout,
     Program,
-    Routine,
 )
-from crane.codegen.linked_functions import LinkedFunction, link_functions
+from crane.codegen.linked_functions import LinkedFunction
 from crane.common.errors import CraneWarning, InputError
 from crane.common.samples import Array
 from crane.control.control_law import ControlLaw
@@ -31,6 +30,13 @@ from crane.dynamics.formula_structure import BODY_SIZE, FormulaStructure
 from crane.dynamics.joint_forces import LAW_PARAMETER_NAMES, PARAMETER_COUNT
 from crane.export.force_inputs import ForceInputs
 from crane.export.instance_routines import INNER_ROUTINES, InstanceRoutines
+from crane.export.kinematics_program import (
+    SINGLE_PRECISION_BOUNDS,
+    Linked,
+    check_formulas,
+    joined_program,
+    link_entries,
+)
 from crane.export.parameter_names import parameter_names
 from crane.machine.machine import Machine
 from crane.motion.frame_kinematics import CompiledFrame
@@ -45,8 +51,6 @@ from crane.simulation.simulation_setup import machine_under_control
 
 TIP_WRENCH_NAME = "tip"
 SINGLE_PRECISION_TOLERANCE = 1e-4  # of a step
-# over those of double precision: residuals of rounding, of closed loops; last step of Newton
-_SINGLE_PRECISION_BOUNDS = np.array([1e9, 1e8, 1e6])
 _SHARPNESS = 1e3  # of friction that is 0 in the machine file, one over its smoothing velocity
 MAX_STEPS, MAX_EVENTS = 10_000, 200  # of one call of `advance`, by default
 DYNAMICS_ROUTINES = MappingProxyType(
@@ -103,8 +107,7 @@ class InstanceProgram:
             control = ValveDrive(machine, ValveSignals(machine, [0.0], {}))
         machine = machine_under_control(machine, control)
         self.machine, self.control = machine, control
-        if not machine.closure.is_compiled:
-            raise InputError(f"the loops of '{machine.name}' have no formulas to export")
+        check_formulas(machine)
         if isinstance(control, ValveDrive) and control.delays.any():
             raise InputError(
                 f"valves of '{machine.name}' have a dead time, which is not exported: set delay "
@@ -183,7 +186,7 @@ class InstanceProgram:
         """`defaults` with tolerances that single precision reaches."""
         values = self.defaults.copy()
         at = self.layout.view(values)
-        at.bounds[:3] *= _SINGLE_PRECISION_BOUNDS
+        at.bounds[:3] *= SINGLE_PRECISION_BOUNDS
         at.tolerances[:] = self._stepper_class(self.chart, SINGLE_PRECISION_TOLERANCE).tolerance
         return values
 
@@ -219,28 +222,21 @@ class InstanceProgram:
         return programs
 
     @cached_property
-    def _linked(self) -> tuple[dict[str, LinkedFunction], list[LinkedFunction]]:
-        programs = {name: dict(program.functions) for name, program in self._programs.items()}
-        own = Program()
-        for prefix, parts in programs.items():
-            own.functions |= {f"{prefix}_{name}": x for name, x in parts.items()}
+    def _linked(self) -> Linked:
+        parts = {name: dict(program.functions) for name, program in self._programs.items()}
+        own = joined_program(parts)
         known = {*own.functions, *INNER_ROUTINES}
         offset = None if self._tip is None else self._tip.frame_offset
         InstanceRoutines(
             self.chart, self.stepper, self.layout, self._programs,
             [name for name in self._quantities if name in self._programs], offset,
         ).add_to(own)  # fmt: skip
-        programs["machine"] = own.functions
-        entries = [
-            name
-            for name, function in own.functions.items()
-            if name not in known and isinstance(function, Routine)
-        ]
-        close = "project" if self._closure.has_partly_active_rotations else "close"
-        bindings = {"close": ("loops", close), "follow": ("loops", "follow")}
-        functions = link_functions(programs, [("machine", x) for x in entries], bindings)
-        by_name = {x.name: x for x in functions}
-        return {x: by_name[f"machine_{x}"] for x in entries}, functions
+        return link_entries(parts, own, known, self._closure)
+
+    @property
+    def output_count(self) -> int:
+        """Elements of an instance that `update_outputs` writes."""
+        return sum(self.chart.output_layout.parts.values())
 
     @property
     def entries(self) -> dict[str, LinkedFunction]:

@@ -32,14 +32,20 @@ from crane.common.samples import Array
 from crane.dynamics.formula_structure import BODY_SIZE
 from crane.dynamics.frame_jacobians import frame_placement
 from crane.export.force_inputs import ForceInputs
+from crane.export.kinematics_program import (
+    BEYOND_CHART,
+    DONE,
+    HALTED,
+    NOT_CLOSED,
+    TOO_MANY_EVENTS,
+    KinematicsRoutines,
+)
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.error_controlled_stepper import ErrorControlledStepper
 from crane.simulation.integration.machine_code_stepper import HELD_INDEX
 from crane.simulation.integration.machine_formulas import AT_REST_SUFFIX
 from crane.simulation.integration.stick_slip_routine import add_stick_slip_routines
 
-# Statuses of the routines, besides the number of what was done.
-DONE, NOT_CLOSED, BEYOND_CHART, HALTED, TOO_MANY_EVENTS = 1, -1, -2, -3, -4
 STATUS_TEXTS = MappingProxyType(
     {
         DONE: "done",
@@ -59,7 +65,7 @@ INNER_ROUTINES = (
 )  # fmt: skip
 
 
-class InstanceRoutines:
+class InstanceRoutines(KinematicsRoutines):
     """Writer of the routines of an instance.
 
     Args:
@@ -80,13 +86,13 @@ class InstanceRoutines:
         quantities: Sequence[str],
         tip_offset: Array | None,
     ):
-        self.chart, self.stepper, self.layout = chart, stepper, layout
+        super().__init__(layout, chart.machine.closure.compiled_closure)
+        self.chart, self.stepper = chart, stepper
         self._programs, self._quantities, self._tip_offset = programs, quantities, tip_offset
         machine = self.machine = chart.machine
         self.control = chart.control
         self._nq, self._n = machine.model.nv, len(machine.active)
         self._k = len(chart.stick_slip.columns)
-        self._closure = machine.closure.compiled_closure
 
     def add_to(self, program: Program) -> None:
         """Add all routines to a program that has the functions of `programs`."""
@@ -94,7 +100,8 @@ class InstanceRoutines:
         self._add_initialize(program)
         self._add_advance(program)
         self._add_evaluations(program)
-        self._add_kinematics(program)
+        self.add_kinematics(program)
+        self._add_tip(program)
         self._add_dynamics(program)
         if self.layout.parts["unladen"]:
             self._add_payload(program)
@@ -117,12 +124,6 @@ class InstanceRoutines:
 
     def _machine_arguments(self, instance: ArrayPointer) -> tuple[ArrayPointer, ...]:
         return tuple(self._part(instance, x) for x in ("geometry", "dynamics", "settings"))
-
-    def _part(self, instance: ArrayPointer, name: str) -> ArrayPointer:
-        return ArrayPointer(instance.name).element_pointer(self.layout.start_index(name))
-
-    def _element(self, instance: ArrayPointer, name: str, index: int = 0) -> RoutineValue:
-        return ArrayPointer(instance.name)[self.layout.start_index(name) + index]
 
     def _store(self, r: Routine, name: str, value: RoutineValue | float, index: int = 0) -> None:
         r.store(ArrayPointer("instance"), self.layout.start_index(name) + index, value)
@@ -330,28 +331,8 @@ class InstanceRoutines:
         r.copy(target, values.element_pointer(part), layout.parts[part])
         r.return_value(DONE)
 
-    def _add_kinematics(self, program: Program) -> None:
-        """close_loops, follow_loops, gamma and tip."""
-        newton = self._closure.formula_outputs("newton")
-        with program.add_routine("close_loops", arrays=("instance", "q")) as r:
-            result = r.local_array("result", newton)
-            geometry, bounds = (self._part(r.instance, x) for x in ("geometry", "bounds"))
-            with r.if_then(r.call("loops_close", geometry, r.q, result, bounds) < 1):
-                r.return_value(NOT_CLOSED)
-            r.return_value(DONE)
-        with program.add_routine("follow_loops", arrays=("instance", "q_a", "q")) as r:
-            geometry, cursor, bounds = (
-                self._part(r.instance, x) for x in ("geometry", "cursor", "bounds")
-            )
-            done = r.call("loops_follow", 1, geometry, r.q_a, cursor, r.q, bounds)
-            with r.if_then(done < 1):
-                r.return_value(NOT_CLOSED)
-            r.return_value(DONE)
-        with program.add_routine("gamma", arrays=("instance", "q", "gamma")) as r:
-            geometry = self._part(r.instance, "geometry")
-            with r.if_then(r.call("loops_gamma_each", 1, geometry, r.q, r.gamma) < 1):
-                r.return_value(BEYOND_CHART)
-            r.return_value(DONE)
+    def _add_tip(self, program: Program) -> None:
+        """tip(instance, q, v_a, tip)."""
         if self._tip_offset is None:
             return
         with program.add_routine("tip", arrays=("instance", "q", "v_a", "tip")) as r:

@@ -9,6 +9,7 @@ from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.dynamics.external_forces import reference_counts
 from crane.dynamics.joint_forces import LAW_PARAMETER_NAMES
 from crane.hydraulics.circuit_states import BALANCE_UNITS
+from crane.machine.machine import Machine
 
 if TYPE_CHECKING:
     from crane.export.instance_program import InstanceProgram
@@ -75,7 +76,7 @@ def _elements(program: "InstanceProgram") -> Iterator[tuple[str, str, str]]:
     if machine.supports:
         for joint in machine.joints:
             yield "a", f"a_{joint}", f"{machine.unit(joint)}/s2"
-    yield from (("geometry", name, unit) for name, unit in _geometry(program))
+    yield from (("geometry", name, unit) for name, unit in geometry_names(program.machine))
     units = _dynamics_units(program)
     yield from (
         ("dynamics", name, unit) for name, unit in zip(_dynamics(program), units, strict=True)
@@ -101,8 +102,8 @@ def _inputs(program: "InstanceProgram") -> Iterator[tuple[str, str]]:
         yield from ((f"{force.name}_{name}", unit) for name, unit in components)
 
 
-def _geometry(program: "InstanceProgram") -> Iterator[tuple[str, str]]:
-    machine = program.machine
+def geometry_names(machine: Machine) -> Iterator[tuple[str, str]]:
+    """Names and units of the constants of `TreeGeometry`."""
     frames = [f"{joint}_frame" for joint in machine.joints]
     for loop in machine.closure.equations.loops:
         frames += [f"{loop.name}_predecessor", f"{loop.name}_successor"]
