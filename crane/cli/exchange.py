@@ -24,7 +24,7 @@ from crane.common.atomic_output import (
 from crane.common.errors import CraneError, CraneWarning, InputError, check_name
 
 _FORMATS = ("urdf+", "urdf", "mjcf", "machine")
-_TARGETS = ("c",)
+_TARGETS = ("c", "ros2_control")
 _SUFFIXES = {".urdf": "urdf+", ".xml": "mjcf", ".mjcf": "mjcf"}
 
 
@@ -69,7 +69,10 @@ def export(
     machine: MachineName,
     options: MachineOptions,
     output: OutputFolder,
-    to: Annotated[str, typer.Option(metavar="TARGET", help="Target: c (C99 sources).")] = "c",
+    to: Annotated[
+        str,
+        typer.Option(metavar="TARGET", help="c: C99 sources; ros2_control: a transmission."),
+    ] = "c",
     name: Annotated[
         str,
         typer.Option(metavar="NAME", help="Prefix of all names; that of the machine by default."),
@@ -79,8 +82,13 @@ def export(
     check_name(to, _TARGETS, f"--to is '{to}'")
     check_folder_is_writable(output.out, output.force)
     loaded = options.load(machine)
-    written = crane.export.write_c(loaded, output.out, name=name, overwrite=output.force)
-    print(f"written to {written}: see its header, or cmake -B build -S {written}")
+    if to == "c":
+        written = crane.export.write_c(loaded, output.out, name=name, overwrite=output.force)
+        print(f"written to {written}: see its header, or cmake -B build -S {written}")
+    else:
+        write = crane.export.write_ros2_control
+        written = write(loaded, output.out, name=name, overwrite=output.force)
+        print(f"written to {written}: a package for colcon build")
 
 
 def _output_format(out: Path, to: str | None) -> str:

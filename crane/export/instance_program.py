@@ -6,7 +6,7 @@ any number of them may be used at once. The routines return a status, 1 for succ
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from types import MappingProxyType
 
@@ -16,9 +16,8 @@ from crane.codegen import (
     FormulaTooLongError,
     Layout,
     Program,
-    Routine,
 )
-from crane.codegen.linked_functions import LinkedFunction, link_functions
+from crane.codegen.linked_functions import LinkedFunction
 from crane.common.errors import CraneWarning, InputError
 from crane.common.samples import Array
 from crane.control.control_law import ControlLaw
@@ -27,8 +26,17 @@ from crane.control.valve_drive import ValveDrive
 from crane.description.external_forces import Wrench
 from crane.dynamics.compiled_dynamics import DERIVATIVES_OF, build_quantity
 from crane.dynamics.dynamics import Dynamics
+from crane.dynamics.formula_structure import BODY_SIZE, FormulaStructure
+from crane.dynamics.joint_forces import LAW_PARAMETER_NAMES, PARAMETER_COUNT
 from crane.export.force_inputs import ForceInputs
 from crane.export.instance_routines import INNER_ROUTINES, InstanceRoutines
+from crane.export.kinematics_program import (
+    SINGLE_PRECISION_BOUNDS,
+    Linked,
+    check_formulas,
+    joined_program,
+    link_entries,
+)
 from crane.export.parameter_names import parameter_names
 from crane.machine.machine import Machine
 from crane.motion.frame_kinematics import CompiledFrame
@@ -43,8 +51,7 @@ from crane.simulation.simulation_setup import machine_under_control
 
 TIP_WRENCH_NAME = "tip"
 SINGLE_PRECISION_TOLERANCE = 1e-4  # of a step
-# over those of double precision: residuals of rounding, of closed loops; last step of Newton
-_SINGLE_PRECISION_BOUNDS = np.array([1e9, 1e8, 1e6])
+_SHARPNESS = 1e3  # of friction that is 0 in the machine file, one over its smoothing velocity
 MAX_STEPS, MAX_EVENTS = 10_000, 200  # of one call of `advance`, by default
 DYNAMICS_ROUTINES = MappingProxyType(
     {
@@ -100,8 +107,7 @@ class InstanceProgram:
             control = ValveDrive(machine, ValveSignals(machine, [0.0], {}))
         machine = machine_under_control(machine, control)
         self.machine, self.control = machine, control
-        if not machine.closure.is_compiled:
-            raise InputError(f"the loops of '{machine.name}' have no formulas to export")
+        check_formulas(machine)
         if isinstance(control, ValveDrive) and control.delays.any():
             raise InputError(
                 f"valves of '{machine.name}' have a dead time, which is not exported: set delay "
@@ -114,6 +120,9 @@ class InstanceProgram:
             )
         states = control.circuit.state_count if isinstance(control, ValveDrive) else 0
         dynamics = Dynamics(machine)
+        active = machine.closure.active.tolist()
+        parameters = _parameter_indices(dynamics.formula_structure, active)
+        dynamics.constant_pattern[parameters] = np.nan
         self.chart = Chart.from_dynamics(dynamics, control, states)
         is_valve_drive = isinstance(control, ValveDrive)
         self._stepper_class = RosenbrockStepper if is_valve_drive else DormandPrinceStepper
@@ -145,11 +154,13 @@ class InstanceProgram:
             geometry=self._closure.geometry.constants.size,
             dynamics=self.chart.dynamics.formula_constants.size,
             settings=self.control.settings.size,
+            unladen=BODY_SIZE if _tip_inertia(self.chart.dynamics.formula_structure) else 0,
         )  # fmt: skip
 
     def _default_instance(self) -> Array:
         values = np.zeros(self.layout.size)
         at, dynamics = self.layout.view(values), self.chart.dynamics
+        structure = dynamics.formula_structure
         self.chart.stick_slip.slip_signs[:] = 0.0
         self.chart.stick_slip.apply_to(dynamics)
         at.step[:], at.max_events[:] = 1e-3, MAX_EVENTS
@@ -159,6 +170,12 @@ class InstanceProgram:
         at.bounds[:], at.tolerances[:] = self.stepper.bounds, self.stepper.tolerance
         at.geometry[:] = self._closure.geometry.constants
         at.dynamics[:], at.settings[:] = dynamics.formula_constants, self.control.settings
+        smoothed = sorted(
+            {*self.machine.closure.active.tolist()} - {*structure.stick_slip_columns}
+        )
+        sharpness = _law_indices(structure, smoothed, "sharpness")
+        at.dynamics[sharpness] = np.minimum(at.dynamics[sharpness], _SHARPNESS)
+        at.unladen[:] = at.dynamics[_tip_inertia(structure)]
         if isinstance(self.control, ValveDrive):
             neutral = [x.neutral for x in self.control.circuit.hydraulics.spools.values()]
             at.inputs[: len(neutral)] = at.inputs_start[: len(neutral)] = neutral
@@ -169,7 +186,7 @@ class InstanceProgram:
         """`defaults` with tolerances that single precision reaches."""
         values = self.defaults.copy()
         at = self.layout.view(values)
-        at.bounds[:3] *= _SINGLE_PRECISION_BOUNDS
+        at.bounds[:3] *= SINGLE_PRECISION_BOUNDS
         at.tolerances[:] = self._stepper_class(self.chart, SINGLE_PRECISION_TOLERANCE).tolerance
         return values
 
@@ -205,28 +222,21 @@ class InstanceProgram:
         return programs
 
     @cached_property
-    def _linked(self) -> tuple[dict[str, LinkedFunction], list[LinkedFunction]]:
-        programs = {name: dict(program.functions) for name, program in self._programs.items()}
-        own = Program()
-        for prefix, parts in programs.items():
-            own.functions |= {f"{prefix}_{name}": x for name, x in parts.items()}
+    def _linked(self) -> Linked:
+        parts = {name: dict(program.functions) for name, program in self._programs.items()}
+        own = joined_program(parts)
         known = {*own.functions, *INNER_ROUTINES}
         offset = None if self._tip is None else self._tip.frame_offset
         InstanceRoutines(
             self.chart, self.stepper, self.layout, self._programs,
             [name for name in self._quantities if name in self._programs], offset,
         ).add_to(own)  # fmt: skip
-        programs["machine"] = own.functions
-        entries = [
-            name
-            for name, function in own.functions.items()
-            if name not in known and isinstance(function, Routine)
-        ]
-        close = "project" if self._closure.has_partly_active_rotations else "close"
-        bindings = {"close": ("loops", close), "follow": ("loops", "follow")}
-        functions = link_functions(programs, [("machine", x) for x in entries], bindings)
-        by_name = {x.name: x for x in functions}
-        return {x: by_name[f"machine_{x}"] for x in entries}, functions
+        return link_entries(parts, own, known, self._closure)
+
+    @property
+    def output_count(self) -> int:
+        """Elements of an instance that `update_outputs` writes."""
+        return sum(self.chart.output_layout.parts.values())
 
     @property
     def entries(self) -> dict[str, LinkedFunction]:
@@ -237,3 +247,31 @@ class InstanceProgram:
     def functions(self) -> list[LinkedFunction]:
         """All linked functions, each after what it calls."""
         return self._linked[1]
+
+
+def _tip_inertia(structure: FormulaStructure) -> list[int]:
+    """Indices in `dynamics_constants` of the inertia of the body of the tip; none on the world."""
+    start = structure.constants_layout.start_index("inertias")
+    start += BODY_SIZE * ((structure.tip_body or 0) - 1)
+    return [*range(start, start + BODY_SIZE)] if structure.tip_body else []
+
+
+def _law_indices(structure: FormulaStructure, columns: Iterable[int], field: str) -> list[int]:
+    """Indices in `dynamics_constants` of a value of the force laws of joints."""
+    start = structure.constants_layout.start_index("joint_laws") + LAW_PARAMETER_NAMES.index(field)
+    return [start + PARAMETER_COUNT * column for column in columns]
+
+
+def _parameter_indices(structure: FormulaStructure, active: Iterable[int]) -> list[int]:
+    """Indices in `dynamics_constants` of what stays a parameter where it is 0, 1 or -1."""
+    gravity, joints = (
+        structure.constants_layout["gravity"],
+        range(len(structure.motion_parents) - 1),
+    )
+    return [
+        *range(gravity.start, gravity.stop),
+        *_tip_inertia(structure),
+        *_law_indices(structure, active, "coulomb"),
+        *_law_indices(structure, joints, "coulomb_offset"),
+        *_law_indices(structure, joints, "viscous"),
+    ]
