@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,10 +16,12 @@ import crane
 from crane.codegen.wasm_emitter import emit_wasm_module
 from crane.common.errors import InputError
 from crane.control import interpolate_references
+from crane.description.force_elements import Friction
 from crane.export import InstanceProgram, write_c
 from crane.export.c_sources import CSources
 from crane.export.instance_program import DYNAMICS_ROUTINES
 from crane.export.instance_routines import TOO_MANY_CALLS
+from crane.machine.payload import Payload
 
 COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic"]
@@ -115,6 +118,35 @@ def test_a_motion_with_joints_that_stick_is_that_of_simulate(tmp_path):
     assert 0 < np.count_nonzero(stick) < stick.size
 
 
+def compare_with_changes(library, machine, configurations, random):
+    """A payload, a slope and friction, set in C, against a machine that was built with them."""
+    tensor = np.cov(random.normal(size=(3, 9)))
+    tensor, com = np.trace(tensor) * np.eye(3) - tensor, random.normal(size=3)
+    column = machine.closure.active[-1]
+    joint, law = machine.joints[column], f"{machine.joints[column]}_"
+    friction = replace(machine.friction.get(joint, Friction()), coulomb=7.0, viscous=3.0)
+    gravity = [1.0, -2.0, -9.0]
+    given = {f"gravity_{x}": value for x, value in zip("xyz", gravity, strict=True)}
+    given |= {f"{law}coulomb": 7.0, f"{law}viscous": 3.0}
+    if machine.friction.get(joint) is None:  # C has no stick-slip transitions of this joint
+        given[f"{law}sharpness"] = 1.0 / 0.002
+        friction = replace(friction, smoothing=0.002)
+    for name, value in given.items():
+        library.instance[library.program.names.index(name)] = value
+    payload = np.array([50.0, *com, *tensor[np.triu_indices(3)]])
+    assert library("set_payload", payload) == 1
+    changed = replace(machine, friction=machine.friction | {joint: friction})
+    changed = changed.with_payload(Payload(machine.tip, 50.0, tuple(com), tensor))
+    changed.model.gravity.linear = np.array(gravity)
+    dynamics = crane.Dynamics(changed)
+    for q in configurations:
+        v, x = random.normal(size=(2, len(machine.active)))
+        expected = dynamics.evaluate_closed("inverse with friction", q, v, x)
+        found = np.empty_like(expected)
+        assert library("inverse_dynamics_with_friction", q, v, x, found) == 1
+        assert np.abs(found - expected).max() < 1e-12 * np.abs(expected).max()
+
+
 @needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EVERY_MACHINE)
@@ -147,6 +179,7 @@ def test_quantities_at_random_states_are_those_of_the_library(tmp_path, name):
         assert library("close_loops", closed) == 1
         assert np.abs((closed - q) / machine.closure.units).max() < 1e-13
     assert all(differences[name] < 1e-13 * sizes[name] for name in quantities)
+    compare_with_changes(library, machine, configurations[:20], random)
 
 
 @needs_compiler

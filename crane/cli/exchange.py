@@ -7,14 +7,14 @@ from typing import Annotated
 import typer
 
 import crane
-from crane.cli.command import command
+from crane.cli.command import command, refuse_options
 from crane.cli.options import (
     MachineName,
     MachineOptions,
     OutputFolder,
     OverwriteOptions,
+    RecordingOptions,
     RequiredOutputFile,
-    TimeOptions,
 )
 from crane.cli.simulate import ExportedController
 from crane.common.atomic_output import (
@@ -25,7 +25,7 @@ from crane.common.atomic_output import (
 from crane.common.errors import CraneError, CraneWarning, InputError, check_name
 
 _FORMATS = ("urdf+", "urdf", "mjcf", "machine")
-_TARGETS = ("c",)
+_TARGETS = ("c", "ros2_control")
 _SUFFIXES = {".urdf": "urdf+", ".xml": "mjcf", ".mjcf": "mjcf"}
 
 
@@ -70,7 +70,10 @@ def export(
     machine: MachineName,
     options: MachineOptions,
     output: OutputFolder,
-    to: Annotated[str, typer.Option(metavar="TARGET", help="Target: c (C99 sources).")] = "c",
+    to: Annotated[
+        str,
+        typer.Option(metavar="TARGET", help="c: C99 sources; ros2_control: a transmission."),
+    ] = "c",
     controller: ExportedController = None,
     name: Annotated[
         str,
@@ -81,11 +84,17 @@ def export(
     check_name(to, _TARGETS, f"--to is '{to}'")
     check_folder_is_writable(output.out, output.force)
     loaded = options.load(machine)
-    law = None if controller is None else crane.control.make_controller(controller, loaded)
-    written = crane.export.write_c(
-        loaded, output.out, controller=law, name=name, overwrite=output.force
-    )
-    print(f"written to {written}: see its header, or cmake -B build -S {written}")
+    if to == "c":
+        law = None if controller is None else crane.control.make_controller(controller, loaded)
+        written = crane.export.write_c(
+            loaded, output.out, controller=law, name=name, overwrite=output.force
+        )
+        print(f"written to {written}: see its header, or cmake -B build -S {written}")
+    else:
+        refuse_options({"--controller": controller}, "is for --to c, leave it out")
+        write = crane.export.write_ros2_control
+        written = write(loaded, output.out, name=name, overwrite=output.force)
+        print(f"written to {written}: a package for colcon build")
 
 
 def _output_format(out: Path, to: str | None) -> str:
@@ -112,13 +121,7 @@ def import_log(
     log: Annotated[
         Path, typer.Argument(metavar="LOG", help="A CSV or npz file of another program.")
     ],
-    columns: Annotated[
-        Path,
-        typer.Argument(
-            metavar="COLUMNS", help="A text file with one line per column of the recording."
-        ),
-    ],
-    window: TimeOptions,
+    reading: RecordingOptions,
     output: RequiredOutputFile,
 ) -> None:
     """Convert a log of another program to a recording."""
@@ -128,6 +131,11 @@ def import_log(
 
     if output.out.suffix.lower() != ".csv":
         raise InputError(f"{output.out}: a recording is written as .csv, name it so")
+    if (columns := reading.columns) is None:
+        raise InputError(
+            "nothing says what the columns of the log are, give a file with a line per column of "
+            "the recording (--columns FILE)"
+        )
     check_file_is_writable(output.out, output.force)
     machine, name = None, read_log_columns(columns)[0].get("machine", "")
     try:
@@ -138,7 +146,7 @@ def import_log(
             CraneWarning,
             stacklevel=2,
         )
-    table = select_time_span(read_sensor_readings(log, machine, columns), window.span, log)
+    table = select_time_span(read_sensor_readings(log, machine, columns), reading.span, log)
     timeseries.write_table(output.out, table)
     print(f"{len(table.values)} samples of {len(table.units)} columns written to {output.out}")
 

@@ -1,6 +1,7 @@
 """Keys of a machine file: the one description that its reader, writer, tables and schema use."""
 
 from crane.description.circuit_schema import HYDRAULICS
+from crane.description.drawing_schema import DRAWING
 from crane.description.external_force_schema import CONTACT, CUTTER, GROUND, LOAD, SOIL, TASK_LOAD
 from crane.description.force_elements import EndStop, ForceElement, Friction, GasSpring, Rope
 from crane.description.key_types import (
@@ -332,7 +333,13 @@ MACHINE = section_schema(
             "acceleration of gravity, in the axes of the world; 0, 0, 0 for none", "m/s2", size=3,
             default=STANDARD_GRAVITY, default_text="0, 0, -9.81, or that of the files of `chains`",
         ),
-        "chains": ListKey("open sub-chains", SectionKey(section=CHAIN), default=REQUIRED),
+        "drawing": SectionKey(
+            "the machine by its pins, instead of chains or before them", section=DRAWING
+        ),
+        "chains": ListKey(
+            "open sub-chains", SectionKey(section=CHAIN),
+            default_text="required without `drawing`",
+        ),
         "floating": NameListKey(
             "degrees of freedom of the root of the first chain",
             choices=FLOATING_FREEDOMS, default_text="none: fixed to the world",

@@ -1,2 +1,3 @@
 from .c_sources import write_c as write_c
 from .instance_program import InstanceProgram as InstanceProgram
+from .ros2_control import write_ros2_control as write_ros2_control

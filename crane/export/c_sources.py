@@ -19,6 +19,7 @@ from crane.control.control_law import Controller
 from crane.control.valve_commands import ValveCommand
 from crane.export.instance_program import DYNAMICS_ROUTINES, InstanceProgram
 from crane.export.instance_routines import STATUS_TEXTS
+from crane.export.kinematics_program import KinematicsProgram
 from crane.export.recorded_values import random_vectors, recorded_motion
 from crane.formats.machine_loading import load
 from crane.machine.machine import Machine
@@ -50,6 +51,9 @@ _TEXTS = {
     "inverse_dynamics_with_friction": "Active forces (n) at accelerations x (n).",
     "forward_dynamics": "Accelerations (n) under active forces x (n), without friction.",
     "forward_dynamics_with_friction": "Accelerations (n) under active forces x (n).",
+    "set_payload": "Hang a payload (10) on the tip: mass, centre of mass (3) and inertia about it "
+    "(xx,\nxy, xz, yy, yz, zz), in the frame of the tip; it replaces the last one. The body of the"
+    "\ntip without it is `unladen_`.",
     "mass_matrix": "(n, n); v_a and x are not used, as for gravity and energy.",
     "bias": "Forces (n) of inertia, gravity and springs at a_a = 0.",
     "gravity": "Active forces (n) that hold the machine.",
@@ -97,21 +101,26 @@ def write_c(
     check_folder_is_writable(Path(folder), overwrite)
     loaded = machine if isinstance(machine, Machine) else load(machine)
     texts = CSources(InstanceProgram(loaded, controller=controller), name).files()
+    return write_texts(folder, texts, overwrite)
+
+
+def write_texts(folder: str | Path, texts: Mapping[str, str], overwrite: bool) -> Path:
+    """Write files of a folder by name."""
     with replace_folder(folder, overwrite) as output_folder:
         for file, text in texts.items():
             (output_folder / file).write_text(text, encoding="utf-8")
     return Path(folder)
 
 
-class CSources:
-    """The C sources of a machine.
+class FunctionSources:
+    """Header and functions of a machine in C.
 
     Args:
         program: The machine as a program.
         name: Prefix of all public names; that of the machine by default.
     """
 
-    def __init__(self, program: InstanceProgram, name: str = ""):
+    def __init__(self, program: InstanceProgram | KinematicsProgram, name: str = ""):
         self._program, self.name = program, c_identifier(name or program.machine.name)
         self._values = [
             _number(x) if x == y else f"sizeof({self.name}_real) < 8 ? {_number(y)} : {_number(x)}"
@@ -119,27 +128,16 @@ class CSources:
         ]
         self._loads = _instance_loads(program)
 
-    def files(self) -> dict[str, str]:
-        """Texts of all files by name."""
-        name = self.name
-        found = {
-            f"{name}.h": self.header(),
-            f"{name}.c": self.source(),
-            f"{name}_test.c": self.test(),
-        }
-        for template in _TEMPLATES:
-            found[template.replace("machine", name)] = self._fill(_template(template))
-        return found
-
-    def _fill(self, text: str, further: Mapping[str, str] = MappingProxyType({})) -> str:
-        """A template with the values of the machine in place of @VALUE@."""
+    def fill(self, template: str, further: Mapping[str, str] = MappingProxyType({})) -> str:
+        """The text of a template with the values of the machine in place of @VALUE@."""
+        text = (files("crane.export") / "templates" / f"{template}.template").read_text("utf-8")
         machine, inputs = self._program.machine, _inputs_of(self._program)
         values = {
             "NAME": self.name, "UPPER": self.name.upper(), "MACHINE": machine.name,
             "VERSION": crane.__version__, "NQ": str(machine.model.nv),
             "N": str(len(machine.active)), "INPUT_COUNT": str(len(inputs)),
             "FIRST_INPUT": self._members()[inputs[0]] if inputs else "time",
-            "OUTPUTS": str(sum(self._program.chart.output_layout.parts.values())), **further,
+            "OUTPUTS": str(self._program.output_count), **further,
         }  # fmt: skip
         return re.sub(r"@([A-Z_]+)@", lambda match: values[match[1]], text)
 
@@ -206,7 +204,7 @@ class CSources:
             "MEMBERS": _join([line for line, _ in self._struct_lines()]),
             "PROTOTYPES": "\n".join(prototypes),
         }
-        return self._fill(_template("machine.h"), values)
+        return self.fill("machine.h", values)
 
     def _prototype(self, entry: str, linked: LinkedFunction) -> str:
         real, parameters = f"{self.name}_real", c_parameters(linked).replace("real *", "@*")
@@ -227,11 +225,36 @@ class CSources:
             "DEFAULTS": _join([f"{value}," for _, value in self._struct_lines()]),
             "WRAPPERS": "\n".join(wrappers),
         }
-        return self._fill(_template("machine.c"), values)
+        return self.fill("machine.c", values)
+
+
+class CSources(FunctionSources):
+    """The C sources of a machine.
+
+    Args:
+        program: The machine as a program.
+        name: Prefix of all public names; that of the machine by default.
+    """
+
+    def __init__(self, program: InstanceProgram, name: str = ""):
+        super().__init__(program, name)
+        self._instance_program = program
+
+    def files(self) -> dict[str, str]:
+        """Texts of all files by name."""
+        name = self.name
+        found = {
+            f"{name}.h": self.header(),
+            f"{name}.c": self.source(),
+            f"{name}_test.c": self.test(),
+        }
+        for template in _TEMPLATES:
+            found[template.replace("machine", name)] = self.fill(template)
+        return found
 
     def test(self) -> str:
         """A program that compares the functions with recorded values of crane."""
-        program, name = self._program, self.name
+        program, name = self._instance_program, self.name
         (vectors, scales), motion = random_vectors(program), recorded_motion(program)
         sizes = {key: rows[0].size for key, rows in vectors.items()}
         checks = []
@@ -250,7 +273,7 @@ class CSources:
             "STEP": repr(motion.step), "LARGEST": str(max(sizes.values())),
             "CHECKS": "\n        ".join(checks), "SET_INPUTS": set_inputs,
         }  # fmt: skip
-        return self._fill(_template("self_test.c"), values)
+        return self.fill("self_test.c", values)
 
 
 def _join(lines: list[str]) -> str:
@@ -263,12 +286,12 @@ def _number(value: float) -> str:
     return repr(float(value))
 
 
-def _inputs_of(program: InstanceProgram) -> range:
+def _inputs_of(program: InstanceProgram | KinematicsProgram) -> range:
     start = program.layout.start_index("inputs")
     return range(start, start + program.layout.parts["inputs"])
 
 
-def _instance_loads(program: InstanceProgram) -> frozenset[int]:
+def _instance_loads(program: InstanceProgram | KinematicsProgram) -> frozenset[int]:
     """Elements of an instance that formulas read."""
     entries = program.entries.values()
     return frozenset().union(*(x.loads.get("instance", frozenset()) for x in entries))
@@ -293,11 +316,6 @@ def _operations(formula: Formula) -> list[int]:
     tapes = [x.tape for x in formula.outputs if isinstance(x, SymbolicExpression)]
     required = required_operations(formula.outputs)
     return [i for i in required if tapes[0].operations[i][0] != "load"]
-
-
-def _template(name: str) -> str:
-    folder = files("crane.export") / "templates"
-    return (folder / f"{name}.template").read_text(encoding="utf-8")
 
 
 def _table(name: str, rows: Array) -> str:

@@ -6,7 +6,7 @@ any number of them may be used at once. The routines return a status, 1 for succ
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from types import MappingProxyType
 
@@ -16,9 +16,8 @@ from crane.codegen import (
     FormulaTooLongError,
     Layout,
     Program,
-    Routine,
 )
-from crane.codegen.linked_functions import LinkedFunction, link_functions
+from crane.codegen.linked_functions import LinkedFunction
 from crane.common.errors import CraneWarning, InputError
 from crane.common.samples import Array
 from crane.control.control_law import ControlLaw, Controller
@@ -28,7 +27,16 @@ from crane.control.valve_drive import ValveDrive
 from crane.description.external_forces import TIP_WRENCH_NAME, Wrench
 from crane.dynamics.compiled_dynamics import DERIVATIVES_OF, build_quantity
 from crane.dynamics.dynamics import Dynamics
+from crane.dynamics.formula_structure import BODY_SIZE, FormulaStructure
+from crane.dynamics.joint_forces import LAW_PARAMETER_NAMES, PARAMETER_COUNT
 from crane.export.instance_routines import INNER_ROUTINES, InstanceRoutines
+from crane.export.kinematics_program import (
+    SINGLE_PRECISION_BOUNDS,
+    Linked,
+    check_formulas,
+    joined_program,
+    link_entries,
+)
 from crane.export.parameter_names import parameter_names
 from crane.machine.machine import Machine
 from crane.motion.frame_kinematics import CompiledFrame
@@ -42,8 +50,7 @@ from crane.simulation.integration.rosenbrock import RosenbrockStepper
 from crane.simulation.simulation_setup import machine_under_control, resolve_controller
 
 SINGLE_PRECISION_TOLERANCE = 1e-4  # of a step
-# over those of double precision: residuals of rounding, of closed loops; last step of Newton
-_SINGLE_PRECISION_BOUNDS = np.array([1e9, 1e8, 1e6])
+_SHARPNESS = 1e3  # of friction that is 0 in the machine file, one over its smoothing velocity
 MAX_STEPS, MAX_EVENTS = 10_000, 200  # of one call of `advance`, by default
 _DELAYED_STEP = 1e-3  # shortest steps of which a dead time remembers all [s]
 DYNAMICS_ROUTINES = MappingProxyType(
@@ -181,12 +188,14 @@ class InstanceProgram:
             geometry=self._closure.geometry.constants.size,
             dynamics=self.chart.dynamics.formula_constants.size,
             settings=control.settings.size, delays=spools, history=rows * (1 + spools),
+            unladen=BODY_SIZE if _tip_inertia(self.chart.dynamics.formula_structure) else 0,
         )  # fmt: skip
 
     def _default_instance(self, chart: Chart) -> Array:
         values = np.zeros(self.layout.size)
         at, dynamics, machine = self.layout.view(values), chart.dynamics, chart.machine
         closure, stepper = machine.closure.compiled_closure, self._make_stepper(chart)
+        structure = dynamics.formula_structure
         chart.stick_slip.slip_signs[:] = 0.0
         chart.stick_slip.apply_to(dynamics)
         at.step[:], at.max_events[:] = 1e-3, MAX_EVENTS
@@ -196,6 +205,10 @@ class InstanceProgram:
         at.bounds[:], at.tolerances[:] = stepper.bounds, stepper.tolerance
         at.geometry[:] = closure.geometry.constants
         at.dynamics[:], at.settings[:] = dynamics.formula_constants, chart.control.settings
+        smoothed = sorted({*machine.closure.active.tolist()} - {*structure.stick_slip_columns})
+        sharpness = _law_indices(structure, smoothed, "sharpness")
+        at.dynamics[sharpness] = np.minimum(at.dynamics[sharpness], _SHARPNESS)
+        at.unladen[:] = at.dynamics[_tip_inertia(structure)]
         references = chart.control.references(np.zeros(1))[0]
         at.inputs[: len(references)] = at.inputs_start[: len(references)] = references
         if at.delays.size:
@@ -207,7 +220,7 @@ class InstanceProgram:
         """`defaults` with tolerances that single precision reaches."""
         values = self.defaults.copy()
         at = self.layout.view(values)
-        at.bounds[:3] *= _SINGLE_PRECISION_BOUNDS
+        at.bounds[:3] *= SINGLE_PRECISION_BOUNDS
         at.tolerances[:] = self._stepper_class(self.chart, SINGLE_PRECISION_TOLERANCE).tolerance
         return values
 
@@ -243,28 +256,21 @@ class InstanceProgram:
         return programs
 
     @cached_property
-    def _linked(self) -> tuple[dict[str, LinkedFunction], list[LinkedFunction]]:
-        programs = {name: dict(program.functions) for name, program in self._programs.items()}
-        own = Program()
-        for prefix, parts in programs.items():
-            own.functions |= {f"{prefix}_{name}": x for name, x in parts.items()}
+    def _linked(self) -> Linked:
+        parts = {name: dict(program.functions) for name, program in self._programs.items()}
+        own = joined_program(parts)
         known = {*own.functions, *INNER_ROUTINES}
         offset = None if self._tip is None else self._tip.frame_offset
         InstanceRoutines(
             self.chart, self.stepper, self.layout, self._programs,
             [name for name in self._quantities if name in self._programs], offset,
         ).add_to(own)  # fmt: skip
-        programs["machine"] = own.functions
-        entries = [
-            name
-            for name, function in own.functions.items()
-            if name not in known and isinstance(function, Routine)
-        ]
-        close = "project" if self._closure.has_partly_active_rotations else "close"
-        bindings = {"close": ("loops", close), "follow": ("loops", "follow")}
-        functions = link_functions(programs, [("machine", x) for x in entries], bindings)
-        by_name = {x.name: x for x in functions}
-        return {x: by_name[f"machine_{x}"] for x in entries}, functions
+        return link_entries(parts, own, known, self._closure)
+
+    @property
+    def output_count(self) -> int:
+        """Elements of an instance that `update_outputs` writes."""
+        return sum(self.chart.output_layout.parts.values())
 
     @property
     def entries(self) -> dict[str, LinkedFunction]:
@@ -287,12 +293,42 @@ def _controlled_chart(machine: Machine, controller: Controller | ValveCommand | 
     machine = machine.with_external_forces(*loads)
     control = _exported_control(machine, controller)
     machine = machine_under_control(machine, control)
-    if not machine.closure.is_compiled:
-        raise InputError(f"the loops of '{machine.name}' have no formulas to export")
+    check_formulas(machine)
     if not machine.has_traceable_forces:
         raise InputError(
             f"a load of '{machine.name}' is a function in Python, which no other target has: "
             "give a crane.Wrench"
         )
     states = len(control.start(machine.home[machine.closure.active]))
-    return Chart.from_dynamics(Dynamics(machine), control, states)
+    dynamics, active = Dynamics(machine), machine.closure.active.tolist()
+    parameters = _parameter_indices(dynamics.formula_structure, active)
+    dynamics.constant_pattern[parameters] = np.nan
+    return Chart.from_dynamics(dynamics, control, states)
+
+
+def _tip_inertia(structure: FormulaStructure) -> list[int]:
+    """Indices in `dynamics_constants` of the inertia of the body of the tip; none on the world."""
+    start = structure.constants_layout.start_index("inertias")
+    start += BODY_SIZE * ((structure.tip_body or 0) - 1)
+    return [*range(start, start + BODY_SIZE)] if structure.tip_body else []
+
+
+def _law_indices(structure: FormulaStructure, columns: Iterable[int], field: str) -> list[int]:
+    """Indices in `dynamics_constants` of a value of the force laws of joints."""
+    start = structure.constants_layout.start_index("joint_laws") + LAW_PARAMETER_NAMES.index(field)
+    return [start + PARAMETER_COUNT * column for column in columns]
+
+
+def _parameter_indices(structure: FormulaStructure, active: Iterable[int]) -> list[int]:
+    """Indices in `dynamics_constants` of what stays a parameter where it is 0, 1 or -1."""
+    gravity, joints = (
+        structure.constants_layout["gravity"],
+        range(len(structure.motion_parents) - 1),
+    )
+    return [
+        *range(gravity.start, gravity.stop),
+        *_tip_inertia(structure),
+        *_law_indices(structure, active, "coulomb"),
+        *_law_indices(structure, joints, "coulomb_offset"),
+        *_law_indices(structure, joints, "viscous"),
+    ]

@@ -1,7 +1,11 @@
 """Routines of an instance of a machine, see `crane.export.instance_program`."""
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations_with_replacement
 from types import MappingProxyType
+
+import numpy as np
+import pinocchio as pin
 
 from crane.codegen import (
     ArrayPointer,
@@ -14,18 +18,36 @@ from crane.codegen import (
     select,
 )
 from crane.codegen.routine_statements import as_value
-from crane.codegen.symbolic import add_vectors, scale_vector, subtract_vectors
+from crane.codegen.symbolic import (
+    add_vectors,
+    dot,
+    matmul,
+    matvec,
+    maximum,
+    scale_vector,
+    subtract_vectors,
+    transpose,
+)
 from crane.common.samples import Array
 from crane.control.valve_drive import ValveDrive
+from crane.dynamics.formula_structure import BODY_SIZE
+from crane.dynamics.frame_jacobians import frame_placement
 from crane.export.dead_times import DEAD_TIME_ROUTINES, DeadTimes
+from crane.export.kinematics_program import (
+    BEYOND_CHART,
+    DONE,
+    HALTED,
+    NOT_CLOSED,
+    TOO_MANY_CALLS,
+    TOO_MANY_EVENTS,
+    KinematicsRoutines,
+)
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.error_controlled_stepper import ErrorControlledStepper
 from crane.simulation.integration.machine_code_stepper import HELD_INDEX
 from crane.simulation.integration.machine_formulas import AT_REST_SUFFIX
 from crane.simulation.integration.stick_slip_routine import add_stick_slip_routines
 
-# Statuses of the routines, besides the number of what was done.
-DONE, NOT_CLOSED, BEYOND_CHART, HALTED, TOO_MANY_EVENTS, TOO_MANY_CALLS = 1, -1, -2, -3, -4, -5
 STATUS_TEXTS = MappingProxyType(
     {
         DONE: "done",
@@ -39,13 +61,14 @@ STATUS_TEXTS = MappingProxyType(
 _FIRST_STEP_SHARE, _LONGEST_FIRST_STEP = 0.01, 5e-4  # as `ErrorControlledStepper.run`
 _STEP_REDUCTION_AFTER_EVENT = 0.2
 _TIME_TOLERANCE = 1e-9  # of a step
+_LEAST_MASS = 1e-30  # by which moments are divided [kg]
 INNER_ROUTINES = (
     "find_modes", "orthogonalize", "least_squares", "transposed_least_squares",
     "bounded_least_squares", *DEAD_TIME_ROUTINES,
 )  # fmt: skip
 
 
-class InstanceRoutines:
+class InstanceRoutines(KinematicsRoutines):
     """Writer of the routines of an instance.
 
     Args:
@@ -66,13 +89,13 @@ class InstanceRoutines:
         quantities: Sequence[str],
         tip_offset: Array | None,
     ):
-        self.chart, self.stepper, self.layout = chart, stepper, layout
+        super().__init__(layout, chart.machine.closure.compiled_closure)
+        self.chart, self.stepper = chart, stepper
         self._programs, self._quantities, self._tip_offset = programs, quantities, tip_offset
         machine = self.machine = chart.machine
         self.control = chart.control
         self._nq, self._n = machine.model.nv, len(machine.active)
         self._k = len(chart.stick_slip.columns)
-        self._closure = machine.closure.compiled_closure
         self._dead_times = DeadTimes(layout) if layout.parts["delays"] else None
 
     def add_to(self, program: Program) -> None:
@@ -83,17 +106,30 @@ class InstanceRoutines:
         self._add_initialize(program)
         self._add_advance(program)
         self._add_evaluations(program)
-        self._add_kinematics(program)
+        self.add_kinematics(program)
+        self._add_tip(program)
         self._add_dynamics(program)
+        if self.layout.parts["unladen"]:
+            self._add_payload(program)
+
+    def _add_payload(self, program: Program) -> None:
+        """set_payload(instance, payload): the inertia of the body of the tip with a payload."""
+        machine, tape = self.machine, Tape()
+        assert machine.tip is not None
+        joint, pose = frame_placement(machine, machine.tip)
+        body = machine.coordinates.body_of_joint[joint]
+        frame = pin.SE3(self._closure.geometry.body_rotations[body].T, np.zeros(3)) * pose
+        unladen, payload = (tape.load_vector(i, 0, BODY_SIZE) for i in range(2))
+        program.add_formula("laden", 2, laden_inertia(unladen, payload, frame))
+        first = self.layout.start_index("dynamics")
+        first += self.chart.dynamics.formula_structure.constants_layout.start_index("inertias")
+        with program.add_routine("set_payload", arrays=("instance", "payload")) as r:
+            inertia = ArrayPointer("instance").element_pointer(first + BODY_SIZE * (body - 1))
+            r.call("laden", self._part(r.instance, "unladen"), r.payload, inertia)
+            r.return_value(DONE)
 
     def _machine_arguments(self, instance: ArrayPointer) -> tuple[ArrayPointer, ...]:
         return tuple(self._part(instance, x) for x in ("geometry", "dynamics", "settings"))
-
-    def _part(self, instance: ArrayPointer, name: str) -> ArrayPointer:
-        return ArrayPointer(instance.name).element_pointer(self.layout.start_index(name))
-
-    def _element(self, instance: ArrayPointer, name: str, index: int = 0) -> RoutineValue:
-        return ArrayPointer(instance.name)[self.layout.start_index(name) + index]
 
     def _store(self, r: Routine, name: str, value: RoutineValue | float, index: int = 0) -> None:
         r.store(ArrayPointer("instance"), self.layout.start_index(name) + index, value)
@@ -343,28 +379,8 @@ class InstanceRoutines:
         r.copy(target, values.element_pointer(part), layout.parts[part])
         r.return_value(DONE)
 
-    def _add_kinematics(self, program: Program) -> None:
-        """close_loops, follow_loops, gamma and tip."""
-        newton = self._closure.formula_outputs("newton")
-        with program.add_routine("close_loops", arrays=("instance", "q")) as r:
-            result = r.local_array("result", newton)
-            geometry, bounds = (self._part(r.instance, x) for x in ("geometry", "bounds"))
-            with r.if_then(r.call("loops_close", geometry, r.q, result, bounds) < 1):
-                r.return_value(NOT_CLOSED)
-            r.return_value(DONE)
-        with program.add_routine("follow_loops", arrays=("instance", "q_a", "q")) as r:
-            geometry, cursor, bounds = (
-                self._part(r.instance, x) for x in ("geometry", "cursor", "bounds")
-            )
-            done = r.call("loops_follow", 1, geometry, r.q_a, cursor, r.q, bounds)
-            with r.if_then(done < 1):
-                r.return_value(NOT_CLOSED)
-            r.return_value(DONE)
-        with program.add_routine("gamma", arrays=("instance", "q", "gamma")) as r:
-            geometry = self._part(r.instance, "geometry")
-            with r.if_then(r.call("loops_gamma_each", 1, geometry, r.q, r.gamma) < 1):
-                r.return_value(BEYOND_CHART)
-            r.return_value(DONE)
+    def _add_tip(self, program: Program) -> None:
+        """tip(instance, q, v_a, tip)."""
         if self._tip_offset is None:
             return
         with program.add_routine("tip", arrays=("instance", "q", "v_a", "tip")) as r:
@@ -385,3 +401,42 @@ class InstanceRoutines:
                 geometry, dynamics = (self._part(r.instance, x) for x in ("geometry", "dynamics"))
                 r.call(f"{name}_formula", geometry, dynamics, r.q, inputs, r.result)
                 r.return_value(DONE)
+
+
+def laden_inertia(
+    unladen: Sequence[Scalar], payload: Sequence[Scalar], frame: pin.SE3
+) -> list[Scalar]:
+    """Inertia of a body with a payload on one of its frames.
+
+    With masses m_i, centres c_i and inertias I_i about them, d = c_2 - c_1 and
+    mu = m_1 m_2 / (m_1 + m_2),
+
+        m = m_1 + m_2,    c = c_1 + m_2 / m d,    I = I_1 + I_2 + mu (d.d 1 - d d^T).
+
+    Args:
+        unladen: (10,) mass, centre of mass (3), inertia about it (xx, xy, xz, yy, yz, zz) in the
+            axes of the body.
+        payload: (10,) the same in the frame.
+        frame: The frame in the body.
+
+    Returns:
+        (10,) like `unladen`.
+    """
+    turn = frame.rotation.tolist()
+    mass = unladen[0] + payload[0]
+    share = payload[0] / maximum(mass, _LEAST_MASS)
+    centre = add_vectors(matvec(turn, payload[1:4]), frame.translation.tolist())
+    distance = subtract_vectors(centre, unladen[1:4])
+    xx, xy, xz, yy, yz, zz = payload[4:]
+    tensor = matmul(matmul(turn, [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), transpose(turn))
+    square, reduced = dot(distance, distance), unladen[0] * share
+    moments = [
+        inertia
+        + tensor[i][k]
+        + reduced * ((square if i == k else 0.0) - distance[i] * distance[k])
+        for inertia, (i, k) in zip(
+            unladen[4:], combinations_with_replacement(range(3), 2), strict=True
+        )
+    ]
+    moved = add_vectors(unladen[1:4], scale_vector(share, distance))
+    return [mass, *moved, *moments]

@@ -10,6 +10,7 @@ from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.dynamics.external_forces import reference_counts
 from crane.dynamics.joint_forces import LAW_PARAMETER_NAMES
 from crane.hydraulics.circuit_states import BALANCE_UNITS
+from crane.machine.machine import Machine
 
 if TYPE_CHECKING:
     from crane.export.instance_program import InstanceProgram
@@ -19,6 +20,7 @@ _POSITION = ["position_x", "position_y", "position_z"]
 _INERTIA = ["mass", *(f"com_{x}" for x in "xyz")] + [
     f"inertia_{x}" for x in ("xx", "xy", "xz", "yy", "yz", "zz")
 ]
+_INERTIA_UNITS = ("kg", "m", "m", "m", *("kg m2",) * 6)
 _WRENCH_UNITS = ("N", "N", "N", "N m", "N m", "N m")
 
 
@@ -85,11 +87,14 @@ def _elements(program: "InstanceProgram") -> Iterator[tuple[str, str, str]]:
     if machine.supports:
         for joint in machine.joints:
             yield "a", f"a_{joint}", f"{machine.unit(joint)}/s2"
-    yield from (("geometry", name, unit) for name, unit in _geometry(program))
+    yield from (("geometry", name, unit) for name, unit in geometry_names(program.machine))
     units = _dynamics_units(program)
     yield from (
         ("dynamics", name, unit) for name, unit in zip(_dynamics(program), units, strict=True)
     )
+    if program.layout.parts["unladen"]:
+        for name, unit in zip(_INERTIA, _INERTIA_UNITS, strict=True):
+            yield "unladen", f"unladen_{name}", unit
 
 
 def _inputs(program: "InstanceProgram") -> Iterator[tuple[str, str]]:
@@ -107,8 +112,8 @@ def _inputs(program: "InstanceProgram") -> Iterator[tuple[str, str]]:
         yield from ((f"{force.name}_{name}", unit) for name, unit in components)
 
 
-def _geometry(program: "InstanceProgram") -> Iterator[tuple[str, str]]:
-    machine = program.machine
+def geometry_names(machine: Machine) -> Iterator[tuple[str, str]]:
+    """Names and units of the constants of `TreeGeometry`."""
     frames = [f"{joint}_frame" for joint in machine.joints]
     for loop in machine.closure.equations.loops:
         frames += [f"{loop.name}_predecessor", f"{loop.name}_successor"]
@@ -160,7 +165,7 @@ def _dynamics_units(program: "InstanceProgram") -> Iterator[str]:
     laws = [_law_units(machine.unit(joint)) for joint in machine.joints]
     pairs = len(dynamics.forces.lengths.pairs)
     known = {
-        "inertias": ("kg", "m", "m", "m", *("kg m2",) * 6) * len(machine.joints),
+        "inertias": _INERTIA_UNITS * len(machine.joints),
         "joint_laws": [units.get(name, "") for units in laws for name in LAW_PARAMETER_NAMES],
         "distances": [
             *(_law_units("m").get(name, "") for name in LAW_PARAMETER_NAMES), *("m",) * 6,

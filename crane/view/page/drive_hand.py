@@ -38,10 +38,11 @@ def pull_data(program: InstanceProgram) -> dict[str, Any] | None:
     if not inverse_mass > 0.0:
         return None
     speed = 2.0 * np.pi * _PULL_FREQUENCY
+    weight = _GRAVITY * sum(x.mass for x in list(machine.model.inertias)[1:])
     return {
         "stiffness": speed**2 / inverse_mass,
         "damping": 2.0 * _PULL_DAMPING * speed / inverse_mass,
-        "largest": _LARGEST_PULL * _GRAVITY * sum(x.mass for x in list(machine.model.inertias)[1:]),
+        "largest": _LARGEST_PULL * weight,
     }
 
 
