@@ -47,9 +47,7 @@ class DeadTimes:
         with program.add_routine("find_kink", arrays=("instance", "now", "kink")) as r:
             r.store(r.kink, 0, _NO_NODE)
             with r.loop(self._rows - 1) as k:
-                node, after = self._node(k), self._node(k + 1)
-                with r.if_then(after[0] < _NO_NODE):
-                    self._write_kinks(r, k, node, after)
+                self._write_kinks(r, k)
 
     def write_start(self, r: Routine) -> None:
         """Write the first node, at the inputs."""
@@ -74,13 +72,12 @@ class DeadTimes:
                 r.assign(used, used + 1)
         with r.loop(self._rows - 1) as k, r.if_then(self._node(k + 1)[0] <= time - longest):
             r.assign(unused, unused + 1)
-        with r.if_then(unused > 0):
-            with r.loop(self._rows - unused) as k:
-                for i in range(self._width):
-                    r.store(self._node(k), i, self._node(k + unused)[i])
-            with r.loop(unused) as k:
-                r.store(self._node(self._rows - unused + k), 0, 10.0 * _NO_NODE)
-            r.assign(used, used - unused)
+        with r.if_then(unused > 0), r.loop(self._rows - unused) as k:
+            for i in range(self._width):
+                r.store(self._node(k), i, self._node(k + unused)[i])
+        with r.loop(unused) as k:
+            r.store(self._node(self._rows - unused + k), 0, 10.0 * _NO_NODE)
+        r.assign(used, used - unused)
         with r.if_then(used < self._rows):
             r.store(self._node(used), 0, time + step)
             r.copy(self._node(used).element_pointer(1), self._part("inputs"), self.count)
@@ -97,10 +94,9 @@ class DeadTimes:
                 change = after[i + 1] - node[i + 1]
                 r.store(r.row, i, node[i + 1] + share * change)
 
-    def _write_kinks(
-        self, r: Routine, k: RoutineValue, node: ArrayPointer, after: ArrayPointer
-    ) -> None:
+    def _write_kinks(self, r: Routine, k: RoutineValue) -> None:
         """Write the comparison of the changes of slopes at a node with the next one so far."""
+        node, after = self._node(k), self._node(k + 1)
         earliest = r.now[0] + self._part("step")[0] * _TIME_TOLERANCE
         before = self._node(k - 1)
         length = r.new_variable(after[0] - node[0])
@@ -111,6 +107,7 @@ class DeadTimes:
                 r.assign(slope, slope - (node[i] - before[i]) / (node[0] - before[0]))
             time = r.new_variable(node[0] + self._part("delays")[i - 1])
             is_kink = _magnitude(slope) * length > size * _SLOPE_TOLERANCE
+            is_kink = is_kink & (after[0] < _NO_NODE)
             with r.if_then(is_kink & (time > earliest) & (time < r.kink[0])):
                 r.store(r.kink, 0, time)
 

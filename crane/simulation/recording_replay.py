@@ -171,15 +171,7 @@ def replay(
     try:
         machine = add_recorded_tip_force(machine, table)
         schedule = ParameterSchedule.from_notes(table.notes)
-        drive: ControlLaw
-        initial: tuple[Array, Array] | None
-        if controller is not None:
-            time, drive, initial = recorded_references(machine, table, controller)
-        elif machine.hydraulics is None:
-            time, drive, initial = _force_inputs(machine, table)
-        else:
-            inputs = replay_inputs(machine, table)
-            time, drive, initial = inputs.time, inputs.valve_drive(machine), inputs.initial
+        time, drive, initial = _recorded_drive(machine, table, controller)
         steps = int(time[-1] / step + 1e-9)
         if steps < 1:
             raise RecordingError(f"is shorter than a step of {step:g} s, shorten the step")
@@ -206,6 +198,18 @@ def replay(
         )
     ]
     return recording, Comparison(time[inside], tuple(channels), recording)
+
+
+def _recorded_drive(
+    machine: Machine, table: Table, controller: str | None
+) -> tuple[Array, ControlLaw, tuple[Array, Array] | None]:
+    """Instants (N,) [s] from zero, the recorded references, signals or forces, and the start."""
+    if controller is not None:
+        return recorded_references(machine, table, controller)
+    if machine.hydraulics is None:
+        return _force_inputs(machine, table)
+    inputs = replay_inputs(machine, table)
+    return inputs.time, inputs.valve_drive(machine), inputs.initial
 
 
 def _force_inputs(

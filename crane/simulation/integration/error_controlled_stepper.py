@@ -161,10 +161,10 @@ class ErrorControlledStepper(MachineCodeStepper):
                 )
             starts_at_break = following and breaks[following - 1] > next_time - 2.0 * difference
             segment_end = min(segment_end, time_to_break)
-            if self._steps_end_at_outputs:  # samples of a log are output instants
-                last_output = np.floor((segment_end + difference) / step) * step
-                if last_output > segment_start + difference:
-                    segment_end = min(segment_end, 0.0 if offset < 0 else last_output)
+            last_output = np.floor((segment_end + difference) / step) * step
+            has_outputs = last_output > segment_start + difference
+            if self._steps_end_at_outputs and has_outputs:  # samples of a log are output instants
+                segment_end = min(segment_end, 0.0 if offset < 0 else last_output)
             ends_at_break = time_to_break < segment_end + difference
             pairs = max(1, int(np.ceil((segment_end - segment_start) / pair - _TIME_TOLERANCE)))
             lengths[2:5] = segment_start, (segment_end - segment_start) / pairs, segment_end

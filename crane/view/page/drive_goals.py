@@ -14,15 +14,16 @@ from crane.motion.kinematics import Kinematics
 from crane.motion.task_trajectories import task_trajectory
 from crane.motion.workspaces.workspace_section import find_slewing_joint
 
-_SAMPLES, _SEED = 80, 1  # configurations that show where the tip goes
+_SAMPLES, _LEAST_SAMPLES, _SEED = 80, 20, 1  # configurations that show where the tip goes
 _MIDDLE = (0.2, 0.8)  # of the ranges, where goals are
 _FREE_RANGE, _LARGEST_SLEW = 0.8, 1.3  # [rad] about home
 _PATH_POINTS, _LINE_POINTS = 40, 12
 _RADIUS = 0.025  # of a goal, in distances that the tip goes
 _LINE_SHARE = 0.25  # of the tip's distance from the axis
+_LOAD_SHARE = 0.3  # of the largest payload
 
 
-def goal_data(machine: Machine, payloads: list[float]) -> list[dict[str, Any]]:
+def goal_data(machine: Machine, payloads: list[float], ground: float) -> list[dict[str, Any]]:
     """Goals: those of the machine's tasks, and such as its reach allows.
 
     Each has `points` (k, 3) of the tip in the world [m] that are passed in order, within `radius`.
@@ -32,6 +33,7 @@ def goal_data(machine: Machine, payloads: list[float]) -> list[dict[str, Any]]:
     Args:
         machine: The machine.
         payloads: Payloads to choose from [kg].
+        ground: Height of the ground, above which goals are where the tip goes there [m].
     """
     if machine.tip is None:
         return []
@@ -40,12 +42,14 @@ def goal_data(machine: Machine, payloads: list[float]) -> list[dict[str, Any]]:
     if not found:
         return []
     points = np.array(found)
+    above = points @ machine.up_direction > ground
+    points = points[above] if above.sum() > _LEAST_SAMPLES else points
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     if not size:
         return []
     goals = []
     if len(payloads) > 1:
-        goals.append(_carry(machine, points, payloads[len(payloads) // 2]))
+        goals.append(_carry(machine, points, payloads[int(_LOAD_SHARE * len(payloads))]))
     with suppress(CraneError):
         goals.append(_grade(machine, kinematics))
     goals.append(_reach(kinematics.position(machine.home[machine.closure.active]), points))
@@ -75,8 +79,8 @@ def _carry(machine: Machine, points: Array, mass: float) -> dict[str, Any]:
     """A load is taken low and far out, and put down high, and beside if the machine slews."""
     heights = points @ machine.up_direction
     start = int(heights.argmin())
-    reach = np.linalg.norm(points - points[start], axis=1)
-    end = int((heights - heights[start] + reach).argmax())
+    distances = np.linalg.norm(points - points[start], axis=1)
+    end = int(np.where(heights >= np.median(heights), distances, -1.0).argmax())
     return {
         "name": "lift the load", "text": "take the load, lift it over, put it down",
         "points": points[[start, end]].tolist(), "take": 0, "put": 1, "mass": mass,

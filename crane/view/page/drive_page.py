@@ -80,8 +80,10 @@ def drive_html(machine: Machine, controller: str | None = None) -> str:
     quantities = ("gravity",) if machine.hydraulics is None and law is None else ()
     conditions = DriveConditions(machine, quantities, law)
     scene = build_scene(machine)
-    drive = _drive_data(conditions, controller)
-    data = machine_data(machine, scene, None) | {"task": "", "drive": drive}
+    data = machine_data(machine, scene, None) | {"task": ""}
+    data["drive"] = _drive_data(conditions, controller) | {
+        "goals": goal_data(machine, conditions.masses, scene.ground_height)
+    }
     data["lower"], data["upper"] = (x.tolist() for x in _motion_bounds(machine, scene))
     assets = files("crane.view.page") / "assets"
 
@@ -140,7 +142,6 @@ def _drive_data(conditions: DriveConditions, controller: str | None) -> dict[str
             if (header := f"load_{force.name}_force_x [N]") in order
             and force.name != TIP_WRENCH_NAME
         ],
-        "goals": goal_data(machine, conditions.masses),
         "statuses": dict(STATUS_TEXTS),
         "notes": [
             "crane recording", f"machine name: {machine.name}", "task: drive",
@@ -207,16 +208,16 @@ def _dials(program: InstanceProgram, order: dict[str, int]) -> Iterator[dict[str
     pumps = [MAIN_PUMP, *circuit.supplies]
     for name, pump in zip(pumps, (circuit.supply, *circuit.supplies.values()), strict=True):
         if (header := f"pressure_{name} [Pa]") in order:
-            title = "pump pressure" if name == MAIN_PUMP else f"pressure {name}"
+            title = "pressure" if name == MAIN_PUMP else f"pressure {name}"
             yield _dial(title, "bar", [(order[header], 1e-5)], 0.0, pump.pressure)
     shafts = [(order[x], 1e-3) for x in order if x.startswith("shaft_")]
     flows = [
         x.flow * 6e4 for x in (circuit.supply, *circuit.supplies.values()) if np.isfinite(x.flow)
     ]
-    yield _dial("pump flow", "l/min", [], 0.0, sum(flows) / 6e4 or 1e-3) | {"kind": "flow"}
+    yield _dial("flow", "l/min", [], 0.0, sum(flows) / 6e4 or 1e-3) | {"kind": "flow"}
     if shafts:
         highest = 1e3 * sum(flows) / 6e4 * circuit.supply.pressure / 1e3
-        yield _dial("pump power", "kW", shafts, 0.0, highest)
+        yield _dial("power", "kW", shafts, 0.0, highest)
     if circuit.engine is not None and (header := "engine_speed [rad/s]") in order:
         highest = 1.2 * circuit.engine.speed
         yield _dial("engine", "rpm", [(order[header], 30.0 / np.pi)], 0.0, highest)

@@ -7,8 +7,8 @@ const worker = new Worker(URL.createObjectURL(new Blob([element("worker-script")
 
 function setRunning(on) { worker.postMessage({ running: on }); }
 
-const space = viewer && new DriveSpace(page);
 const levers = new Levers(drive.levers);
+const space = viewer && new DriveSpace(page);
 const dials = drive.dials.map(addDial);
 const joints = drive.joints.map(addJoint);
 const loads = drive.loads.map(addLoad);

@@ -23,7 +23,7 @@ function dialValue(dial, state) {
     if (dial.read) return dial.read(state);
     const from = drive.columns.length;
     if (dial.kind === "speed") return before.length ? Math.hypot(...[0, 1, 2].map((k) => row[from + k] - before[from + k])) / drive.interval : 0;
-    if (dial.kind === "stability") return 100 * row[from + (drive.hasTip ? 3 : 0)];
+    if (dial.kind === "stability") return 100 * row[from + (drive.hasTip ? 4 : 1)];
     if (dial.kind === "flow") return before.length && drive.energy.oil !== null ? 6e4 * (row[drive.energy.oil] - before[drive.energy.oil]) / drive.interval : 0;
     return dial.terms.reduce((sum, [column, factor]) => sum + factor * row[column], 0);
 }

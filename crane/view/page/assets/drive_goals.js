@@ -98,7 +98,7 @@ class GoalRun {
         this.tips = [...this.tips, tip].slice(-3);
         if (this.levers) this.travel += levers.reduce((sum, x, i) => sum + Math.abs(x - this.levers[i]), 0);
         this.levers = levers.slice();
-        if (this.given.stability) this.lowest = Math.min(this.lowest ?? Infinity, row[columns.length + 3]);
+        if (this.given.stability) this.lowest = Math.min(this.lowest ?? Infinity, row[columns.length + 4]);
     }
 
     // Smoothness is minus the logarithm of the jerk without dimension (Hogan, Sternad 2009).

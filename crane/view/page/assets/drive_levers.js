@@ -90,7 +90,7 @@ class Levers {
                 const axis = 2 * side + (place > 1 ? 1 : 0), i = this.on(axis);
                 const word = i === null ? "" : WORDS[this.levers[i].role][place % 2];
                 const key = make("kbd", { textContent: keyName(KEYS[axis][place % 2]) });
-                label.replaceChildren(...(i === null ? [] : [key, `${this.levers[i].name} ${word}`]));
+                label.replaceChildren(...(i === null ? [] : [key, `${this.levers[i].name.replaceAll("_", "_\u200b")} ${word}`]));
                 label.title = label.textContent;
             });
             stick.hidden = this.on(2 * side) === null && this.on(2 * side + 1) === null;

@@ -60,6 +60,13 @@ class DriveSpace extends Space {
         const isDark = window.matchMedia("(prefers-color-scheme: dark)").matches;
         viewer.set_property(["Background"], "top_color", isDark ? [0.11, 0.14, 0.18] : [0.80, 0.87, 0.93]);
         viewer.set_property(["Background"], "bottom_color", isDark ? [0.17, 0.18, 0.19] : [0.97, 0.97, 0.95]);
+        viewer.scene.traverse((item) => { if (item.isLineSegments) item.material.color.setHex(isDark ? 0x3d4650 : 0xb4bac0); });
+    }
+
+    // The machine is above the sticks where there is little room beside them.
+    free() {
+        const room = element("pane").clientWidth < 600 ? element("sticks").clientHeight + 6 : 0;
+        return super.free().map(([left, top, right, bottom]) => [left, top, right, bottom - room]);
     }
 
     ball(radius, color, opacity) {
@@ -125,7 +132,7 @@ class DriveSpace extends Space {
         if (now - this.checked > 700) {
             this.checked = now;
             const most = Math.min(window.devicePixelRatio, isSoftware ? 1 : 2);
-            const wished = this.interval > SMOOTH ? Math.max(0.5, 0.8 * this.ratio) : this.interval < 18 ? Math.min(most, 1.1 * this.ratio) : this.ratio;
+            const wished = this.interval > SMOOTH ? Math.max(0.6, 0.8 * this.ratio) : this.interval < 18 ? Math.min(most, 1.1 * this.ratio) : this.ratio;
             if (Math.abs(wished - this.ratio) > 0.02) {
                 this.ratio = wished;
                 viewer.renderer.setPixelRatio(wished);
