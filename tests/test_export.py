@@ -226,6 +226,23 @@ def test_a_load_that_is_a_function_in_python_is_refused():
         InstanceProgram(machine.with_external_forces(load))
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(
+    not (shutil.which("aarch64-linux-gnu-gcc") and shutil.which("qemu-aarch64")),
+    reason="no cross-compiler with an emulator is here",
+)
+@pytest.mark.parametrize("name", ["mini_forwarder", "patu655"])
+def test_another_processor_with_fused_operations_computes_the_same(tmp_path, name):
+    quantities = ("inverse_dynamics_with_friction", "forward_dynamics", "energy")
+    program = InstanceProgram(crane.load(name), quantities=quantities)
+    for file, text in CSources(program, "m").files().items():
+        (tmp_path / file).write_text(text)
+    flags = "-O1", "-ffp-contract=fast", "-static", "-DTOLERANCE=1e-13"
+    path = compiled(tmp_path, "m", *flags, compiler="aarch64-linux-gnu-gcc")
+    status, output = run(path, "qemu-aarch64")
+    assert status == 0, output
+
+
 _NODE_PROGRAM = """
 const fs = require("fs");
 const given = JSON.parse(fs.readFileSync("given.json"));

@@ -136,12 +136,12 @@ class FunctionSources:
             "NAME": self.name, "UPPER": self.name.upper(), "MACHINE": machine.name,
             "VERSION": crane.__version__, "NQ": str(machine.model.nv),
             "N": str(len(machine.active)), "INPUT_COUNT": str(len(inputs)),
-            "FIRST_INPUT": self._members()[inputs[0]] if inputs else "time",
+            "FIRST_INPUT": self.members()[inputs[0]] if inputs else "time",
             "OUTPUTS": str(self._program.output_count), **further,
         }  # fmt: skip
         return re.sub(r"@([A-Z_]+)@", lambda match: values[match[1]], text)
 
-    def _members(self) -> dict[int, str]:
+    def members(self) -> dict[int, str]:
         """Member of the struct for each element of an instance."""
         found: dict[int, str] = {}
         taken: set[str] = {*_ARRAYS}
@@ -160,7 +160,7 @@ class FunctionSources:
 
     def _struct_lines(self) -> Iterator[tuple[str, str]]:
         """Declaration of each member, and the initial values."""
-        members, layout = self._members(), self._program.layout
+        members, layout = self.members(), self._program.layout
         unused: list[int] = []
 
         def padding() -> Iterator[tuple[str, str]]:
@@ -264,7 +264,7 @@ class CSources(FunctionSources):
             checks += [f"{name}_{key}(&m, q, v, x, found);", f"compare({arguments});"]
         inputs = _inputs_of(program)
         set_inputs = f"for (j = 0; j < {len(inputs)}; ++j)\n            " + (
-            f"(&m.{self._members()[inputs[0]]})[j] = ({name}_real)inputs[i][j];" if inputs else ";"
+            f"(&m.{self.members()[inputs[0]]})[j] = ({name}_real)inputs[i][j];" if inputs else ";"
         )
         tables = {**vectors, "inputs": motion.inputs, "motion": motion.q}
         values = {
