@@ -111,7 +111,9 @@ KEYS = [
     ),
     case(
         "four_bar.yaml:21: friction of 'coupler' is empty, its keys are coulomb, "
-        "coulomb_offset, viscous, viscous_offset, smoothing, stiction, stribeck, drives",
+        "coulomb_offset, viscous, viscous_offset, smoothing, stiction, stribeck, "
+        "stiction_2, stribeck_2, root, presliding, presliding_length, memory, memory_time, "
+        "memory_speed, drives",
         swap("{viscous: 0.01}", ""),
     ),
     case(

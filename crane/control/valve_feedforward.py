@@ -266,7 +266,9 @@ class ValveFeedforward(ValvePD):
                 max_flow = valve.c1 * np.sqrt(valve.margin or circuit.supply.pressure)
                 flow = v * circuit.cylinders[joint].area_a
                 direction = np.tanh(flow / (_REVERSAL_SMOOTHING * max_flow))
-                forces[:, i] += law.viscous * v + law.coulomb * direction + law.coulomb_offset
+                forces[:, i] += (
+                    law.viscous * v + law.sliding_force * direction + law.coulomb_offset
+                )
         count = int(np.ceil(reference.duration * _STEPS_PER_SECOND)) + 1
         self._opening_times = np.linspace(0.0, reference.duration, count)
         q, v, _ = (x[:, self._active_indices] for x in reference(self._opening_times))

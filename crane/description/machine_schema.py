@@ -98,10 +98,37 @@ FRICTION = section_schema(
             "m/s", "rad/s", minimum=0.0,
         ),
         "stiction": NumberKey(
-            "$F_S$, excess of the breakaway force over `coulomb`", "N", "N m", minimum=0.0
+            "$F_S$, excess of the breakaway force over `coulomb`; negative where friction rises "
+            "from rest", "N", "N m",
         ),
         "stribeck": NumberKey(
             "$v_{St}$, Stribeck velocity, over which $F_S$ decays", "m/s", "rad/s", minimum=0.0,
+            zero_error="'{key}' of {title} is 0, give a velocity",
+        ),
+        "stiction_2": NumberKey("a second excess, over another velocity", "N", "N m"),
+        "stribeck_2": NumberKey(
+            "its Stribeck velocity", "m/s", "rad/s", minimum=0.0,
+            zero_error="'{key}' of {title} is 0, give a velocity",
+        ),
+        "root": NumberKey(
+            "$F_R$, mixed lubrication, times the root of the speed", "N s^0.5/m^0.5",
+            "N m s^0.5/rad^0.5",
+        ),
+        "presliding": NumberKey(
+            "$F_P$, Coulomb friction that builds up over a distance (Dahl)", "N", "N m",
+            minimum=0.0,
+        ),
+        "presliding_length": NumberKey(
+            "$l_P$, that distance", "m", "rad", minimum=0.0,
+            zero_error="'{key}' of {title} is 0, give a distance",
+        ),
+        "memory": NumberKey("$F_M$, friction that is higher after a rest", "N", "N m"),
+        "memory_time": NumberKey(
+            "$T_M$, time constant of the memory", "s", minimum=0.0,
+            zero_error="'{key}' of {title} is 0, give a time",
+        ),
+        "memory_speed": NumberKey(
+            "$v_M$, speed over which it fades", "m/s", "rad/s", minimum=0.0,
             zero_error="'{key}' of {title} is 0, give a velocity",
         ),
         "drives": FlagKey(

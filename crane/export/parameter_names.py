@@ -179,7 +179,8 @@ def _dynamics_units(program: "InstanceProgram") -> Iterator[str]:
 def _law_units(unit: str) -> dict[str, str]:
     force = "N" if unit == "m" else "N m"
     constant = dict.fromkeys(
-        ("coulomb", "coulomb_offset", "stiction", "constant", "gas_force"), force
+        ("coulomb", "coulomb_offset", "stiction", "stiction_2", "memory", "constant", "gas_force"),
+        force,
     )
     rates = dict.fromkeys(
         ("viscous", "viscous_offset", "damping", "stop_damping"), f"{force} s/{unit}"

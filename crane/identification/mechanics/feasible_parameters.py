@@ -11,6 +11,7 @@ is positive definite (Wensing, Kim, Slotine 2018, IEEE Robotics and Automation L
 import math
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -190,19 +191,17 @@ def _solve_convex_problem(problem: Any) -> None:
     for solver, options in solvers:
         if inaccurate and solver == cp.SCS:  # it is less accurate
             break
-        try:
-            with warnings.catch_warnings(action="ignore"):
-                problem.solve(solver=solver, **options)
-        except cp.SolverError:
-            continue  # reported below
-        if problem.status == cp.OPTIMAL:
+        status = cp.SOLVER_ERROR
+        with warnings.catch_warnings(action="ignore"), suppress(cp.SolverError):  # reported below
+            problem.solve(solver=solver, **options)
+            status = problem.status
+        if status == cp.OPTIMAL:
             return
-        if problem.status == cp.OPTIMAL_INACCURATE and not inaccurate:
+        if status == cp.OPTIMAL_INACCURATE and not inaccurate:
             inaccurate = [variable.value for variable in problem.variables()]
     if not inaccurate:
         raise CraneError(
-            f"no feasible estimate (solver: {problem.status or 'numerical problems'}), give a "
-            "larger weight to the prior"
+            f"no feasible estimate (solver: {status}), give a larger weight to the prior"
         )
     for variable, value in zip(problem.variables(), inaccurate, strict=True):
         variable.save_value(value)

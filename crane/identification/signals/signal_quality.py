@@ -309,23 +309,21 @@ def steady_means(time: Array, settle: float, signal: Array, answer: Array) -> St
     for start, end in true_runs(held).tolist():
         if plain[start:end].all():
             continue
-        part, reach, lines = pairs[:, start:end], settle, []
-        for _ in range(_MAX_LINES):
+        lines: list[tuple[float, float]] = []
+        reach, whole, new = settle, pairs.copy(), np.zeros(end - start, dtype=bool)
+        while len(lines) < _MAX_LINES and not new.any():
+            part = whole[:, start:end]  # the whole keeps the range of the signals
             period, amplitude = _ringing(time[start:end], part[1], settle)
             reach += period
             if not period or end - start <= round(reach / step):
                 break
-            part = _period_means(time[start:end], part, period)
+            part[:] = _period_means(time[start:end], part, period)
             lines.append((1 / period, amplitude))
-            whole = pairs.copy()  # keeps the range of the whole signal
-            whole[:, start:end] = part
             new = _steady_mask(time, settle, *whole)[start:end] & ~plain[start:end]
             new[: round(reach / step)] = False
-            if new.any():
-                means[start:end] |= new
-                pairs[:, start:end] = np.where(new, part, pairs[:, start:end])
-                found += lines
-                break
+        means[start:end] |= new
+        pairs[:, start:end] = np.where(new, whole[:, start:end], pairs[:, start:end])
+        found += lines if new.any() else []
     if not means.any():
         return SteadyMeans(steady_samples(time, settle, signal, answer), signal, answer)  # raises
     if not found:
