@@ -266,7 +266,9 @@ class _DrawingReader:
             body = sum_inertias(*(inertia for _, inertia in parts))
             body = body if mass is None else scale_inertia(body, mass)
         else:
-            mass = self._estimate_mass(name, item, points) if mass is None else mass
+            if mass is None:  # the base does not move
+                is_base = name == self._section.text("base")
+                mass = 0.0 if is_base else self._estimate_mass(name, item, points)
             body = spread_inertia(
                 mass, self._coordinates(points), item.number("width") if "width" in item else 0.0
             )
