@@ -20,6 +20,7 @@ _ACCELERATIONS = {"m": 0.5, "rad": 1.5}  # by a full lever, of a drive of unknow
 _BRAKING_TIME = 0.3  # in which a drive of a machine without valves stops by itself [s]
 INTERVAL = 0.01  # of the recording, at whose ends the inputs are given [s]
 _BRAKED_SHARE = 0.2  # of a speed, at most, in an interval
+_MAX_INERTIA_RATIO = 100.0  # eigenvalue of M^-1 D, see `_braking_rate`
 _NEAR_HOME = 0.2  # [rad], [characteristic lengths]
 _STEP = 1e-5  # of a difference [m], [rad]
 
@@ -79,7 +80,8 @@ def _braking_rate(dynamics: Dynamics, home: Array) -> float:
     """Rate at which speeds are braked, by forces that are updated every `INTERVAL` [1/s].
 
     With D the diagonal of the mass matrix M at home, forces -rate D v stop every motion near home
-    within some intervals: the largest eigenvalue of rate M^-1 D is well below 1 / interval.
+    within some intervals: the largest eigenvalue of rate M^-1 D is well below 1 / interval. It is
+    0 near configurations where inertias vanish.
     """
     inertias, fastest = np.diag(np.diagonal(dynamics.mass_matrix(home))), 1.0
     units = dynamics.machine.closure.units[dynamics.machine.closure.active]
@@ -88,6 +90,8 @@ def _braking_rate(dynamics: Dynamics, home: Array) -> float:
             mass = dynamics.mass_matrix(home + shares * units)
             values = np.linalg.eigvals(np.linalg.solve(mass, inertias)).real
             fastest = max(fastest, float(values.max()))
+    if fastest > _MAX_INERTIA_RATIO:
+        return 0.0
     return min(1.0 / _BRAKING_TIME, _BRAKED_SHARE / (fastest * INTERVAL))
 
 

@@ -1,7 +1,7 @@
 // The machine at its own steps: levers in, states out. One row per step is kept for the recording.
 
 let given, machine, numbers, instance, scratch, levers, wanted, inputs, status, stability, goals;
-let running = false, due = 0, last = 0, computed = 0, busy = 0, spent = 0, holds = true;
+let running = false, due = 0, last = 0, computed = 0, busy = 0, spent = 0, holds = false;
 let rows, record, conditions, base;
 
 const START = 64; // of the instance in the memory, in numbers
@@ -18,6 +18,7 @@ async function begin(message) {
     base = conditions;
     stability = given.stability && new Stability(given);
     goals = new GoalRun(given);
+    holds = given.holdsWeight && given.levers.every(({ braking }) => braking > 0);
     reset();
     setTimeout(lap);
 }
@@ -110,15 +111,23 @@ function holdWeight() {
 
 function advance() {
     const most = given.interval / given.ramp;
-    given.levers.forEach((lever, i) => {
-        levers[i] += Math.max(-most, Math.min(most, wanted[i] - levers[i]));
-        instance[lever.index] = signal(lever, levers[i]);
-    });
-    if (given.holdsWeight && holds) holdWeight();
-    for (const [name, value] of Object.entries(inputs)) instance[given.inputs[name]] = value;
-    status = machine.advance(HERE);
+    given.levers.forEach((lever, i) => { levers[i] += Math.max(-most, Math.min(most, wanted[i] - levers[i])); });
+    const before = holds ? instance.slice() : null;
+    step();
+    if (status !== 1 && holds) { // weights that no force carries, as at a dead centre
+        holds = false;
+        instance.set(before);
+        step();
+    }
     if (status === 1) keep();
     else running = false;
+}
+
+function step() {
+    given.levers.forEach((lever, i) => { instance[lever.index] = signal(lever, levers[i]); });
+    if (holds) holdWeight();
+    for (const [name, value] of Object.entries(inputs)) instance[given.inputs[name]] = value;
+    status = machine.advance(HERE);
 }
 
 // Where the tip is: position, Jacobian and bias follow each other.
@@ -169,7 +178,7 @@ function lap() {
 
 function tell() {
     postMessage({
-        status, running, levers, conditions, time: instance[0], factor: busy > 0.2 ? computed / busy : 1,
+        status, running, holds, levers, conditions, time: instance[0], factor: busy > 0.2 ? computed / busy : 1,
         q: Array.from(part("q")), goal: goals.state(), results: record.results,
         changed: record.changed, changes: record.changes, hasMoved: rows.length > 1,
         row: rows.length ? Array.from(rows[rows.length - 1]) : [],
