@@ -5,9 +5,11 @@ import numpy as np
 from crane.common.samples import Array
 from crane.control.control_law import ControlLaw
 from crane.control.controller_registry import make_controller
+from crane.control.force_inputs import ForceInputs
 from crane.control.reference_samples import interpolate_references
 from crane.control.valve_commands import ValveCommand
 from crane.description.external_forces import TIP_WRENCH_NAME, Wrench
+from crane.description.sensors import FORCE_SUFFIX, FORCE_UNITS
 from crane.machine.machine import Machine
 from crane.recordings.measured_configurations import joint_motion
 from crane.recordings.timeseries import TIME, Table, check_columns_present, table_column
@@ -33,25 +35,27 @@ def add_recorded_tip_force(machine: Machine, table: Table) -> Machine:
 
 
 def recorded_references(
-    machine: Machine, table: Table, name: str
+    machine: Machine, table: Table, name: str | None
 ) -> tuple[Array, ControlLaw, tuple[Array, Array]]:
-    """Instants (N,) [s] from zero, a control law with the recorded references, and the start.
+    """Instants (N,) [s] from zero, a control law with recorded references, and the start.
 
     Args:
         machine: The machine.
-        table: A recording with a column of each reference, such as reference_X1 [m].
-        name: Name of the controller, see `make_controller`.
+        table: A recording with a column of each reference, such as reference_X1 [m], or of the
+            force of each drive.
+        name: Name of the controller, see `make_controller`; None for forces.
 
     Raises:
         RecordingError: Columns are missing.
-        InputError: The controller is unknown, or has no references by name.
+        InputError: The controller is unknown.
     """
-    controller = make_controller(name, machine)
+    controller = ForceInputs(machine) if name is None else make_controller(name, machine)
     assert isinstance(controller, ControlLaw | ValveCommand)  # as all in the registry
-    check_columns_present([[column] for column in controller.reference_units], table.units)
-    rows = np.column_stack(
-        [table_column(table, column, unit) for column, unit in controller.reference_units.items()]
-    )
+    columns = dict(controller.reference_units)
+    if name is None:
+        columns = {x + FORCE_SUFFIX: FORCE_UNITS[machine.unit(x)] for x in machine.driven_joints}
+    check_columns_present([[column] for column in columns], table.units)
+    rows = np.column_stack([table_column(table, column, unit) for column, unit in columns.items()])
     q_a, v_a = joint_motion(machine, table)
     time = table_column(table, TIME)
     time = time - time[0]

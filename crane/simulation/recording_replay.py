@@ -18,7 +18,6 @@ from crane.common.progress import progress_reporter
 from crane.common.result import Result
 from crane.common.samples import Array, as_number
 from crane.control.control_law import ControlLaw
-from crane.control.force_inputs import ForceInputs
 from crane.control.valve_commands import ValveSignals, require_circuit
 from crane.control.valve_drive import ValveDrive
 from crane.description.sensors import SUPPLY_PRESSURE, TANK_PRESSURE, VALVE_SIGNAL_PREFIX
@@ -35,7 +34,6 @@ from crane.recordings.measured_recordings import (
     locked_joint_conflicts,
 )
 from crane.recordings.recording import (
-    FORCE_SUFFIX,
     IDEAL_SENSORS,
     SENSORS_NOTE,
     VELOCITY_SUFFIX,
@@ -46,7 +44,6 @@ from crane.recordings.sensor_discrepancy import warn_discrepancies
 from crane.recordings.timeseries import (
     TIME,
     Table,
-    check_columns_present,
     table_column,
     time_derivative,
 )
@@ -204,25 +201,10 @@ def _recorded_drive(
     machine: Machine, table: Table, controller: str | None
 ) -> tuple[Array, ControlLaw, tuple[Array, Array] | None]:
     """Instants (N,) [s] from zero, the recorded references, signals or forces, and the start."""
-    if controller is not None:
+    if controller is not None or machine.hydraulics is None:
         return recorded_references(machine, table, controller)
-    if machine.hydraulics is None:
-        return _force_inputs(machine, table)
     inputs = replay_inputs(machine, table)
     return inputs.time, inputs.valve_drive(machine), inputs.initial
-
-
-def _force_inputs(
-    machine: Machine, table: Table
-) -> tuple[Array, ForceInputs, tuple[Array, Array]]:
-    """Instants (N,) [s] from zero, forces of the drives there, and the initial motion."""
-    time = table_column(table, TIME)
-    names = [joint + FORCE_SUFFIX for joint in machine.driven_joints]
-    check_columns_present([[name] for name in names], table.units)
-    forces = np.column_stack([table_column(table, name) for name in names])
-    q_a, v_a = joint_motion(machine, table)
-    time = time - time[0]
-    return time, ForceInputs(machine, time, forces), (q_a[0], v_a[0])
 
 
 @dataclass(frozen=True, eq=False)

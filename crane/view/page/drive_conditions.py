@@ -1,11 +1,12 @@
 """Payload, slope and supports of the page on which a machine is driven."""
 
+import warnings
 from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
-from crane.common.errors import CraneError, InputError
+from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.common.samples import Array
 from crane.control.control_law import Controller
 from crane.control.valve_commands import ValveCommand
@@ -48,10 +49,11 @@ class DriveConditions:
         variants, tilted = MachineVariants(machine), []
         x, y, z = machine.gravity
         self.slopes = bool(z < 0 and not x and not y)
-        if self.slopes:
-            tilted = [variants.machine(self._changes(_gravity(z, _TILT, 2 * _TILT)))]
         self._payloads: list[Machine] = []
-        with suppress(CraneError):  # another structure with a payload
+        with suppress(CraneError), warnings.catch_warnings():  # another structure with a payload
+            warnings.simplefilter("ignore", CraneWarning)  # as when the machine was loaded
+            if self.slopes:
+                tilted = [variants.machine(self._changes(_gravity(z, _TILT, 2 * _TILT)))]
             masses = sorted({*self.masses, *_payload_masses(machine)})
             payloads = [variants.machine(self._changes({PAYLOAD: x})) for x in masses]
             self.program = InstanceProgram(machine, quantities, [*payloads, *tilted], controller)

@@ -38,13 +38,12 @@ from crane.simulation.integration.chart_switching import KEPT_CHART_RELAXATION
 from crane.view.page.drive_conditions import DriveConditions
 from crane.view.page.drive_goals import goal_data
 from crane.view.page.drive_hand import pull_data, target_data
-from crane.view.page.drive_levers import lever_data
+from crane.view.page.drive_levers import INTERVAL, lever_data
 from crane.view.page.html_document import write_page
 from crane.view.page.page_motion import frame_data, joint_tree, pack_base64
 from crane.view.page.report_page import machine_data, scene_commands, script_json, viewer_script
 from crane.view.page.scene import build_scene, link_poses, read_visuals, scene_bounds
 
-INTERVAL = 0.01  # of the recording, at whose ends the inputs are given [s]
 RAMP = 0.15  # time from neutral to the end of a lever [s]
 _SCRIPTS = (
     "data", "kinematics", "scene", "drive_scene", "drive_levers", "drive_gauges", "drive_pull",
@@ -278,7 +277,7 @@ def _motion_bounds(machine: Machine, scene: Any) -> tuple[Array, Array]:
     configurations = [machine.home]
     for i, (lower, upper) in enumerate(zip(machine.lower, machine.upper, strict=True)):
         turns = machine.unit(machine.active[i]) == "rad" and not upper - lower < np.pi
-        for value in () if turns else (lower, upper):
+        for value in () if turns else filter(np.isfinite, (lower, upper)):
             try:
                 q_a = np.where(np.arange(len(home)) == i, value, home)
                 configurations.append(machine.closure.solve(q_a, initial_guess=machine.home))

@@ -100,12 +100,13 @@ class Conditions {
             this.roll = addSlider("slope along y", "°", { min: -15, max: 15 }, (roll) => send({ roll }));
         }
         if (!drive.holdsWeight) return;
-        const box = make("input", { type: "checkbox", checked: true });
-        box.onchange = () => worker.postMessage({ holds: box.checked });
-        element("conditions").append(make("label", { className: "condition box" }, box, "drives carry the weight and brake"));
+        this.box = make("input", { type: "checkbox" });
+        this.box.onchange = () => worker.postMessage({ holds: this.box.checked });
+        element("conditions").append(make("label", { className: "condition box" }, this.box, "drives carry the weight and brake"));
     }
 
-    show({ conditions: { payload, pitch, roll } }) {
+    show({ holds, conditions: { payload, pitch, roll } }) {
+        if (this.box) this.box.checked = holds;
         if (this.payload) this.payload(payload, spoken(drive.payload.masses[payload], 4));
         if (!this.pitch) return;
         this.pitch(pitch, spoken(pitch));

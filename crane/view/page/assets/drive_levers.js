@@ -9,7 +9,6 @@ const KEYS = [["KeyD", "KeyA"], ["KeyW", "KeyS"], ["KeyL", "KeyJ"], ["KeyI", "Ke
 const ARROWS = [[], [], ["ArrowRight", "ArrowLeft"], ["ArrowUp", "ArrowDown"]];
 const MORE_KEYS = [["KeyR", "KeyF"], ["KeyT", "KeyG"], ["KeyY", "KeyH"]];
 const PAD_BUTTONS = [[7, 6], [5, 4], [12, 13]]; // of further levers: triggers, shoulders, cross
-const WORDS = { slew: ["right", "left"], boom: ["down", "up"], stick: ["out", "in"], tool: ["out", "in"] };
 const FINE = 0.4; // of the way, with shift
 const keyName = (code) => code.replace("Key", "").replace("Arrow", "").toLowerCase();
 
@@ -88,7 +87,7 @@ class Levers {
         for (const { side, names, stick } of this.sticks) {
             names.forEach((label, place) => {
                 const axis = 2 * side + (place > 1 ? 1 : 0), i = this.on(axis);
-                const word = i === null ? "" : WORDS[this.levers[i].role][place % 2];
+                const word = i === null ? "" : this.levers[i].words[place % 2];
                 const key = make("kbd", { textContent: keyName(KEYS[axis][place % 2]) });
                 label.replaceChildren(...(i === null ? [] : [key, `${this.levers[i].name.replaceAll("_", "_\u200b")} ${word}`]));
                 label.title = label.textContent;

@@ -1,7 +1,7 @@
 // The machine at its own steps: levers in, states out. One row per step is kept for the recording.
 
 let given, machine, numbers, instance, scratch, levers, wanted, inputs, status, stability, goals;
-let running = false, due = 0, last = 0, computed = 0, busy = 0, spent = 0, holds = true;
+let running = false, due = 0, last = 0, computed = 0, busy = 0, spent = 0, holds = false;
 let rows, record, conditions, base, hand;
 
 const START = 64; // of the instance in the memory, in numbers
@@ -19,6 +19,7 @@ async function begin(message) {
     stability = given.stability && new Stability(given);
     goals = new GoalRun(given);
     hand = new Hand(given, START + given.handMemory);
+    holds = given.holdsWeight && given.levers.every(({ braking }) => braking > 0);
     reset();
     setTimeout(lap);
 }
@@ -112,17 +113,25 @@ function holdWeight() {
 
 function advance() {
     const most = given.interval / given.ramp;
-    given.levers.forEach((lever, i) => {
-        levers[i] += Math.max(-most, Math.min(most, wanted[i] - levers[i]));
-        if (lever.index !== undefined) instance[lever.index] = signal(lever, levers[i]);
-    });
+    given.levers.forEach((lever, i) => { levers[i] += Math.max(-most, Math.min(most, wanted[i] - levers[i])); });
     if (given.targets.length) hand.follow(levers);
     hand.pull();
-    if (given.holdsWeight && holds) holdWeight();
-    for (const [name, value] of Object.entries(inputs)) instance[given.inputs[name]] = value;
-    status = machine.advance(HERE);
+    const before = holds ? instance.slice() : null;
+    step();
+    if (status !== 1 && holds) { // weights that no force carries, as at a dead centre
+        holds = false;
+        instance.set(before);
+        step();
+    }
     if (status === 1) keep();
     else running = false;
+}
+
+function step() {
+    if (!given.targets.length) given.levers.forEach((lever, i) => { instance[lever.index] = signal(lever, levers[i]); });
+    if (holds) holdWeight();
+    for (const [name, value] of Object.entries(inputs)) instance[given.inputs[name]] = value;
+    status = machine.advance(HERE);
 }
 
 // Where the tip is: position, Jacobian and bias follow each other.
@@ -173,7 +182,7 @@ function lap() {
 
 function tell() {
     postMessage({
-        status, running, levers, conditions, time: instance[0], factor: busy > 0.2 ? computed / busy : 1,
+        status, running, holds, levers, conditions, time: instance[0], factor: busy > 0.2 ? computed / busy : 1,
         hand: hand.state(), q: Array.from(part("q")), goal: goals.state(), results: record.results,
         changed: record.changed, changes: record.changes, hasMoved: rows.length > 1,
         row: rows.length ? Array.from(rows[rows.length - 1]) : [],
