@@ -23,6 +23,7 @@ from crane.common.progress import Progress
 from crane.common.samples import Array
 from crane.identification.calibration.calibration_problem import CalibrationProblem
 from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt, SearchLog
+from crane.identification.calibration.multi_start import minimize_from_starts, smoothed_minimum
 from crane.identification.calibration.unknowns import Unknown
 
 _LOWER_MINIMUM_SHARE = 5e-2  # relative difference of the cost of a lower minimum
@@ -100,7 +101,7 @@ def estimate_with_profiles(
     """
     from scipy.stats import t as student
 
-    z = search.run()
+    z = minimize_from_starts(search)
     for last in [False] * _MAX_RESTARTS + [True]:
         covariance, blocks = search.covariance(z)
         factor = float(student.ppf(0.975, max(blocks - 1, 1)))
@@ -306,7 +307,7 @@ def select_parameters(
         InputError: No parameter is kept.
     """
     search = LevenbergMarquardt(problem, progress, log)
-    z, unknowns = search.smoothed_minimum(), problem.unknowns
+    z, unknowns = smoothed_minimum(search), problem.unknowns
     excluded = set()
     for i, unknown in enumerate(unknowns):
         rigid = dict(unknown.members).get(unknown.name) == 0.0 and unknown.start > 0.0
