@@ -3,7 +3,6 @@
 Its states are kept, so that an interrupted search goes on from the last one.
 """
 
-import warnings
 from contextlib import suppress
 from dataclasses import dataclass
 

@@ -6,16 +6,18 @@ others at the values of the machine: r(z_S) = r - J z + J_S z_S. A fit of S with
 contiguous instants is a Gauss-Newton step of normal equations, its error in block b follows from
 their matrices. The set grows by the parameter that reduces
 
-    score = sum_c n_c ln(mean square of channel c over all blocks left out) + 2 k
+    score = sum_c n_c ln(mean square of channel c over all blocks left out) + sum_S (z / prior)^2
+            + 2 k
 
-most, with the number n_c of independent samples and k parameters, up to all candidates. The set
+most, with the number n_c of independent samples, deviations z of priors and k parameters, up to
+all candidates. The set
 of the lowest score is kept, without parameters that the recordings do not determine: whose
 deviation is that of their prior, or that correlate with another one. It is fitted by simulation,
 and selected again by the linearization there, until it repeats.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,6 +35,7 @@ MAX_PRIOR_SHARE = 0.7  # of the deviation of a prior, up to which recordings det
 BLOCK_DURATION = 3.0  # [s] of a block that is left out
 _BLOCK_RANGE = 3, 8  # number of blocks of a recording
 _MAX_ROUNDS = 3  # linearizations
+_BLOCK_ITERATIONS = 3  # of the fits without a block
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,6 @@ class SelectionStep:
         information_criterion: Bayesian information criterion of the set, n ln(mean square of the
             residual) + k ln(n).
         errors: RMS errors of the channels in the blocks left out, in their units.
-        is_kept: Whether the final set contains the parameter.
     """
 
     name: str
@@ -54,7 +56,23 @@ class SelectionStep:
     score: float
     information_criterion: float
     errors: dict[str, float]
-    is_kept: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class SelectedModel:
+    """Result of a selection.
+
+    Attributes:
+        search: Search of the selected parameters.
+        minimum: (p,) its minimum, where it is linearized; None if it was not searched.
+        steps: Steps of the selection.
+        left_out: Names of the parameters that were left out.
+    """
+
+    search: LevenbergMarquardt
+    minimum: Array | None = None
+    steps: tuple[SelectionStep, ...] = ()
+    left_out: tuple[str, ...] = ()
 
 
 class LinearizedSelection:
@@ -103,7 +121,7 @@ class LinearizedSelection:
         return z
 
     def mean_squares(self, unknowns: Sequence[int], left_out: bool) -> Array:
-        """Mean squares (c,) of the weighted residuals, of all blocks or where they are left out."""
+        """Mean squares (c,) of the weighted residuals, fitted or where blocks are left out."""
         total = np.zeros(len(self._rows))
         for b, products in enumerate(self._products):
             z = np.append(self.fit(unknowns, b if left_out else None), 1.0)
@@ -112,8 +130,10 @@ class LinearizedSelection:
 
     def score(self, parameters: Sequence[int]) -> float:
         """Score of a set of parameters, by blocks left out."""
-        squares = self.mean_squares(self.with_starts(parameters), True)
-        return float(self._counts @ np.log(squares)) + 2.0 * len(parameters)
+        unknowns = self.with_starts(parameters)
+        squares, z = self.mean_squares(unknowns, True), self.fit(unknowns)
+        penalty = float(z @ self._prior @ z) / self._search.redundancy
+        return float(self._counts @ np.log(squares)) + penalty + 2.0 * len(parameters)
 
     def with_starts(self, parameters: Sequence[int]) -> list[int]:
         """Parameters and all starts of recordings."""
@@ -185,9 +205,7 @@ def training_blocks(times: Array) -> Array:
     return numbers
 
 
-def select_parameters(
-    search: LevenbergMarquardt, kept_names: Sequence[str]
-) -> tuple[CalibrationProblem, LevenbergMarquardt, list[SelectionStep]]:
+def select_parameters(search: LevenbergMarquardt, kept_names: Sequence[str]) -> SelectedModel:
     """Select parameters, see the module.
 
     Args:
@@ -195,11 +213,10 @@ def select_parameters(
         kept_names: Parameters that are kept in any case.
 
     Returns:
-        Problem of the selected parameters, a search that continues from its fit, and the steps.
+        The selected model.
     """
-    whole, z = search.problem, smoothed_minimum(search)
+    whole, z = search.problem, search.sharpen_friction(smoothed_minimum(search))
     kept = [i for i, x in enumerate(whole.unknowns) if x.name in kept_names]
-    count = len(whole.unknowns)
     tried: list[list[int]] = []
     for _ in range(_MAX_ROUNDS):
         selection = LinearizedSelection(search, z, kept)
@@ -210,7 +227,7 @@ def select_parameters(
         tried.append(chosen)
         problem = CalibrationProblem(whole.machine, [whole.unknowns[i] for i in chosen],
                                      whole.cases)  # fmt: skip
-        problem.smooth, problem.derivative_tolerance = whole.smooth, whole.derivative_tolerance
+        problem.smooth, problem.slopes = whole.smooth, whole.slopes
         starts = [z[unknowns], selection.fit(unknowns)[unknowns]]
         restricted = search.restricted_search(problem, starts[0])
         start = min(starts, key=restricted.cost)
@@ -221,11 +238,75 @@ def select_parameters(
         search.linearize(z)
         search.update_redundancy()
         whole.simulation_count += problem.simulation_count
-    restricted = search.restricted_search(problem, z[unknowns])
     problem.simulation_count = whole.simulation_count
-    restricted.minima = search.minima
-    return problem, restricted, [
-        SelectionStep(x.name, x.is_removal, x.score, x.information_criterion, x.errors,
-                      x.name in {whole.unknowns[i].name for i in chosen})
-        for x in steps
-    ]  # fmt: skip
+    restricted = search.restricted_search(problem, z[unknowns])
+    determined, z = _determined(restricted, restricted.sharpen_friction(z[unknowns]), kept_names)
+    names = {x.name for x in determined.problem.unknowns}
+    left_out = (x.name for x in whole.unknowns if x.name not in names)
+    return SelectedModel(determined, z, tuple(steps), tuple(left_out))
+
+
+def _determined(
+    search: LevenbergMarquardt, z: Array, kept_names: Sequence[str]
+) -> tuple[LevenbergMarquardt, Array]:
+    """Search and minimum of the parameters that the recordings determine.
+
+    Args:
+        search: Search at its minimum.
+        z: (p,) minimum.
+        kept_names: Parameters that are kept in any case.
+    """
+    while True:
+        problem = search.problem
+        parameters = problem.unknowns
+        kept = [i for i, x in enumerate(parameters) if x.name in kept_names]
+        selection = LinearizedSelection(search, z, kept)
+        everything = list(range(len(parameters)))
+        removable = selection.undetermined(everything) or [
+            i for i in everything if parameters[i].prior and z[i] == 0.0 and i not in kept
+        ]
+        if not removable:
+            return search, z
+        rests = {i: [x for x in everything if x != i] for i in removable}
+        rest = min(rests.values(), key=selection.score)
+        smaller = CalibrationProblem(problem.machine, [parameters[i] for i in rest], problem.cases)
+        smaller.simulation_count = problem.simulation_count
+        unknowns = selection.with_starts(rest)
+        search = search.restricted_search(smaller, z[unknowns])
+        z = search.nearest_minimum(z[unknowns])
+
+
+def block_errors(search: LevenbergMarquardt, z: Array) -> dict[str, tuple[float, float]]:
+    """RMS errors of each channel in blocks that are left out of the fit: of all, and of the worst.
+
+    Args:
+        search: Search at its minimum, linearized there.
+        z: (p,) minimum.
+    """
+    problem, squares = search.problem, dict[str, list[tuple[int, float]]]()
+    numbers, row = training_blocks(search.blocks), 0
+    for k, case in enumerate(search.training_cases):
+        count = int(case.train_mask.sum()) * len(case.sensors)
+        blocks = np.full(len(case.train_mask), -1)
+        blocks[case.train_mask] = numbers[row : row + count : len(case.sensors)]
+        row += count
+        for b in np.unique(blocks[case.train_mask]):
+            cases = list(search.training_cases)
+            cases[k] = replace(case, train_mask=case.train_mask & (blocks != b))
+            part = CalibrationProblem(problem.machine, problem.unknowns, cases)
+            part.smooth, part.slopes = problem.smooth, problem.slopes
+            part.derivative_tolerance = problem.derivative_tolerance
+            found = search.restricted_search(part, z).minimize(
+                z, INITIAL_COST_TOLERANCE, max_iterations=_BLOCK_ITERATIONS
+            )
+            problem.simulation_count += part.simulation_count
+            residual = part.residuals(part.cases[k], found.z)[blocks == b]
+            for name, x in zip(case.sensors, residual.T, strict=True):
+                squares.setdefault(name, []).append((len(x), float(x @ x)))
+    return {
+        name: (
+            float(np.sqrt(sum(x for _, x in parts) / sum(n for n, _ in parts))),
+            float(np.sqrt(max(x / n for n, x in parts))),
+        )
+        for name, parts in squares.items()
+    }

@@ -23,7 +23,7 @@ from crane.identification.calibration.unknowns import Unknown
 _CAUTIOUS_DAMPING = 1.0
 _PART_DURATION = 2.0  # [s] of the parts of a recording
 _POINT_COUNT = 128  # points of the Sobol sequence
-_ROUNDS = ((8, 3), (4, 4), (2, 40))  # searches and iterations of each round
+_ROUNDS = ((7, 3), (3, 4), (2, 40))  # searches and iterations of each round
 _SAMPLE_DEVIATIONS = 2.0  # of a prior, within which points lie
 _SAMPLE_FACTOR = 3.0  # of a start without a prior, likewise
 _PRIOR_SHARE = 0.98  # of the normal distribution
@@ -39,9 +39,9 @@ def smoothed_minimum(search: LevenbergMarquardt) -> Array:
     """Lowest minimum (p,) found with smoothed friction, and the linearization there."""
     search.start_with_smoothed_friction()
     start = np.zeros(search.problem.unknown_count)
-    search.minima = [search.minimize(start, INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING)]
-    if not search.leaves_noise(search.minima[0].z):
-        search.minima = _race(search, search.minima[0])
+    first = search.minimize(start, INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING, _ROUNDS[0][1])
+    is_good = search.leaves_noise(first.z)
+    search.minima = [first] if is_good else _race(search, first)
     z = search.minima[0].z
     search.channel_scales = search.updated_channel_scales(z)
     z = search.minimize(z, INITIAL_COST_TOLERANCE).z
@@ -55,18 +55,20 @@ def _race(search: LevenbergMarquardt, first: SearchState) -> list[SearchState]:
 
     Args:
         search: The search.
-        first: Minimum of the search from the machine.
+        first: State of the search from the machine after the first round.
     """
     starts = [*_part_minimum(search), *_sampled_points(search)]
-    starts = sorted(starts, key=search.cost)[: _ROUNDS[0][0]]
-    states = [SearchState(z, search.cost(z), _CAUTIOUS_DAMPING) for z in starts]
+    points = [SearchState(z, search.cost(z), _CAUTIOUS_DAMPING) for z in starts]
+    states = sorted((x for x in points if np.isfinite(x.cost)), key=lambda x: x.cost)
+    others = [first]
     for count, iterations in _ROUNDS:
         states = [
             search.minimize(x.z, INITIAL_COST_TOLERANCE, x.damping, iterations)
-            for x in sorted(states, key=lambda x: x.cost)[:count]
-            if np.isfinite(x.cost)
+            for x in states[:count]
         ]
-    return sorted([first, *states], key=lambda x: x.cost)
+        states = sorted([*others, *states], key=lambda x: x.cost)
+        others = []
+    return states
 
 
 def _part_minimum(search: LevenbergMarquardt) -> list[Array]:
