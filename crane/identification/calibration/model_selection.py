@@ -112,7 +112,7 @@ class LinearizedSelection:
         products = self._by_block.sum(axis=0)
         if without_block is not None:
             products = products - self._by_block[without_block]
-        i = np.asarray(unknowns)
+        i = np.asarray(unknowns, dtype=int)
         z, search = np.zeros(len(self._z)), self._search
         z[i] = bounded_step(
             (products[:-1, :-1] + self._prior)[np.ix_(i, i)], products[i, -1],
