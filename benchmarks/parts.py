@@ -5,6 +5,7 @@ from types import ModuleType
 from typing import Any
 
 import bundled_runs
+import c_steps
 import calls
 import calls_over_size
 import closing_from_anywhere
@@ -81,6 +82,11 @@ PARTS = {
     "runs": Part(
         "Runs of bundled machines", bundled_runs,
         "All with friction; those on valves with pressures, spools and pump.",
+    ),
+    "c_steps": Part(
+        "Steps in C", c_steps,
+        "`crane export --to c` by compilers of this computer, over the package's machine code, in "
+        "turns. That uses all instructions of the processor, C only with `-march=native`.",
     ),
     "calls": Part(
         "Calls from Python", calls,

@@ -97,7 +97,7 @@ CALLS = {
         "--starts 1 --points 2 --processes 1",
     ],
     "excite": ["slider.yaml --out {out} --period 4 --harmonics 1 --step 0.05"],
-    "import": ["motion.csv columns.txt --out {out}.csv"],
+    "import": ["motion.csv --columns columns.txt --out {out}.csv"],
     "identify": ["slider.yaml motion.csv --out {out}"],
     "payload": ["slider.yaml motion.csv"],
     "circuit": [

@@ -37,6 +37,24 @@ def opened(browser, path, **options):
     return page
 
 
+def dragged(page, x, y):
+    """Drag the tip by some pixels, and hold it there; the force and its label then."""
+    page.wait_for_function("pull.tip")
+    place = "(() => { const { left, top } = element('pane').getBoundingClientRect();"
+    left, top = page.evaluate(
+        place + "const [x, y] = pull.pixels(pull.tip); return [left + x, top + y]; })()"
+    )
+    page.mouse.move(left, top)
+    page.mouse.down()
+    for share in (0.3, 0.6, 1.0):
+        page.mouse.move(left + share * x, top + share * y)
+        page.wait_for_timeout(100)
+    page.wait_for_timeout(400)
+    label, hand = page.text_content("output.pull"), page.evaluate("window.crane.state.hand")
+    page.mouse.up()
+    return np.array(hand["force"]), label
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["patu655", "excavator"])
 def test_a_drive_by_keys_is_repeated_by_the_library(browser, tmp_path, name):
@@ -48,6 +66,7 @@ def test_a_drive_by_keys_is_repeated_by_the_library(browser, tmp_path, name):
         page.keyboard.down(key)
         page.wait_for_timeout(700)
         page.keyboard.up(key)
+    dragged(page, 20, -40)
     page.wait_for_timeout(500)
     page.keyboard.press("Space")
     assert page.evaluate("window.crane.state.status") == 1
@@ -64,6 +83,7 @@ def test_a_drive_by_keys_is_repeated_by_the_library(browser, tmp_path, name):
     moved = np.ptp(recorded.q, axis=0)
     assert moved.max() > 0.05
     np.testing.assert_allclose(recorded.q, replayed.q, rtol=0, atol=1e-9)
+    assert np.ptp(recorded.channels["load_tip_force_z"]) > 100.0
     for channel in ("tip_z", "pressure_supply", "work"):
         scale = np.abs(replayed.channels[channel]).max()
         difference = recorded.channels[channel] - replayed.channels[channel]
@@ -95,3 +115,25 @@ def test_what_cannot_be_driven_is_told():
     machine.model.effortLimit[:] = 0.0
     with pytest.raises(InputError, match="give joints an effort limit"):
         drive_html(machine)
+
+
+@pytest.mark.slow
+def test_a_closed_loop_that_was_pulled_and_led_is_repeated(browser, tmp_path):
+    path, csv = tmp_path / "drive.html", tmp_path / "drive.csv"
+    typed("view", "mini_forwarder", "--drive", "--controller", "pi", "--no-open", "--out", path)
+    page = opened(browser, path, viewport={"width": 1280, "height": 760})
+    force, label = dragged(page, 60, -120)
+    assert np.linalg.norm(force) > 0.5 and label.endswith("N")
+    page.click(".hand button:has-text('move the target')")
+    dragged(page, -60, -40)
+    with page.expect_download() as download:
+        page.click("#save")
+    download.value.save_as(csv)
+    assert not page.faults
+    page.close()
+    recorded = quiet(crane.Recording.from_csv, csv)
+    again, _ = quiet(crane.replay, crane.load("mini_forwarder"), csv, 0.01, controller="pi")
+    assert np.ptp(recorded.channels["load_tip_force_z"]) > 0.5
+    assert np.abs(recorded.q - again.q).max() < 1e-9 * np.ptp(recorded.q)
+    moved = np.ptp(recorded.channels["reference_X1"])
+    assert moved > 1e-4 and np.abs(recorded.error("X1")).max() < moved

@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,8 +15,13 @@ from warned import quiet
 import crane
 from crane.codegen.wasm_emitter import emit_wasm_module
 from crane.common.errors import InputError
+from crane.control import interpolate_references
+from crane.description.force_elements import Friction
 from crane.export import InstanceProgram, write_c
 from crane.export.c_sources import CSources
+from crane.export.instance_program import DYNAMICS_ROUTINES
+from crane.export.instance_routines import TOO_MANY_CALLS
+from crane.machine.payload import Payload
 
 COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic"]
@@ -45,11 +51,16 @@ def run(path, *before):
     return done.returncode, done.stdout + done.stderr
 
 
+def largest_relative_difference(output):
+    return float(re.search(r"dynamics: largest relative difference (\S+),", output)[1])
+
+
 class Library:
     """The functions of a machine in C, and an instance as numpy arrays by part."""
 
-    def __init__(self, machine, folder, *flags):
-        self.program = InstanceProgram(machine)
+    def __init__(self, machine, folder, *flags, controller=None, quantities=None):
+        quantities = DYNAMICS_ROUTINES if quantities is None else quantities
+        self.program = InstanceProgram(machine, quantities, controller=controller)
         texts = CSources(self.program, "m").files()
         for name in ("m.h", "m.c"):
             (folder / name).write_text(texts[name])
@@ -74,9 +85,8 @@ def signals(program, times):
     return found
 
 
-def largest_difference(machine, folder, steps=150, step=0.01):
+def largest_difference(machine, library, steps=150, step=0.01):
     """Of the active coordinates in C and by `simulate`, over their motion; transitions."""
-    library = Library(machine, folder)
     program, times = library.program, step * np.arange(steps + 1)
     moved = signals(program, times)
     command = crane.control.ValveSignals(machine, times, moved)
@@ -106,10 +116,39 @@ def test_sources_compile_without_warnings_and_their_self_test_passes(tmp_path):
 @pytest.mark.slow
 def test_a_motion_with_joints_that_stick_is_that_of_simulate(tmp_path):
     machine = crane.load("patu655")
-    difference, expected = largest_difference(machine, tmp_path)
+    difference, expected = largest_difference(machine, Library(machine, tmp_path))
     assert difference < 1e-12
     stick = np.array([x for name, x in expected.channels.items() if name.startswith("rest_")])
     assert 0 < np.count_nonzero(stick) < stick.size
+
+
+def compare_with_changes(library, machine, configurations, random):
+    """A payload, a slope and friction, set in C, against a machine that was built with them."""
+    tensor = np.cov(random.normal(size=(3, 9)))
+    tensor, com = np.trace(tensor) * np.eye(3) - tensor, random.normal(size=3)
+    column = machine.closure.active[-1]
+    joint, law = machine.joints[column], f"{machine.joints[column]}_"
+    friction = replace(machine.friction.get(joint, Friction()), coulomb=7.0, viscous=3.0)
+    gravity = [1.0, -2.0, -9.0]
+    given = {f"gravity_{x}": value for x, value in zip("xyz", gravity, strict=True)}
+    given |= {f"{law}coulomb": 7.0, f"{law}viscous": 3.0}
+    if machine.friction.get(joint) is None:  # C has no stick-slip transitions of this joint
+        given[f"{law}sharpness"] = 1.0 / 0.002
+        friction = replace(friction, smoothing=0.002)
+    for name, value in given.items():
+        library.instance[library.program.names.index(name)] = value
+    payload = np.array([50.0, *com, *tensor[np.triu_indices(3)]])
+    assert library("set_payload", payload) == 1
+    changed = replace(machine, friction=machine.friction | {joint: friction})
+    changed = changed.with_payload(Payload(machine.tip, 50.0, tuple(com), tensor))
+    changed.model.gravity.linear = np.array(gravity)
+    dynamics = crane.Dynamics(changed)
+    for q in configurations:
+        v, x = random.normal(size=(2, len(machine.active)))
+        expected = dynamics.evaluate_closed("inverse with friction", q, v, x)
+        found = np.empty_like(expected)
+        assert library("inverse_dynamics_with_friction", q, v, x, found) == 1
+        assert np.abs(found - expected).max() < 1e-12 * np.abs(expected).max()
 
 
 @needs_compiler
@@ -144,6 +183,7 @@ def test_quantities_at_random_states_are_those_of_the_library(tmp_path, name):
         assert library("close_loops", closed) == 1
         assert np.abs((closed - q) / machine.closure.units).max() < 1e-13
     assert all(differences[name] < 1e-13 * sizes[name] for name in quantities)
+    compare_with_changes(library, machine, configurations[:20], random)
 
 
 @needs_compiler
@@ -166,11 +206,10 @@ def test_tools_find_no_error_in_memory_or_arithmetic(tmp_path):
 @needs_compiler
 def test_single_precision_keeps_its_digits(tmp_path):
     write_c(crane.load("kr300"), tmp_path, name="m")
-    flags = "-O0", "-Dm_real=float", "-DTOLERANCE=1e-3", "-DMOTION_TOLERANCE=1e300"
+    flags = "-O0", "-Dm_real=float", "-DMOTION_TOLERANCE=1e300"
     status, output = run(compiled(tmp_path, "m", *flags))
     assert status == 0
-    difference = float(re.search(r"dynamics: largest relative difference (\S+),", output)[1])
-    assert 1e-9 < difference < 1e-3
+    assert 1e-9 < largest_relative_difference(output) < 1e-3
 
 
 def test_parameters_have_names_and_change_the_motion():
@@ -188,6 +227,24 @@ def test_a_load_that_is_a_function_in_python_is_refused():
     load = crane.description.WrenchFunction(machine.tip, lambda *motion: np.zeros(6))
     with pytest.raises(InputError, match="is a function in Python"):
         InstanceProgram(machine.with_external_forces(load))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    not (shutil.which("aarch64-linux-gnu-gcc") and shutil.which("qemu-aarch64")),
+    reason="no cross-compiler with an emulator is here",
+)
+@pytest.mark.parametrize("name", ["mini_forwarder", "patu655"])
+def test_another_processor_with_fused_operations_computes_the_same(tmp_path, name):
+    quantities = ("inverse_dynamics_with_friction", "forward_dynamics", "energy")
+    program = InstanceProgram(crane.load(name), quantities=quantities)
+    for file, text in CSources(program, "m").files().items():
+        (tmp_path / file).write_text(text)
+    flags = "-O1", "-ffp-contract=fast", "-static"
+    path = compiled(tmp_path, "m", *flags, compiler="aarch64-linux-gnu-gcc")
+    status, output = run(path, "qemu-aarch64")
+    assert status == 0, output
+    assert largest_relative_difference(output) < 1e-13
 
 
 _NODE_PROGRAM = """
@@ -233,7 +290,77 @@ def test_a_motion_in_web_assembly_is_that_of_simulate(tmp_path):
     assert np.abs(difference).max() < 1e-12 * np.ptp(expected.q, axis=0).max()
 
 
-def test_dead_time_is_refused():
-    machine = crane.load("patu655", changes={"valve.X_lift.delay": 0.05})
-    with pytest.raises(InputError, match="have a dead time"):
-        InstanceProgram(machine)
+def tracking_difference(machine, task, make_controller, folder, steps, step=0.01):
+    """Of the active coordinates in C and by `simulate` with a reference by samples, relative."""
+    reference = crane.task_trajectory(machine, task)
+    law, times = make_controller(machine, reference), step * np.arange(steps + 1)
+    rows, start = law.references(times), reference.position(0.0)
+    sampled = interpolate_references(law, times, rows)
+    expected = quiet(
+        crane.simulate, machine, sampled, initial=start, duration=times[-1], step=step
+    )
+    library = Library(machine, folder, controller=law, quantities=())
+    library.at.step[:] = step
+    library.at.q[machine.closure.active] = start
+    library.at.inputs[: len(rows.T)] = rows[0]
+    assert library("initialize") == 1
+    worst = 0.0
+    for row, q_a in zip(rows[1:], expected.q[1:], strict=True):
+        library.at.inputs[: len(row)] = row
+        assert library("advance") == 1
+        worst = max(worst, np.abs(library.at.q[machine.closure.active] - q_a).max())
+    motion, errors = np.ptp(expected.q, axis=0).max(), expected.q - reference.position(times)
+    return worst / motion, np.abs(errors).max() / motion
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "task", "controller", "steps"),
+    [
+        ("mini_forwarder", "lift", crane.PI, 1000),
+        ("patu655", "reach", crane.control.ValvePD, 400),
+    ],
+)
+def test_a_closed_loop_is_that_of_simulate(tmp_path, name, task, controller, steps):
+    machine = crane.load(name)
+    difference, error = tracking_difference(machine, task, controller, tmp_path, steps)
+    assert difference < 1e-12
+    assert error < 0.5  # the loop is closed
+
+
+def test_a_controller_has_its_gains_and_references_by_name():
+    machine = crane.load("mini_forwarder")
+    controller = crane.control.make_controller("pi", machine)
+    program = InstanceProgram(machine, (), controller=controller)
+    at = program.layout.view(np.array(program.names))
+    assert at.inputs.tolist()[:3] == ["reference_q1", "reference_X1", "reference_X2"]
+    assert at.settings.tolist()[:4] == ["q1_kp", "X1_kp", "X2_kp", "q1_ki"]
+    assert at.controller.tolist()[0] == "error_integral_q1"
+    home = program.layout.view(program.defaults).inputs[:3]
+    assert home == pytest.approx(machine.home[machine.closure.active])
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_dead_times_of_valves_are_those_of_simulate(tmp_path):
+    """Not whole milliseconds, nor equal for all valves."""
+    machine = crane.load("patu655", {"valve.X_lift.delay": 0.0437, "valve.X_ext.delay": 0.02})
+    library = Library(machine, tmp_path, quantities=())
+    assert "X_lift_delay" in library.program.names
+    assert largest_difference(machine, library, steps=100)[0] < 1e-12
+    for step, most in ((1e-3, 200), (1e-4, 100)):  # that of `simulate`, and a tenth of it
+        library.at.step[:] = step
+        statuses = {library("advance") for _ in range(most)}
+        assert statuses == ({1} if step == 1e-3 else {1, TOO_MANY_CALLS})
+
+
+def test_controllers_that_are_programs_in_python_are_refused():
+    machine = crane.load("patu655", {"valve.X_lift.delay": 0.05})
+    for controller, text in (
+        (lambda time, q_a, v_a: 0.0 * q_a, "function is computed in Python"),
+        (crane.control.SampledCommand(lambda *at: np.zeros(4), machine), "SampledCommand is comp"),
+        (crane.control.make_controller("valve-pd", machine), "ValvePD with valves that have a de"),
+    ):
+        with pytest.raises(InputError, match=text):
+            InstanceProgram(machine, controller=controller)

@@ -4,10 +4,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.optimize import minimize
+from warned import told
 
-from crane.common.errors import InputError
+from crane.common.errors import CraneError, InputError
 from crane.identification.mechanics.feasible_parameters import (
     body_parameters,
+    load_convex_solver,
     pseudo_inertia,
     solve_feasible,
 )
@@ -169,3 +171,38 @@ def test_priors_that_cannot_be():
     for wrong in (message(-1.0, 10), message([1, 0, 0, 0, 1, 0, 1, 0, 0, 3])):
         assert wrong.startswith("prior of 'stick' is flat or no possible body: give it")
     assert message([1, 0, 0, 0, 1, 0, 1, 0, 0, 2]) == wrong
+
+
+def test_warnings_of_solvers_are_one_line(monkeypatch):
+    """Steps of every solver are so few that none converges; CVXPY would advise another one."""
+    W, y, _, prior = problem(1, 1, rows=40)
+    given = W, y, np.full(40, 1e2), names(1), prior, np.full(1, 1e-3), np.full(1, np.inf)
+    exact = solve_feasible(*given)
+    problems, calls = load_convex_solver().Problem, []
+    real = problems.solve
+
+    def few_steps(self, solver, **options):
+        calls.append(solver)
+        limit = {"max_iters": 25} if solver == "SCS" else {"max_iter": 1}
+        return real(self, solver=solver, **limit)
+
+    monkeypatch.setattr(problems, "solve", few_steps)
+    found, lines = told(solve_feasible, *given)
+    assert calls == ["CLARABEL", "CLARABEL", "CLARABEL", "SCS"]
+    assert lines == [
+        "the feasible estimate is accurate to few digits only, as the recording hardly determines "
+        "it: give a larger weight to the prior (--prior)"
+    ]
+    assert 1e-9 < np.abs(found - exact).max() < np.abs(exact).max()
+
+
+def test_an_estimate_that_no_solver_finds_is_an_error(monkeypatch):
+    W, y, _, prior = problem(1, 1, rows=40)
+    cvxpy = load_convex_solver()
+
+    def fail(self, **options):
+        raise cvxpy.SolverError("try another solver, verbose=True")
+
+    monkeypatch.setattr(cvxpy.Problem, "solve", fail)
+    with pytest.raises(CraneError, match="^no feasible estimate .* larger weight to the prior$"):
+        solve_feasible(W, y, np.ones(40), names(1), prior, np.ones(1), np.ones(1))

@@ -594,6 +594,28 @@ def test_valve_whose_load_rings(compensated, frequency):
     assert "means over its periods" in found.to_text()
 
 
+def test_valve_whose_ringing_decays_below_ripple_of_the_sensor(compensated):
+    """As the log crane's: 2 Hz decays within 12 s, below ripple of 5.7 Hz and of 13 Hz."""
+    time = np.arange(0, 96, 1e-2)
+    U = long_steps(time)
+    rng = np.random.default_rng(4)
+    ripple = 4e-3 * np.sin(2 * np.pi * 5.7 * time) + 0.01 * np.sin(2 * np.pi * 13 * time)
+
+    def ringing(U):
+        decay = np.exp(-(time % 12) / 20)
+        return speed_of(U) * (1 + 0.3 * decay * np.sin(2 * np.pi * 2 * time)) + ripple
+
+    run = driven(U, time, 5e-4, rng, lag=1e-3, speed=ringing)
+    with pytest.raises(RecordingError, match="no sample is steady"):
+        steady_samples(time, 0.5, U, run.v[:, 0])
+    found = identify_valve(compensated, run, "boom")
+    assert found.neutral == pytest.approx(MIDDLE, abs=5e-3)
+    assert found.dead_band == pytest.approx(SHARE, abs=3e-3)
+    np.testing.assert_allclose(found.full_flows, FLOW, rtol=0.01)
+    low, high, _ = found.ringing
+    assert low == pytest.approx(2.0, rel=0.02) and high == pytest.approx(5.7, rel=0.02)
+
+
 def test_means_over_periods_leave_what_does_not_ring(compensated):
     """Noise, slow ramps and plain steps raise no warning of ringing."""
     time = np.arange(0, 42, 1e-2)

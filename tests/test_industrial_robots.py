@@ -316,6 +316,26 @@ def logs(name, *files):
 
 
 @recorded
+@pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+@pytest.mark.parametrize("name", ["kr300", pytest.param("tx40", marks=pytest.mark.slow)])
+def test_the_written_machine_predicts_as_the_identification(name, tmp_path, request):
+    """Presliding, memory and root of the KR300; two Stribeck velocities, a motor of the TX40."""
+    machine = request.getfixturevalue(name)
+    file = "kr300_A.npz" if name == "kr300" else "tx40_recording.npz"
+    (log,) = logs(name, file)
+    if name == "tx40":
+        log = log.between(0.0, 5.4)
+    found = crane.identify(machine, log)
+    written = crane.load(crane.identification.write_identified(found, tmp_path / name))
+    step = log.time[1] - log.time[0]
+    q = sosfiltfilt(butter(4, 20, fs=1 / step, output="sos"), log.q, axis=0)
+    v = np.gradient(q, step, axis=0)
+    given = q, v, np.gradient(v, step, axis=0)
+    forces = crane.Dynamics(written).inverse(*given, friction=True, step=step)
+    np.testing.assert_allclose(forces, found.predict(*given, step), rtol=0, atol=1e-9)
+
+
+@recorded
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 def test_the_tx40_predicts_the_part_it_has_not_seen(tx40):

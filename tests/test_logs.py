@@ -158,7 +158,7 @@ def test_logs_that_cannot_be_read(log, tmp_path):
 def test_command_line(log, tmp_path):
     run = functools.partial(typed, "import")
 
-    given = log, columns(tmp_path, GOOD), "--out", tmp_path / "run.csv"
+    given = log, "--columns", columns(tmp_path, GOOD), "--out", tmp_path / "run.csv"
     done = run(*given)
     assert done.returncode == 0, done.stderr
     assert done.stdout == f"5 samples of 5 columns written to {tmp_path / 'run.csv'}\n"
@@ -167,6 +167,7 @@ def test_command_line(log, tmp_path):
     np.testing.assert_array_equal(found.tau[:, 0], 32 * TIME**2)
     again = run(*given)
     assert again.returncode == 2 and "exists already" in again.stderr
+    assert "give a file with a line per column" in run(log, *given[3:]).stderr
     assert "name it so" in run(*given[:-1], tmp_path / "run.npz").stderr
 
 
@@ -194,7 +195,7 @@ X_9 [m] = 0
 )  # fmt: skip
 def test_a_misspelt_quantity_is_refused_where_the_machine_is_named(log, tmp_path, written, meant):
     described = columns(tmp_path, f"{PATU}{written} = t\n")
-    done = typed("import", log, described, "--out", tmp_path / "run.csv")
+    done = typed("import", log, "--columns", described, "--out", tmp_path / "run.csv")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == (
         f"error: {described}: '{written}' is no quantity of 'patu655', did you mean '{meant}'? "
@@ -211,14 +212,18 @@ def test_channels_of_their_own_are_kept(log, tmp_path):
     nodes = [f"pressure_{x.replace('.', '_')}" for x in machine.hydraulics.node_names]
     own = [name for name in nodes if name not in PATU]
     text = PATU + "".join(f"{name} [bar] = 1\n" for name in own)
-    done = typed("import", log, columns(tmp_path, text), "--out", tmp_path / "run.csv")
+    done = typed(
+        "import", log, "--columns", columns(tmp_path, text), "--out", tmp_path / "run.csv"
+    )
     assert (done.returncode, done.stderr) == (0, "")
     units = table_reader.read_table(tmp_path / "run.csv").units
     assert {"pressure_X_grip_a", "pressure_pump", "X_9", *own} < set(units)
 
 
 def test_names_are_not_checked_where_the_machine_is_not_found(log, tmp_path):
-    done = typed("import", log, columns(tmp_path, GOOD), "--out", tmp_path / "run.csv")
+    done = typed(
+        "import", log, "--columns", columns(tmp_path, GOOD), "--out", tmp_path / "run.csv"
+    )
     assert done.returncode == 0
     assert (
         done.stderr.startswith("warning: ") and "names of columns are not checked" in done.stderr

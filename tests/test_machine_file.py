@@ -65,7 +65,7 @@ TEXT = [
         swap("  crank: 1.2", "  yes: 1.2"),
     ),
     case(
-        "four_bar.yaml:29: unknown key 'tip  [31m' in the machine file, the nearest of 32 "
+        "four_bar.yaml:29: unknown key 'tip  [31m' in the machine file, the nearest of 33 "
         "known ones are tip, active, floating, friction, end_stops, rotor_inertia, "
         "identification, home",
         swap("tip: coupler_pin", '"tip\\n\\e[31m": coupler_pin'),
@@ -80,7 +80,7 @@ TEXT = [
 # Keys that are unknown, missing or empty.
 KEYS = [
     case(
-        "four_bar.yaml:29: unknown key 'weather' in the machine file, the nearest of 32 "
+        "four_bar.yaml:29: unknown key 'weather' in the machine file, the nearest of 33 "
         "known ones are active, cutters, extends, home, name, rotor_inertia, control, "
         "identification",
         swap("tip: coupler_pin", "weather: 9.81"),
@@ -97,7 +97,7 @@ KEYS = [
         swap("active: [crank]", ""),
     ),
     case(
-        "four_bar.yaml:5: there are no chains, add one under 'chains:'",
+        "four_bar.yaml:5: there are no chains, add one under 'chains:', or a 'drawing:'",
         swap(
             "chains:\n"
             "  - {name: crank, urdf: four_bar/ground.urdf}\n"
@@ -111,7 +111,9 @@ KEYS = [
     ),
     case(
         "four_bar.yaml:21: friction of 'coupler' is empty, its keys are coulomb, "
-        "coulomb_offset, viscous, viscous_offset, smoothing, stiction, stribeck, drives",
+        "coulomb_offset, viscous, viscous_offset, smoothing, stiction, stribeck, "
+        "stiction_2, stribeck_2, root, presliding, presliding_length, memory, memory_time, "
+        "memory_speed, drives",
         swap("{viscous: 0.01}", ""),
     ),
     case(
@@ -192,7 +194,7 @@ NAMES = [
         swap("urdf: four_bar/rocker.urdf", "urdf: four_bar"),
     ),
     case(
-        "four_bar.yaml:1: not XML, Start tag expected, '<' not found, correct it",
+        "four_bar.yaml:2: this is no URDF and has no section 'drawing'",
         swap("urdf: four_bar/rocker.urdf", "urdf: four_bar.yaml"),
     ),
     case(

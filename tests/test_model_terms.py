@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from command_line import typed
+from warned import quiet
 
 import crane
 from crane.common.errors import CraneError, CraneWarning, InputError, RecordingError
@@ -33,7 +34,6 @@ from crane.identification.mechanics.model_terms import (
     friction_term,
     root_friction_term,
 )
-from crane.identification.mechanics.write_identified import friction_laws
 from crane.identification.signals.signal_processing import Motion
 
 STEP = 5e-3
@@ -268,24 +268,90 @@ def test_a_motor_of_two_joints_is_written_as_a_rotor_that_a_coupling_turns(arm, 
     assert (gap < 0.01 * np.linalg.norm(motion.tau[moving], axis=0)).all()
 
 
-def test_friction_without_a_place_is_written_as_the_nearest_law(arm):
-    """Presliding at steady speeds is Coulomb's; of the root, least squares over the speeds."""
-    terms = {"q1.presliding": (1e-3,), "q2.root": (), "q3.stiction": (0.1,), "q3.viscous": None}
-    model = IdentificationModel(arm, terms)
-    values = np.zeros(len(model.names))
-    for name, value in {"q1.presliding": 4.0, "q1.viscous": 2.0, "q2.root": 3.0, "q3.coulomb": 1.0,
-                        "q3.stiction": 0.5}.items():  # fmt: skip
-        values[model.names.index(name)] = value
-    found, deviations = friction_laws(model, values, dict.fromkeys(arm.active, (0.01, 1.0)))
-    law = found["q1"]
-    assert deviations["q1"] < 1e-9 and law.coulomb + law.stiction == pytest.approx(4.0)
-    assert law.viscous == pytest.approx(2.0)
-    assert "q3" not in deviations and found["q3"] == Friction(1.0, stiction=0.5, stribeck=0.1)
-    v = np.linspace(0.01, 1.0, 500)
-    law, off = found["q2"], deviations["q2"]
-    written = law.coulomb + law.viscous * v + law.stiction * np.exp(-((v / law.stribeck) ** 2))
-    assert np.abs(written - 3 * np.sqrt(v)).max() == pytest.approx(off, rel=0.02)
-    assert 0 < off < 0.6  # that of the best straight line, about 0.8 + 2.4 v, at the lowest speed
+HISTORY = Friction(
+    coulomb=1.0, coulomb_offset=0.3, viscous=2.0, viscous_offset=-0.5, stiction=-0.4, stribeck=0.1,
+    stiction_2=0.7, stribeck_2=0.5, root=3.0, presliding=4.0, presliding_length=0.02, memory=2.0,
+    memory_time=0.15, memory_speed=0.2,
+)  # fmt: skip
+
+
+def test_the_written_machine_predicts_as_the_parameters_do(arm, tmp_path):
+    """Friction with a history, of joints and of a motor of two; predicted as by the parameters."""
+    terms = {
+        "q1.presliding": (1e-3,), "q1.coulomb": (), "q2.root": (), "q3.stiction": (0.1, 0.4),
+        "q4.memory": (0.2, 0.1), "q5+q6.rotor_inertia": (), "q5+q6.presliding": (2e-3,),
+        "q5+q6.root": (), "q5+q6.memory": (0.1, 0.3),
+    }  # fmt: skip
+    motion = moved(arm)
+    found = quiet(
+        identify, arm, motion, terms=terms, prior={"bodies": "10 %"},
+        bandwidth=40.0, trust=True,
+    )  # fmt: skip
+    values = found.parameters.copy()
+    for i, (name, nominal) in enumerate(zip(found.model.names, found.model.nominal, strict=True)):
+        kind = name.rpartition(".")[2]
+        values[i] = nominal if i < 10 * len(found.model.bodies) else {"rotor_inertia": 0.2}.get(
+            kind, 1.0 + 0.01 * i
+        )  # fmt: skip
+    found = dataclasses.replace(found, parameters=values)
+    machine = crane.load(crane.identification.write_identified(found, tmp_path / "out"))
+    assert machine.friction["q1"].presliding_length == 1e-3
+    assert machine.friction["q5+q6"].memory_speed == 0.3
+    given = motion.q, motion.v, motion.a
+    forces = crane.Dynamics(machine).inverse(*given, friction=True, step=STEP)
+    np.testing.assert_allclose(forces, found.predict(*given, STEP), rtol=0, atol=1e-9)
+    steady = crane.Dynamics(machine).inverse(*given, friction=True)
+    assert np.abs(steady - forces).max() > 0.5  # it has no history
+    written = IdentificationModel(machine, {"q1.presliding": (1e-3,)})
+    law, nominal = machine.friction["q1"], dict(zip(written.names, written.nominal, strict=True))
+    assert nominal["q1.presliding"] == law.presliding > 1
+
+
+def test_friction_with_a_history_is_its_differential_equations(arm):
+    """Against scipy's integration over time; both backends at steady speeds."""
+    from scipy.integrate import solve_ivp
+
+    step, law = 2e-4, HISTORY
+    time = np.arange(0.0, 2.0, step)
+    q, v = np.zeros((2, len(time), 6))
+    q[:, 0], v[:, 0] = 0.1 * (1 - np.cos(5 * time)), 0.5 * np.sin(5 * time)
+    rough, smooth = (
+        crane.Dynamics(arm.replace(friction=laws)) for laws in ({"q1": law}, {"q1": Friction()})
+    )
+    found = (rough.inverse(q, v, 0 * q, True, step) - smooth.inverse(q, v, 0 * q))[:, 0]
+
+    def rates(t, x):
+        speed = 0.5 * np.sin(5 * t)
+        z, w = x
+        return (speed - abs(speed) * z) / law.presliding_length, (abs(speed) - w) / law.memory_time
+
+    z, w = solve_ivp(rates, (0, 2), (0.0, 0.0), t_eval=time, rtol=1e-10, atol=1e-12).y
+    x, sign = v[:, 0], np.sign(v[:, 0])
+
+    def expected(z, w):
+        excess = -0.4 * np.exp(-((x / 0.1) ** 2)) + 0.7 * np.exp(-((x / 0.5) ** 2))
+        return (
+            4.0 * z + (1.0 + excess + 2.0 * np.exp(-w / 0.2)) * sign + 0.3 + 2.0 * x
+            - 0.5 * np.abs(x) + 3.0 * sign * np.sqrt(np.abs(x))
+        )  # fmt: skip
+
+    np.testing.assert_allclose(found[1:], expected(z, w)[1:], atol=0.02)
+    some = slice(1, None, 400)
+    for backend in ("compiled", "pinocchio"):
+        dynamics = crane.Dynamics(arm.replace(friction={"q1": law}), backend=backend)
+        force = dynamics.friction(q[some], v[some])[:, 0]
+        np.testing.assert_allclose(force, expected(sign, np.abs(x))[some], atol=1e-9)
+    for options, message in (
+        ({"step": 0.1}, "a step is that of a motion"),
+        ({"step": 0.0, "friction": True}, "the step is 0|step is 0"),
+    ):
+        with pytest.raises(InputError, match=message):
+            rough.inverse(q, v, 0 * q, **options)
+
+
+def test_friction_at_rest_may_not_push(arm):
+    with pytest.raises(InputError, match="friction at rest is -1, the sum of coulomb, presliding"):
+        Friction(coulomb=1.0, stiction=-2.0)
 
 
 # --- the command line -------------------------------------------------------------------------

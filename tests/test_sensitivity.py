@@ -101,7 +101,8 @@ def test_with_friction_that_sticks_or_is_smooth(name, quantity, smoothing):
     machine = machine_of(name)
     friction = crane.description.Friction(
         coulomb=40.0, coulomb_offset=3.0, viscous=200.0, viscous_offset=9.0, smoothing=smoothing,
-        stiction=15.0, stribeck=0.4,
+        stiction=15.0, stribeck=0.4, stiction_2=-5.0, stribeck_2=0.7, root=20.0, memory=8.0,
+        memory_speed=0.5, presliding=10.0,
     )  # fmt: skip
     machine = machine.replace(friction=dict.fromkeys(machine.joints, friction))
     dynamics, span, q_a, v_a, a_a = state(machine, 4)

@@ -562,7 +562,7 @@ def test_a_raw_log_s_disagreement_is_told(machine, tmp_path):
     places = [number(line, "lift_boom_rod.x") for line in (lift, tilt)]  # both say the same pin
     np.testing.assert_allclose(places, 0.316, atol=1e-3)
     window = "--from", "2", "--until", "3"
-    done = typed("import", LIFTING, columns, "--out", tmp_path / "part.csv", *window)
+    done = typed("import", LIFTING, "--columns", columns, "--out", tmp_path / "part.csv", *window)
     assert done.stdout.startswith("101 samples of 13 columns")
     assert len(told(machine, tmp_path / "part.csv")) == 2
     columns.write_text(COLUMNS.replace(" - 820", "").replace(" - 1050", ""))
@@ -570,7 +570,7 @@ def test_a_raw_log_s_disagreement_is_told(machine, tmp_path):
                  "--out", tmp_path / "out")  # fmt: skip
     assert done.returncode == 2 and "sensor.X_lift.zero = 0.82" in done.stderr
     columns.write_text(COLUMNS.replace("= U1_V", "= U1").replace("= t_s", "= t"))
-    done = typed("import", LIFTING, columns, "--out", tmp_path / "out.csv")
+    done = typed("import", LIFTING, "--columns", columns, "--out", tmp_path / "out.csv")
     assert done.returncode == 2 and not (tmp_path / "out.csv").exists()
     assert ":2: the log has no 't'; " in done.stderr and ":3: the log has no 'U1', " in done.stderr
     done = typed("plot", LIFTING, "--machine", "patu655", "--out", tmp_path / "out.png")

@@ -84,11 +84,8 @@ def test_a_spring_brings_a_block_to_rest(tmp_path, method):
     assert gap(found) < 30 * tolerance
 
 
-def stick_slip(k, m, speed, coulomb, stiction, stribeck, until):
+def stick_slip(k, m, speed, law, breakaway, until):
     """Phases of a block that a spring pulls at a constant speed: times and states."""
-
-    def law(v):
-        return coulomb + stiction * np.exp(-((v / stribeck) ** 2))
 
     def stops(t, y):
         return y[1]
@@ -96,7 +93,7 @@ def stick_slip(k, m, speed, coulomb, stiction, stribeck, until):
     stops.terminal, stops.direction = True, -1.0
     t, x, phases = 0.0, 0.0, []
     while t < until:
-        slips = (coulomb + stiction + k * x) / (k * speed)
+        slips = (breakaway + k * x) / (k * speed)
         phases.append(("rest", t, slips, x))
         first, jerk = 1e-5, k * speed / m  # the series' next terms are below 1e-25
         path = solve_ivp(
@@ -110,17 +107,35 @@ def stick_slip(k, m, speed, coulomb, stiction, stribeck, until):
     return phases
 
 
-@pytest.mark.parametrize(("method", "tolerance"), [("rk4", 2e-8), ("DOP853", 1e-9)])
-def test_a_stick_slip_oscillator(tmp_path, method, tolerance):
+STRIBECK = {"coulomb": 4.0, "stiction": 2.0, "stribeck": 0.2}
+ALL_TERMS = {  # presliding and memory as at steady speeds
+    "coulomb": 1.0, "presliding": 3.0, "stiction": 1.5, "stribeck": 0.2, "stiction_2": -0.5,
+    "stribeck_2": 0.1, "memory": 1.0, "memory_speed": 0.3, "root": 0.3, "viscous": 0.2,
+}  # fmt: skip
+
+
+def all_terms(v):
+    excess = 1.5 * np.exp(-((v / 0.2) ** 2)) - 0.5 * np.exp(-((v / 0.1) ** 2))
+    return 4.0 + excess + np.exp(-v / 0.3) + 0.3 * np.sqrt(max(v, 0.0)) + 0.2 * v
+
+
+@pytest.mark.parametrize(
+    ("method", "tolerance", "law", "force", "breakaway"),
+    [
+        ("rk4", 2e-8, STRIBECK, lambda v: 4.0 + 2.0 * np.exp(-((v / 0.2) ** 2)), 6.0),
+        ("DOP853", 1e-9, STRIBECK, lambda v: 4.0 + 2.0 * np.exp(-((v / 0.2) ** 2)), 6.0),
+        ("DOP853", 2e-7, ALL_TERMS, all_terms, 6.0),
+    ],
+)
+def test_a_stick_slip_oscillator(tmp_path, method, tolerance, law, force, breakaway):
     """A block that a spring pulls at constant speed, against phases integrated one by one."""
     k, m, speed = 50.0, 2.0, 0.1
-    law = {"coulomb": 4.0, "stiction": 2.0, "stribeck": 0.2}
     machine = block(tmp_path, 0.0, m, **law)
     path = crane.motion.polynomial([[0.0, speed]], 10.0)
     pull = crane.PI(machine, path, {"x": crane.description.PIGains(k, 0.0)}, np.zeros(1))
     found = run(machine, pull, step=1e-3, method=method)
     wanted, rests = np.zeros(len(found.time)), np.zeros(len(found.time), dtype=bool)
-    phases = stick_slip(k, m, speed, **law, until=10.0)
+    phases = stick_slip(k, m, speed, force, breakaway, until=10.0)
     assert len(phases) >= 10
     for kind, begun, ended, what in phases:
         here = (found.time >= begun) & (found.time < ended)

@@ -55,7 +55,7 @@ COMMANDS = {
         "result",
     ),
     "identify": (["mini_forwarder", "mini.csv", "--prior", "0.3", "--out", "result"], "result"),
-    "import": (["log.csv", "columns.txt", "--out", "result.csv"], "result.csv"),
+    "import": (["log.csv", "--columns", "columns.txt", "--out", "result.csv"], "result.csv"),
     "modes": (["four_bar.yaml", "--out", "result"], "result"),
     "plot": (["run.csv", "--out", "result.png"], "result.png"),
     "power": (["rig.yaml", "rig.csv", "--out", "result"], "result"),

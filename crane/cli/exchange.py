@@ -16,9 +16,10 @@ from crane.cli.options import (
     MachineOptions,
     OutputFolder,
     OverwriteOptions,
+    RecordingOptions,
     RequiredOutputFile,
-    TimeOptions,
 )
+from crane.cli.simulate import ExportedController
 from crane.cli.terminal import status
 from crane.common.atomic_output import (
     check_file_is_writable,
@@ -37,7 +38,7 @@ class OutputPath(OutputFolder):
 
 
 _FORMATS = ("urdf+", "urdf", "mjcf", "machine")
-_TARGETS = ("c", "fmu")
+_TARGETS = ("c", "fmu", "ros2_control")
 _SUFFIXES = {".urdf": "urdf+", ".xml": "mjcf", ".mjcf": "mjcf"}
 
 
@@ -84,8 +85,12 @@ def export(
     output: OutputPath,
     to: Annotated[
         str,
-        typer.Option(metavar="TARGET", help="Target: c (C99 sources) or fmu (one file for FMI)."),
+        typer.Option(
+            metavar="TARGET",
+            help="c: C99 sources; fmu: a file for FMI; ros2_control: a transmission.",
+        ),
     ] = "c",
+    controller: ExportedController = None,
     name: Annotated[
         str,
         typer.Option(metavar="NAME", help="Prefix of all names; that of the machine by default."),
@@ -95,14 +100,24 @@ def export(
     """Write a machine as a program for another environment."""
     check_name(to, _TARGETS, f"--to is '{to}'")
     if to == "fmu":
-        refuse_options({"--name": name or None}, "is for --to c, leave it out")
+        others = {"--name": name or None, "--controller": controller}
+        refuse_options(others, "is for --to c, leave it out")
         _write_fmu(options.load(machine), output, fmi)
         return
     refuse_options({"--fmi": fmi != 3 or None}, "is for --to fmu, leave it out")
     check_folder_is_writable(output.out, output.force)
     loaded = options.load(machine)
-    written = crane.export.write_c(loaded, output.out, name=name, overwrite=output.force)
-    print(f"written to {written}: see its header, or cmake -B build -S {written}")
+    if to == "c":
+        law = None if controller is None else crane.control.make_controller(controller, loaded)
+        written = crane.export.write_c(
+            loaded, output.out, controller=law, name=name, overwrite=output.force
+        )
+        print(f"written to {written}: see its header, or cmake -B build -S {written}")
+    else:
+        refuse_options({"--controller": controller}, "is for --to c, leave it out")
+        write = crane.export.write_ros2_control
+        written = write(loaded, output.out, name=name, overwrite=output.force)
+        print(f"written to {written}: a package for colcon build")
 
 
 def _write_fmu(machine: crane.Machine, output: OutputPath, fmi: int) -> None:
@@ -146,13 +161,7 @@ def import_log(
     log: Annotated[
         Path, typer.Argument(metavar="LOG", help="A CSV or npz file of another program.")
     ],
-    columns: Annotated[
-        Path,
-        typer.Argument(
-            metavar="COLUMNS", help="A text file with one line per column of the recording."
-        ),
-    ],
-    window: TimeOptions,
+    reading: RecordingOptions,
     output: RequiredOutputFile,
 ) -> None:
     """Convert a log of another program to a recording."""
@@ -162,6 +171,11 @@ def import_log(
 
     if output.out.suffix.lower() != ".csv":
         raise InputError(f"{output.out}: a recording is written as .csv, name it so")
+    if (columns := reading.columns) is None:
+        raise InputError(
+            "nothing says what the columns of the log are, give a file with a line per column of "
+            "the recording (--columns FILE)"
+        )
     check_file_is_writable(output.out, output.force)
     machine, name = None, read_log_columns(columns)[0].get("machine", "")
     try:
@@ -172,7 +186,7 @@ def import_log(
             CraneWarning,
             stacklevel=2,
         )
-    table = select_time_span(read_sensor_readings(log, machine, columns), window.span, log)
+    table = select_time_span(read_sensor_readings(log, machine, columns), reading.span, log)
     timeseries.write_table(output.out, table)
     print(f"{len(table.values)} samples of {len(table.units)} columns written to {output.out}")
 

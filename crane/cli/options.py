@@ -283,7 +283,9 @@ class RecordingOptions(TimeOptions):
     columns: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="File that assigns the columns of a log, as for crane import."
+            metavar="FILE",
+            help="File with a line per column of the recording: name, unit, and formula in the "
+            "columns of a log of another program.",
         ),
     ] = None
 

@@ -16,6 +16,7 @@ from crane.cli.options import (
     RecordingOptions,
 )
 from crane.cli.parsing import joint_units, parse_configuration
+from crane.cli.simulate import ExportedController
 from crane.cli.terminal import hide_activity_line
 from crane.common.atomic_output import portable_file_name
 from crane.common.errors import InputError, check_name
@@ -51,6 +52,7 @@ def view(
     drive: Annotated[
         bool, typer.Option("--drive", help="A page on which the machine is driven by its levers.")
     ] = False,
+    controller: ExportedController = None,
     no_open: Annotated[bool, typer.Option("--no-open", help="Do not open a browser.")] = False,
 ) -> None:
     """Write a 3D page of a machine or run, and open it.
@@ -68,6 +70,8 @@ def view(
         recording.refuse(text)
     loaded, first = _load(what, machine, options, recording)
     second = None if over is None else recording.read(over, loaded)
+    if not drive:
+        refuse_options({"--controller": controller}, "is for --drive, add it")
     if drive and first is not None:
         raise InputError(f"--drive is for machines, and '{what}' is a run, leave it out")
     if drive:
@@ -77,7 +81,7 @@ def view(
     else:
         page = output.path(_folder(Path(what)) / PAGE)
     if drive:
-        crane.view.drive_page(loaded, page)
+        crane.view.drive_page(loaded, page, controller)
     else:
         crane.report(loaded, first, page, second)
     if first is not None and second is not None:

@@ -4,7 +4,7 @@ import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -54,6 +54,15 @@ ControllerName = Annotated[
         "default the one whose gains the machine file contains, otherwise computed-torque. "
         "If neither --task nor --path is given: with --controller the machine holds the home "
         "configuration; without it, drive forces are zero and valves stay at neutral.",
+    ),
+]
+ExportedController = Annotated[
+    str | None,
+    typer.Option(
+        "--controller",
+        metavar="NAME",
+        help="Controller whose references are the inputs: pi, computed-torque, valve-pd or "
+        "valve-feedforward; by default forces of drives or signals of valves are.",
     ),
 ]
 Duration = Annotated[
@@ -177,8 +186,8 @@ def simulate(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="A recording whose valve signals are replayed, and whose other columns are "
-            "compared with the simulation.",
+            help="A recording whose valve signals are replayed, or with --controller whose "
+            "references are followed; its other columns are compared with the simulation.",
         ),
     ] = None,
     load: Annotated[
@@ -209,10 +218,12 @@ def simulate(
     loaded = loaded.with_external_forces(*map(parse_load, load or ()))
     result: Result
     if inputs is not None:
-        for block in (motion, integration):
+        for block in (replace(motion, controller=None), integration):
             block.refuse("does not go with --inputs, leave it out")
         with _write_stopped_run(output, npz), progress_bar("simulating") as progress:
-            _, result = crane.replay(loaded, inputs, step, progress, reading.columns, reading.span)
+            _, result = crane.replay(
+                loaded, inputs, step, progress, reading.columns, reading.span, motion.controller
+            )
     else:
         reading.refuse("is for --inputs, leave it out")
         control, duration = motion.control(loaded, step)
@@ -258,11 +269,7 @@ def task_control(
     """
     if task is None:
         refuse_options({"--sway": sway}, "changes a reference, name a --task or a --path")
-        if controller is None:
-            return None
-        home = machine.home[machine.closure.active]
-        trajectory = crane.point_to_point(home, home, 1.0)
-        return crane.control.make_controller(controller, machine, trajectory)
+        return None if controller is None else crane.control.make_controller(controller, machine)
     check_name(task, machine.tasks, f"machine '{machine.name}' has no task '{task}'")
     if machine.tasks[task].space == "joystick":
         text = f"does not go with task '{task}', which moves levers, leave it out"

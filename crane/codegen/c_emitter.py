@@ -1,7 +1,8 @@
 """Linked functions in C99: no allocation, no static data, no recursion.
 
-The type `real` and the macro R(x) for constants are defined by what includes the functions:
-double, or float; <tgmath.h> selects the functions of that type.
+The type `real`, double or float, and the macro R(x) for constants are defined by what includes the
+functions. MATH1 and MATH2 call those of that type, because <tgmath.h> needs complex functions that
+C libraries of microcontrollers lack.
 """
 
 import math
@@ -28,6 +29,10 @@ from crane.codegen.symbolic import SymbolicExpression, required_operations
 from crane.codegen.vector_layout import Formula
 
 C_PRELUDE = """\
+#define MATH1(name, x) (sizeof(real) < 8 ? (real)name##f((float)(x)) : (real)name(x))
+#define MATH2(name, x, y) \\
+    (sizeof(real) < 8 ? (real)name##f((float)(x), (float)(y)) : (real)name(x, y))
+
 static inline real maximum_of(real a, real b)
 {
     return a != a ? a : (a >= b ? a : b);
@@ -36,7 +41,6 @@ static inline real maximum_of(real a, real b)
 
 PIECE_LENGTH = 2000  # operations of a C function; compilers need more than linear time
 _INFIX = {"add": "+", "subtract": "-", "multiply": "*", "divide": "/"}
-_FUNCTIONS = {"abs": "fabs", "maximum": "maximum_of"}  # others have the names of C
 _TYPES = {"real": "real", "integer": "int", "truth": "int"}
 _OPERATORS = {"and": "&&", "or": "||"}
 
@@ -147,7 +151,10 @@ def _operation_text(kind: str, words: list[str]) -> str:
     if kind == "dot":
         half = len(words) // 2
         return " + ".join(f"{x} * {y}" for x, y in zip(words[:half], words[half:], strict=True))
-    return f"{_FUNCTIONS.get(kind, kind)}({', '.join(words)})"
+    if kind == "maximum":
+        return f"maximum_of({', '.join(words)})"
+    function = "fabs" if kind == "abs" else kind  # others have the names of C
+    return f"MATH{len(words)}({function}, {', '.join(words)})"
 
 
 def _operand(

@@ -11,6 +11,7 @@ from .fmu_controller import FmuController as FmuController
 from .levers import LeverPhases as LeverPhases
 from .levers import TipVelocity as TipVelocity
 from .levers import joystick as joystick
+from .reference_samples import interpolate_references as interpolate_references
 from .valve_commands import SampledCommand as SampledCommand
 from .valve_commands import ValveCommand as ValveCommand
 from .valve_commands import ValvePD as ValvePD

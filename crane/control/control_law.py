@@ -3,16 +3,19 @@
 import itertools
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from functools import cached_property
+from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.codegen.symbolic import Scalar, subtract_vectors
+from crane.codegen.symbolic import Scalar, subtract_vectors, where_positive
 from crane.common.errors import ClosureError, CraneWarning, InputError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, as_number, as_sample
+from crane.description.sensors import FORCE_UNITS
 from crane.description.specification import PIGains
 from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.external_forces import static_active_forces
@@ -73,11 +76,18 @@ class ControlLaw(OneLineRepr):
         settings: (s,) parameters that can change without a new compilation. All other constants of
             a law become part of the machine code.
         period: Time between calls of `update` [s]; 0 for no calls.
+        reference_units: Names and units of its `references`, for programs that are exported, as
+            those of `settings` and states; empty for numbers as names.
+        setting_units: Names and units of `settings`.
+        state_units: Names and units of the states.
     """
 
     reference: Trajectory | None = None
     period: float = 0.0
     settings: Array = np.zeros(0)
+    reference_units: Mapping[str, str] = MappingProxyType({})
+    setting_units: Mapping[str, str] = MappingProxyType({})
+    state_units: Mapping[str, str] = MappingProxyType({})
 
     def __init__(self, machine: Machine):
         self.machine = machine
@@ -124,6 +134,13 @@ class ControlLaw(OneLineRepr):
     def references(self, times: Array) -> Array:
         """Inputs that depend on time alone, (N, c) at times (N,) [s]; none by default."""
         return np.zeros((len(times), 0))
+
+    def for_machine(self, machine: Machine) -> "ControlLaw":
+        """The same law for another machine with the same joints."""
+        found = copy(self)
+        found.machine = machine
+        vars(found).pop("_dynamics", None)
+        return found
 
     def start(self, q_a: Array) -> Array:
         """See `Controller`."""
@@ -210,6 +227,17 @@ def controller_reference(controller: Controller, machine: Machine) -> Trajectory
     return None if reference is None else add_free_joints(machine, reference)
 
 
+def motion_units(units: Mapping[str, str], order: int) -> dict[str, str]:
+    """Names and units of references: coordinates, by name, and derivatives up to an order."""
+    return {
+        f"reference_{derivative}{name}": unit + per
+        for derivative, per in (("", ""), ("velocity_", "/s"), ("acceleration_", "/s2"))[
+            : order + 1
+        ]
+        for name, unit in units.items()
+    }
+
+
 class PI(ControlLaw):
     """One PI controller per driven joint, equation (7) of the reduced-scale forwarder paper.
 
@@ -262,17 +290,26 @@ class PI(ControlLaw):
             [*(gains[joint].kp for joint in driven), *(gains[joint].ki for joint in driven)],
             dtype=np.float64,
         )
+        units = {joint: machine.unit(joint) for joint in driven}
+        self.reference_units = motion_units(units, 0)
+        self.setting_units = {
+            **{f"{joint}_kp": f"{FORCE_UNITS[unit]}/{unit}" for joint, unit in units.items()},
+            **{f"{joint}_ki": f"{FORCE_UNITS[unit]}/({unit} s)" for joint, unit in units.items()},
+        }
+        self.state_units = {
+            f"error_integral_{joint}": f"{unit} s" for joint, unit in units.items()
+        }
 
     def initial_state(self, inputs: ControllerInputs) -> Sequence[Scalar]:
         """See `ControlLaw`."""
         if self._initial_integral is not None:
             return list(self._initial_integral)
-        holding_forces = np.array(
-            self.select_driven(inputs.inverse([0.0] * len(inputs.q_a), friction=True))
-        )
-        kp, ki = np.array(self._gains(inputs))
-        integral_forces = holding_forces - kp * np.array(self._error(inputs))
-        return list(np.where(ki > 0, integral_forces, 0.0) / np.where(ki > 0, ki, 1.0))
+        forces = self.select_driven(inputs.inverse([0.0] * len(inputs.q_a), friction=True))
+        columns = zip(forces, *self._gains(inputs), self._error(inputs), strict=True)
+        return [
+            where_positive(ki, force - kp * error, 0.0) / where_positive(ki, ki, 1.0)
+            for force, kp, ki, error in columns
+        ]
 
     def references(self, times: Array) -> Array:
         """See `ControlLaw`."""
@@ -313,6 +350,8 @@ class ComputedTorque(ControlLaw):
         super().__init__(machine)
         self.reference: Trajectory = add_free_joints(machine, reference)
         self.settings = np.array([as_number(bandwidth, "the bandwidth", "rad/s", greater_than=0)])
+        self.setting_units = {"bandwidth": "rad/s"}
+        self.reference_units = motion_units({x: machine.unit(x) for x in machine.driven_joints}, 2)
         if not machine.undriven_joints:
             return
         motion = self.reference(np.linspace(0.0, self.reference.duration, 201))

@@ -8,7 +8,7 @@ from crane.control.levers import TipVelocity
 from crane.control.valve_commands import ValveCommand, ValvePD
 from crane.control.valve_feedforward import ValveFeedforward
 from crane.machine.machine import Machine
-from crane.motion.trajectory import Trajectory
+from crane.motion.trajectory import Trajectory, point_to_point
 
 CONTROLLERS: Mapping[str, Callable[[Machine, Trajectory], Controller | ValveCommand]] = {
     "pi": PI,
@@ -27,12 +27,15 @@ def default_controller_name(machine: Machine) -> str:
 
 
 def make_controller(
-    name: str, machine: Machine, reference: Trajectory
+    name: str, machine: Machine, reference: Trajectory | None = None
 ) -> Controller | ValveCommand:
-    """A built-in controller by name.
+    """A built-in controller by name, by default of the home configuration.
 
     Raises:
         InputError: The name is unknown.
     """
     check_name(name, CONTROLLERS, f"controller '{name}' is unknown")
+    if reference is None:
+        home = machine.home[machine.closure.active]
+        reference = point_to_point(home, home, 1.0)
     return CONTROLLERS[name](machine, reference)

@@ -2,6 +2,7 @@
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -13,7 +14,7 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.plausible_ranges import suggested_units_text
 from crane.common.samples import Array, as_number, as_sample
 from crane.common.threads import ThreadLocal
-from crane.control.control_law import ControllerInputs
+from crane.control.control_law import ControllerInputs, motion_units
 from crane.hydraulics.components import Cylinder, Spool, Valve
 from crane.hydraulics.hydraulic_circuit import Hydraulics, PDGains
 from crane.machine.machine import Machine
@@ -47,6 +48,8 @@ class ValveCommand(Protocol):
         is_finished: Whether the command has ended; a run without a given duration ends then.
         channels: Names and units of the references behind the signals, which are recorded.
         clock: Function that returns phases (N,) at times (N,) [s]; None without phases.
+        reference_units: Names and units of its `references`, see `ControlLaw`.
+        setting_units: Names and units of `settings`.
     """
 
     reference: Trajectory | None = None
@@ -59,6 +62,8 @@ class ValveCommand(Protocol):
     is_finished: bool = False
     channels: tuple[tuple[str, str], ...] = ()
     clock: Callable[[Array], Array] | None = None
+    reference_units: Mapping[str, str] = MappingProxyType({})
+    setting_units: Mapping[str, str] = MappingProxyType({})
 
     def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
         """Compute the signals of the next period.
@@ -208,6 +213,10 @@ class ValveSignals(ValveCommand, OneLineRepr):
                 )
         self._columns = np.asfortranarray(np.column_stack(columns))  # read column by column
         self._spool_count = len(circuit.spools)
+        lines = ("pressure_supply", "pressure_tank") if self.has_measured_pressures else ()
+        self.reference_units = {
+            **{f"signal_{name}": "V" for name in circuit.spools}, **dict.fromkeys(lines, "Pa"),
+        }  # fmt: skip
         self.duration = float(self._instants[-1])
 
     def _check_column(self, values: ArrayLike, label: str) -> Array:
@@ -275,6 +284,16 @@ class ValvePD(ValveCommand, OneLineRepr):
             for spool in spools
         ]  # fmt: skip
         self.settings = np.array(settings, dtype=np.float64).T.ravel()
+        units = {name: machine.unit(spool.joint) for name, spool in circuit.spools.items()}
+        self.reference_units = motion_units(units, 1)
+        self.setting_units = {
+            f"{name}_{setting}": text.format(unit)
+            for setting, text in (
+                ("kp", "1/{}"), ("kd", "s/{}"), ("command_overlap", ""), ("command_neutral", "V"),
+                ("command_span", "V"),
+            )
+            for name, unit in units.items()
+        }  # fmt: skip
 
     def references(self, times: Array) -> Array:
         """See `ValveCommand`."""

@@ -69,6 +69,7 @@ class ValveDrive(ControlLaw):
                 )
             self._signal_source = SampledCommand(self._sample_signals, machine, _SAMPLING_PERIOD)
         self.period = self._signal_source.period
+        self.reference_units = self._signal_source.reference_units
         self._active_indices = [machine.active.index(joint) for joint in hydraulics.joints]
         are_motors = [cylinder.motor for cylinder in hydraulics.cylinders.values()]
         self._lower_limits = np.where(are_motors, 0.0, machine.lower[self._active_indices])
@@ -127,12 +128,14 @@ class ValveDrive(ControlLaw):
         # a sampled command has no signal yet, except perhaps those of an earlier run
         signals: Sequence[Scalar] = [spool.neutral for spool in hydraulics.spools.values()]
         if not self.command.period:
-            reference = inputs.reference
+            size = len(self.circuit.constants) + len(self._active_indices)
+            own = inputs._replace(settings=inputs.settings[size:])
             if self._signal_source is not self.command:
-                reference = self.command.references(np.zeros(1))[0].tolist()
-            signals = self.command.signals(
-                inputs._replace(settings=self.command.settings.tolist(), reference=reference)
-            )
+                own = inputs._replace(
+                    settings=self.command.settings.tolist(),
+                    reference=self.command.references(np.zeros(1))[0].tolist(),
+                )
+            signals = self.command.signals(own)
         tank = hydraulics.supply.tank
         if self.command.has_measured_pressures:
             tank = float(np.array(inputs.reference[-1], dtype=np.float64))

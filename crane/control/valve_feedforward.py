@@ -254,6 +254,8 @@ class ValveFeedforward(ValvePD):
         valves = circuit.valves.values()
         lags = [2.0 * x.damping / x.bandwidth if x.bandwidth else 0.0 for x in valves]
         self._damps_sway = damping > 0
+        openings = {f"opening_{name}": "" for name in circuit.spools}
+        self.reference_units = {} if self._damps_sway else {**self.reference_units, **openings}
         count = max(8, int(np.ceil(reference.duration * _KNOTS_PER_SECOND)) + 1)
         self._knot_times = np.linspace(0.0, reference.duration, count)
         q_a, v_a, a_a = reference(self._knot_times)
@@ -264,7 +266,9 @@ class ValveFeedforward(ValvePD):
                 max_flow = valve.c1 * np.sqrt(valve.margin or circuit.supply.pressure)
                 flow = v * circuit.cylinders[joint].area_a
                 direction = np.tanh(flow / (_REVERSAL_SMOOTHING * max_flow))
-                forces[:, i] += law.viscous * v + law.coulomb * direction + law.coulomb_offset
+                forces[:, i] += (
+                    law.viscous * v + law.sliding_force * direction + law.coulomb_offset
+                )
         count = int(np.ceil(reference.duration * _STEPS_PER_SECOND)) + 1
         self._opening_times = np.linspace(0.0, reference.duration, count)
         q, v, _ = (x[:, self._active_indices] for x in reference(self._opening_times))

@@ -31,6 +31,7 @@ VALVE_TYPES = ("orifice", "compensated", "sharing")
 ORIFICE_KEYS = ("c1", "c2", "c3", "c4")
 AREA_KEYS = ("area_a", "area_b")
 BORE_KEYS = ("bore", "rod")
+CYLINDER_SIZE_KEYS = (*AREA_KEYS, *BORE_KEYS, "count")
 _COEFFICIENT = "m3/(s Pa^0.5)"
 
 CURVE = section_schema(

@@ -14,9 +14,11 @@ _RELATIVE_STD_RANGE = 1e-7, 1e6
 # by the last part of the name of a parameter
 _PARAMETERS = {
     **dict.fromkeys(
-        ("coulomb", "coulomb_offset", "stiction", "presliding", "memory"), ("N", "N m")
+        ("coulomb", "coulomb_offset", "stiction", "stiction_2", "presliding", "memory"),
+        ("N", "N m"),
     ),
     **dict.fromkeys(("viscous", "viscous_offset"), ("N s/m", "N m s/rad")),
+    "root": ("N s^0.5/m^0.5", "N m s^0.5/rad^0.5"),
     "m": ("kg", "kg"),
     **dict.fromkeys(("mx", "my", "mz"), ("kg m", "kg m")),
     **dict.fromkeys(("Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz"), ("kg m2", "kg m2")),
@@ -24,7 +26,7 @@ _PARAMETERS = {
     "gas_scale": ("", ""),
 }
 _TERM_VALUES = {  # by the kind of a model term
-    "stiction": [("m/s", "rad/s")] * 9,
+    "stiction": [("m/s", "rad/s")] * 2,
     "presliding": [("m", "rad")],
     "memory": [("s", "s"), ("m/s", "rad/s")],
 }

@@ -14,6 +14,7 @@ from crane.common.samples import Array
 
 AXES = ("world", "frame")
 WRENCH_COMPONENTS = tuple(f"{kind}_{axis}" for kind in ("force", "moment") for axis in "xyz")
+TIP_WRENCH_NAME = "tip"  # of a force at the tip that an exported program or a page gives
 
 
 class FrameMotion(NamedTuple):

@@ -46,11 +46,16 @@ def _check_frames(element: "AnyForceElement") -> None:
 class Friction:
     """Friction of one tree joint, asymmetric Coulomb and viscous.
 
-    tau = (coulomb + stiction e^-(v / stribeck)^2) sign(v) + coulomb_offset
-          + viscous v + viscous_offset |v|,
+    tau = (coulomb + stiction e^-(v / stribeck)^2 + stiction_2 e^-(v / stribeck_2)^2
+           + memory e^-(w / memory_speed)) sign(v) + presliding z + coulomb_offset
+          + viscous v + viscous_offset |v| + root sign(v) |v|^(1/2),
 
-    the joint's drive force that the friction consumes. At rest it is what keeps the joint there,
-    anything from coulomb_offset - (coulomb + stiction) to coulomb_offset + (coulomb + stiction).
+    the joint's drive force that the friction consumes. It depends on the history of the motion by
+    Dahl's deflection z of the contacts, dz = (1 - sign(v) z) dq / presliding_length, and by the
+    speed that the contact remembers, memory_time w' = |v| - w. At steady speeds z is sign(v) and w
+    is |v|: so a simulation takes them, and `Dynamics.inverse` with the step of a motion takes its
+    history. At rest friction is what keeps the joint there, at most `breakaway_force` from
+    coulomb_offset.
     With a smoothing it is a function of v instead, sign(v) = tanh(v / smoothing), and what should
     rest creeps. Without stiction this is equation (5) of the reduced-scale forwarder paper with
     the sign that brakes.
@@ -61,8 +66,16 @@ class Friction:
         viscous: [N s/m] or [N m s/rad].
         viscous_offset: Difference between the two directions [N s/m] or [N m s/rad].
         smoothing: Velocity over which the sign changes [m/s] or [rad/s]; 0: it jumps, and sticks.
-        stiction: By how much friction at rest exceeds Coulomb friction [N] or [N m].
+        stiction: By how much friction at rest exceeds Coulomb friction [N] or [N m]; negative
+            where friction rises from rest.
         stribeck: Velocity over which stiction vanishes [m/s] or [rad/s].
+        stiction_2, stribeck_2: The same over another velocity.
+        root: Mixed lubrication [N (s/m)^(1/2)] or [N m (s/rad)^(1/2)]; as of a velocity of 1e-8.
+        presliding: Coulomb friction that builds up over a distance [N] or [N m].
+        presliding_length: That distance [m] or [rad].
+        memory: By how much friction after a rest exceeds that before it [N] or [N m].
+        memory_time: Time constant of the memory [s].
+        memory_speed: Speed over which the memory fades [m/s] or [rad/s].
     """
 
     coulomb: float = 0.0
@@ -72,21 +85,53 @@ class Friction:
     smoothing: float = 0.0
     stiction: float = 0.0
     stribeck: float = 1e-2
+    stiction_2: float = 0.0
+    stribeck_2: float = 1e-2
+    root: float = 0.0
+    presliding: float = 0.0
+    presliding_length: float = 1e-4
+    memory: float = 0.0
+    memory_time: float = 0.1
+    memory_speed: float = 1e-2
 
     def __post_init__(self) -> None:
-        check_numbers(self, "friction", "coulomb", "viscous", "smoothing", "stiction", "stribeck")
-        if self.stribeck == 0:
-            raise InputError("stribeck of friction is 0, give the velocity where stiction ends")
+        scales = ("stribeck", "stribeck_2", "presliding_length", "memory_time", "memory_speed")
+        check_numbers(
+            self, "friction", "coulomb", "viscous", "smoothing", "presliding", *scales,
+            nonzero_fields=scales,
+        )  # fmt: skip
+        if self.breakaway_force < 0:
+            raise InputError(
+                f"friction at rest is {self.breakaway_force:g}, the sum of coulomb, presliding, "
+                "stiction and memory must not be negative"
+            )
 
     @property
     def breakaway_force(self) -> float:
         """How much friction at rest can differ from `coulomb_offset` [N] or [N m]."""
-        return self.coulomb + self.stiction
+        return self.sliding_force + self.stiction + self.stiction_2 + self.memory
+
+    @property
+    def sliding_force(self) -> float:
+        """Coulomb friction that is built up [N] or [N m]."""
+        return self.coulomb + self.presliding
+
+    @property
+    def has_history(self) -> bool:
+        """Whether it depends on the history of the motion."""
+        return bool(self.presliding or self.memory)
+
+    @property
+    def driving_kind(self) -> str:
+        """Kind whose offset is larger than its mean, which drives the joint one way, else ""."""
+        if abs(self.coulomb_offset) > self.sliding_force:
+            return "coulomb"
+        return "viscous" if abs(self.viscous_offset) > self.viscous else ""
 
     @property
     def is_driving(self) -> bool:
         """Whether it drives the joint in one direction: an offset is larger than its mean."""
-        return abs(self.coulomb_offset) > self.coulomb or abs(self.viscous_offset) > self.viscous
+        return bool(self.driving_kind)
 
     @property
     def has_stick_slip(self) -> bool:

@@ -1,6 +1,7 @@
 """Keys of a machine file: the one description that its reader, writer, tables and schema use."""
 
 from crane.description.circuit_schema import HYDRAULICS
+from crane.description.drawing_schema import DRAWING
 from crane.description.external_force_schema import CONTACT, CUTTER, GROUND, LOAD, SOIL, TASK_LOAD
 from crane.description.force_elements import EndStop, ForceElement, Friction, GasSpring, Rope
 from crane.description.key_types import (
@@ -97,10 +98,37 @@ FRICTION = section_schema(
             "m/s", "rad/s", minimum=0.0,
         ),
         "stiction": NumberKey(
-            "$F_S$, excess of the breakaway force over `coulomb`", "N", "N m", minimum=0.0
+            "$F_S$, excess of the breakaway force over `coulomb`; negative where friction rises "
+            "from rest", "N", "N m",
         ),
         "stribeck": NumberKey(
             "$v_{St}$, Stribeck velocity, over which $F_S$ decays", "m/s", "rad/s", minimum=0.0,
+            zero_error="'{key}' of {title} is 0, give a velocity",
+        ),
+        "stiction_2": NumberKey("a second excess, over another velocity", "N", "N m"),
+        "stribeck_2": NumberKey(
+            "its Stribeck velocity", "m/s", "rad/s", minimum=0.0,
+            zero_error="'{key}' of {title} is 0, give a velocity",
+        ),
+        "root": NumberKey(
+            "$F_R$, mixed lubrication, times the root of the speed", "N s^0.5/m^0.5",
+            "N m s^0.5/rad^0.5",
+        ),
+        "presliding": NumberKey(
+            "$F_P$, Coulomb friction that builds up over a distance (Dahl)", "N", "N m",
+            minimum=0.0,
+        ),
+        "presliding_length": NumberKey(
+            "$l_P$, that distance", "m", "rad", minimum=0.0,
+            zero_error="'{key}' of {title} is 0, give a distance",
+        ),
+        "memory": NumberKey("$F_M$, friction that is higher after a rest", "N", "N m"),
+        "memory_time": NumberKey(
+            "$T_M$, time constant of the memory", "s", minimum=0.0,
+            zero_error="'{key}' of {title} is 0, give a time",
+        ),
+        "memory_speed": NumberKey(
+            "$v_M$, speed over which it fades", "m/s", "rad/s", minimum=0.0,
             zero_error="'{key}' of {title} is 0, give a velocity",
         ),
         "drives": FlagKey(
@@ -332,7 +360,13 @@ MACHINE = section_schema(
             "acceleration of gravity, in the axes of the world; 0, 0, 0 for none", "m/s2", size=3,
             default=STANDARD_GRAVITY, default_text="0, 0, -9.81, or that of the files of `chains`",
         ),
-        "chains": ListKey("open sub-chains", SectionKey(section=CHAIN), default=REQUIRED),
+        "drawing": SectionKey(
+            "the machine by its pins, instead of chains or before them", section=DRAWING
+        ),
+        "chains": ListKey(
+            "open sub-chains", SectionKey(section=CHAIN),
+            default_text="required without `drawing`",
+        ),
         "floating": NameListKey(
             "degrees of freedom of the root of the first chain",
             choices=FLOATING_FREEDOMS, default_text="none: fixed to the world",

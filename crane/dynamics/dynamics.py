@@ -67,9 +67,17 @@ class Dynamics(QuantityEvaluator):
         return self.tree_dynamics.inertial_parameters
 
     def inverse(
-        self, q_a: ArrayLike, v_a: ArrayLike, a_a: ArrayLike, friction: bool = False
+        self,
+        q_a: ArrayLike,
+        v_a: ArrayLike,
+        a_a: ArrayLike,
+        friction: bool = False,
+        step: float | None = None,
     ) -> Array:
         """Inverse dynamics: tau_A = gamma^T (rnea(q, v, a) - f) [+ friction].
+
+        Friction with presliding or memory depends on the history of the motion: with a step the
+        samples are those of a motion, which begins without history, else each is of a steady one.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
@@ -77,11 +85,27 @@ class Dynamics(QuantityEvaluator):
             a_a: The same shape [m/s2], [rad/s2].
             friction: Whether the drives overcome friction. At rest, under stiction, it opposes the
                 acceleration of the joint; without acceleration it is the friction offset.
+            step: Step of the samples (N, n) of a motion [s], with friction; where its velocity is
+                exactly zero, only presliding and the offset act.
 
         Returns:
             tau_A, (n,) or (N, n) [N], [N m].
+
+        Raises:
+            InputError: The step is not positive, or given for a single sample or no friction.
         """
-        return self._evaluate("inverse with friction" if friction else "inverse", q_a, v_a, a_a)
+        if step is None:
+            quantity = "inverse with friction" if friction else "inverse"
+            return self._evaluate(quantity, q_a, v_a, a_a)
+        as_number(step, "step", "s", greater_than=0)
+        if not friction or np.ndim(v_a) != 2:
+            raise InputError("a step is that of a motion (N, n) with friction, leave it out")
+        tau, closure = self._evaluate("inverse", q_a, v_a, a_a), self.machine.closure
+        q = closure.solve(q_a)
+        gamma = closure.gamma(q)
+        v = (gamma @ np.asarray(v_a)[:, :, None])[:, :, 0]
+        force = self.forces.friction_along_motion(q, v, step)
+        return tau + np.einsum("kij,ki->kj", gamma, force)
 
     def forward(
         self, q_a: ArrayLike, v_a: ArrayLike, tau_a: ArrayLike, friction: bool = False

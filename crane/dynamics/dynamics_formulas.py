@@ -33,7 +33,7 @@ from crane.dynamics.cluster_recursion import (
     joint_accelerations,
 )
 from crane.dynamics.inertial_force_formulas import InertialForceFormulas
-from crane.dynamics.joint_force_formulas import friction_sign
+from crane.dynamics.joint_force_formulas import breakaway_force, friction_sign
 from crane.dynamics.joint_forces import REST_ACCELERATION, REST_VELOCITY, SLIP_INDEX
 
 # degrees of freedom up to which factorizing M_A takes fewer operations than recursion
@@ -194,7 +194,7 @@ class DynamicsFormulas(InertialForceFormulas):
             law, rate = self._joint_laws[i], joint_velocities[i + 1]
             sign = friction_sign(law, self.joint_velocities[i + 1], True, self._use_modes)
             negative_sign = where_positive(-REST_ACCELERATION - rate, -1.0, 0.0)
-            breakaway = (law[0] + law[5]) * (
+            breakaway = breakaway_force(law) * (
                 where_positive(rate - REST_ACCELERATION, 1.0, negative_sign) - sign
             )
             joint_forces[i + 1] = joint_forces[i + 1] + where_positive(
@@ -254,7 +254,7 @@ class DynamicsFormulas(InertialForceFormulas):
     @property
     def breakaway_forces(self) -> Vector:
         """(k,) largest friction of the stick-slip joints at rest, relative to its offset."""
-        return [self._joint_laws[i][0] + self._joint_laws[i][5] for i in self._stick_slip_columns]
+        return [breakaway_force(self._joint_laws[i]) for i in self._stick_slip_columns]
 
     def accelerations_with_stick_slip(
         self, tau: Sequence[Scalar], with_joints_at_rest: bool

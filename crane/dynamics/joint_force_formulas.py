@@ -26,8 +26,10 @@ from crane.codegen.symbolic import (
 from crane.dynamics.formula_structure import BODY_SIZE, DISTANCE_SIZE, FormulaStructure
 from crane.dynamics.frame_jacobians import MIN_LENGTH
 from crane.dynamics.joint_forces import (
+    BREAKAWAY_INDICES,
     END_STOP_INDEX,
     PARAMETER_COUNT,
+    ROOT_VELOCITY,
     SHARPNESS_INDEX,
     SLIP_INDEX,
 )
@@ -58,7 +60,7 @@ def friction_sign(law: Vector, velocity: Scalar, has_stick_slip: bool, use_modes
     """Sign of a joint's friction: of the slip for stick-slip joints, else smoothed.
 
     Args:
-        law: (22,), see `JointForces.table`.
+        law: (27,), see `JointForces.table`.
         velocity: Velocity.
         has_stick_slip: Whether the joint has stick-slip friction.
         use_modes: Whether the stick-slip mode in `law` gives the sign instead of the velocity.
@@ -69,6 +71,36 @@ def friction_sign(law: Vector, velocity: Scalar, has_stick_slip: bool, use_modes
     return apply_function("tanh", law[SHARPNESS_INDEX] * velocity)
 
 
+def breakaway_force(law: Vector) -> Scalar:
+    """Largest friction at rest relative to its offset, of a law (27,)."""
+    return sum_scalars(law[i] for i in BREAKAWAY_INDICES)
+
+
+def _steady_friction(
+    law: Vector, velocity: Scalar, has_stick_slip: bool, use_modes: bool
+) -> Scalar:
+    """Friction at a steady velocity; arguments as for `evaluate_force_law`."""
+    (
+        coulomb, coulomb_offset, viscous, viscous_offset, _, stiction, stribeck,
+        stiction_2, stribeck_2, memory, memory_speed, root,
+    ) = law[:SLIP_INDEX]  # fmt: skip
+    friction = viscous * velocity + coulomb_offset
+    if root != 0.0:
+        speed = maximum(apply_function("abs", velocity), ROOT_VELOCITY)
+        friction = friction + root * velocity / apply_function("sqrt", speed)
+    if not any(x != 0.0 for x in (coulomb, viscous_offset, stiction, stiction_2, memory)):
+        return friction
+    for excess, rate in ((stiction, stribeck), (stiction_2, stribeck_2)):
+        if excess != 0.0:
+            slow = rate * velocity
+            coulomb = coulomb + excess * apply_function("exp", -1.0 * (slow * slow))
+    if memory != 0.0:
+        speed = apply_function("abs", memory_speed * velocity)
+        coulomb = coulomb + memory * apply_function("exp", -1.0 * speed)
+    sign = friction_sign(law, velocity, has_stick_slip, use_modes)
+    return friction + (coulomb + viscous_offset * velocity) * sign
+
+
 def evaluate_force_law(
     law: Vector, q: Scalar, velocity: Scalar, has_stick_slip: bool, use_modes: bool
 ) -> ForceLawValues:
@@ -77,24 +109,17 @@ def evaluate_force_law(
     `JointForces` has the same law in numpy, on purpose: each checks the other.
 
     Args:
-        law: (22,), see `JointForces.table`.
+        law: (27,), see `JointForces.table`.
         q: Position.
         velocity: Velocity.
         has_stick_slip: See `friction_sign`.
         use_modes: See `friction_sign`.
     """
     (
-        coulomb, coulomb_offset, viscous, viscous_offset, _, stiction, stribeck,
-        _, _, _, stiffness, damping, constant, energy_offset, stop, stop_damping, lower, upper,
+        stiffness, damping, constant, energy_offset, stop, stop_damping, lower, upper,
         gas, gas_area_per_volume, gas_rest_position, gas_exponent,
-    ) = law  # fmt: skip
-    friction = viscous * velocity + coulomb_offset
-    if coulomb != 0.0 or viscous_offset != 0.0 or stiction != 0.0:
-        sign = friction_sign(law, velocity, has_stick_slip, use_modes)
-        if stiction != 0.0:
-            slow = stribeck * velocity
-            coulomb = coulomb + stiction * apply_function("exp", -1.0 * (slow * slow))
-        friction = friction + (coulomb + viscous_offset * velocity) * sign
+    ) = law[SLIP_INDEX + 3 :]  # fmt: skip
+    friction = _steady_friction(law, velocity, has_stick_slip, use_modes)
     force = constant - stiffness * q - damping * velocity
     force_derivative = -1.0 * stiffness
     stored_energy = 0.5 * stiffness * q * q - constant * q + energy_offset

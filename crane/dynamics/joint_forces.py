@@ -11,16 +11,21 @@ import numpy as np
 from crane.common.samples import Array
 from crane.description.force_elements import ForceElement, Friction, GasSpring, Rope
 from crane.dynamics.frame_jacobians import FrameDistances, FramePair
+from crane.dynamics.friction_history import dahl_deflections, remembered_speeds
 from crane.machine.machine import Machine
 
 LAW_PARAMETER_NAMES = (
     "coulomb", "coulomb_offset", "viscous", "viscous_offset", "sharpness", "stiction", "stribeck",
+    "stiction_2", "stribeck_2", "memory", "memory_speed", "root",
     "slip_sign", "is_held", "inverse_velocity",
     "stiffness", "damping", "constant", "energy_offset",
     "stop_stiffness", "stop_damping", "lower_limit", "upper_limit",
     "gas_force", "gas_area_per_volume", "gas_rest_position", "gas_exponent",
 )  # fmt: skip
 PARAMETER_COUNT = len(LAW_PARAMETER_NAMES)  # values of a law, see `JointForces.table`
+BREAKAWAY_INDICES = [
+    LAW_PARAMETER_NAMES.index(name) for name in ("coulomb", "stiction", "stiction_2", "memory")
+]
 SHARPNESS_INDEX = LAW_PARAMETER_NAMES.index("sharpness")
 SLIP_INDEX = LAW_PARAMETER_NAMES.index("slip_sign")  # first of the stick-slip mode
 END_STOP_INDEX = LAW_PARAMETER_NAMES.index("stop_stiffness")  # first of the end stop
@@ -35,6 +40,7 @@ MIN_COULOMB_FRICTION = 1e-6
 REST_VELOCITY = 5e-10  # scaled velocity that counts as rest
 REST_ACCELERATION = 1e-9  # [rad/s^2], [m/s^2] acceleration that counts as rest
 _UNSMOOTHED_SHARPNESS = 1e300  # sharpness of a discontinuous sign
+ROOT_VELOCITY = 1e-8  # [rad/s], [m/s] below which the root of the speed is a line
 
 
 class JointForces:
@@ -57,18 +63,25 @@ class JointForces:
         circuit_friction: (nv,) current circuit friction [N], [N m]; see `set_circuit_friction`.
         moving_factor: 0 where friction holds the whole machine at rest, else 1; see
             `set_stick_slip_modes`.
-        table: (nv + m, 22) per joint, then per distance: Coulomb friction, its offset, viscous
-            friction, its offset, one over the smoothing velocity, stiction, one over the Stribeck
-            velocity; the stick-slip mode: sign of the slip or share of the limit at rest, whether
-            it is held, one over a velocity of the machine (`set_stick_slip_modes`); stiffness,
-            damping, constant force, energy of the spring at q = 0; stiffness and damping of the
-            end stops, lower and upper limit; force of a gas spring at rest, its area over its
-            volume there, rest position, exponent. A rope is an end stop.
+        table: (nv + m, 27) per joint, then per distance: Coulomb friction with that of presliding,
+            its offset, viscous friction, its offset, one over the smoothing velocity; two
+            stictions, each with one over its Stribeck velocity; memory and one over its speed;
+            factor of the root of the speed; the stick-slip mode: sign of the slip or share of the
+            limit at rest, whether it is held, one over a velocity of the machine
+            (`set_stick_slip_modes`); stiffness, damping, constant force, energy of the spring at
+            q = 0; stiffness and damping of the end stops, lower and upper limit; force of a gas
+            spring at rest, its area over its volume there, rest position, exponent. A rope is an
+            end stop.
     """
 
     def __init__(self, machine: Machine):
         rows, pairs = _table_rows(machine)
         self._joint_count, self.lengths = machine.model.nv, FrameDistances(machine, pairs)
+        self._laws_with_history = {
+            machine.column(joint): law
+            for joint, law in machine.friction.items()
+            if law.has_history
+        }
         law_table = self.table = np.zeros((self._joint_count + len(pairs), PARAMETER_COUNT))
         self.stick_slip_columns, self.moving_factor = find_stick_slip_columns(machine), 1.0
         self.circuit_friction_columns, self.circuit_friction = (
@@ -82,14 +95,19 @@ class JointForces:
             only_circuit_friction = (
                 column in self.stick_slip_columns and not friction.has_stick_slip
             )
-            law_table[column, :7] = (
-                MIN_COULOMB_FRICTION if only_circuit_friction else friction.coulomb,
+            law_table[column, :SLIP_INDEX] = (
+                MIN_COULOMB_FRICTION if only_circuit_friction else friction.sliding_force,
                 friction.coulomb_offset,
                 friction.viscous,
                 friction.viscous_offset,
                 1.0 / friction.smoothing if friction.smoothing else _UNSMOOTHED_SHARPNESS,
                 friction.stiction,
                 1.0 / friction.stribeck,
+                friction.stiction_2,
+                1.0 / friction.stribeck_2,
+                friction.memory,
+                1.0 / friction.memory_speed,
+                friction.root,
             )
         for stop in machine.end_stops:
             i = machine.column(stop.joint)
@@ -144,8 +162,7 @@ class JointForces:
     def _joint_breakaway(self) -> Array:
         """The same without circuit friction."""
         law = self.table[list(self.stick_slip_columns)]
-        columns = [LAW_PARAMETER_NAMES.index(name) for name in ("coulomb", "stiction")]
-        return np.asarray(law[:, columns].sum(axis=1))
+        return np.asarray(law[:, BREAKAWAY_INDICES].sum(axis=1))
 
     def friction_at_rest(self, limit_share: Array) -> Array:
         """(k,) friction of stick-slip joints at rest, from shares (k,) of its limit."""
@@ -182,34 +199,61 @@ class JointForces:
         self.circuit_friction[list(self.circuit_friction_columns)] = circuit_friction
 
     def friction_forces(self, v: Array, use_modes: bool = False) -> Array:
-        """Drive force that overcomes friction at every joint.
+        """Drive force that overcomes friction at every joint at steady speeds.
 
-        tau_F = (F_C + F_S e^-(v / v_S)^2) s + D_C + F_V v + D_V v s with s = tanh(v / smoothing)
-        or sign(v): equation (5) of the reduced-scale forwarder paper with the sign that brakes,
-        and stiction.
+        tau_F = (F_C + sum_i F_Si e^-(v / v_Si)^2 + F_M e^-|v / v_M|) s + D_C + F_V v + D_V v s
+        + F_R v / |v|^(1/2) with s = tanh(v / smoothing) or sign(v): equation (5) of the
+        reduced-scale forwarder paper with the sign that brakes, see `Friction`.
 
         Args:
-            v: (nv,) [m/s], [rad/s].
+            v: (nv,) or (N, nv) [m/s], [rad/s]; one sample with modes.
             use_modes: Whether s of the stick-slip joints comes from `set_stick_slip_modes`, and
                 F_C includes circuit friction.
 
         Returns:
-            (nv,) [N], [N m].
+            (nv,) or (N, nv) [N], [N m].
         """
-        coulomb, coulomb_offset, viscous, viscous_offset, sharpness, stiction, stribeck = (
-            self.table[: self._joint_count].T[:7]
-        )
+        (
+            coulomb, coulomb_offset, viscous, viscous_offset, sharpness, stiction, stribeck,
+            stiction_2, stribeck_2, memory, memory_speed, root,
+        ) = self.table[: self._joint_count].T[:SLIP_INDEX]  # fmt: skip
         sign = np.tanh(v * sharpness)
         if use_modes:
             stick_slip = list(self.stick_slip_columns)
             sign[stick_slip] = self.table[stick_slip, SLIP_INDEX]
             coulomb = coulomb + self.circuit_friction
-        stick_slip_columns = stiction * np.exp(-((v * stribeck) ** 2))
+        slow = stiction * np.exp(-((v * stribeck) ** 2))
+        slow += stiction_2 * np.exp(-((v * stribeck_2) ** 2))
+        slow += memory * np.exp(-np.abs(v * memory_speed))
         return (
-            (coulomb + stick_slip_columns) * sign
+            (coulomb + slow) * sign
             + coulomb_offset
             + (viscous + viscous_offset * sign) * v
+            + root * root_speed(v)
         )
+
+    def friction_along_motion(self, q: Array, v: Array, step: float) -> Array:
+        """Drive force that overcomes friction along a motion, which begins without history.
+
+        In place of the steady values of `friction_forces` it has those of the history,
+        F_P z + F_M e^-(w / v_M) s, see `Friction`.
+
+        Args:
+            q: (N, nq) [m], [rad].
+            v: (N, nv) [m/s], [rad/s].
+            step: Step of the samples [s].
+
+        Returns:
+            (N, nv) [N], [N m].
+        """
+        force = self.friction_forces(v)
+        for i, law in self._laws_with_history.items():
+            sign = np.tanh(v[:, i] * self.table[i, SHARPNESS_INDEX])
+            w, _ = remembered_speeds(v[:, i], step, law.memory_time)
+            remembered, steady = np.exp(-np.stack([w, np.abs(v[:, i])]) / law.memory_speed)
+            z = dahl_deflections(q[:, i], law.presliding_length)
+            force[:, i] += law.memory * (remembered - steady) * sign + law.presliding * (z - sign)
+        return force
 
     def breakaway_forces(self, v: Array, a: Array) -> Array:
         """Breakaway friction of stick-slip joints that start to move from rest.
@@ -328,6 +372,11 @@ class JointForces:
             + self._energy_offset.sum()
             + 0.5 * self._stop_stiffness @ depth**2
         )
+
+
+def root_speed(v: Array) -> Array:
+    """Root of the speed with the sign of the velocity, a line below `ROOT_VELOCITY`."""
+    return v / np.sqrt(np.maximum(np.abs(v), ROOT_VELOCITY))
 
 
 def find_stick_slip_columns(machine: Machine) -> tuple[int, ...]:

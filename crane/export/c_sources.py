@@ -15,15 +15,18 @@ from crane.codegen.symbolic import SymbolicExpression, required_operations
 from crane.codegen.vector_layout import Formula
 from crane.common.atomic_output import check_folder_is_writable, replace_folder
 from crane.common.samples import Array
-from crane.export.instance_program import DYNAMICS_ROUTINES, InstanceProgram
+from crane.control.control_law import Controller
+from crane.control.valve_commands import ValveCommand
+from crane.export.instance_program import InstanceProgram
 from crane.export.instance_routines import STATUS_TEXTS
+from crane.export.kinematics_program import KinematicsProgram
 from crane.export.recorded_values import random_vectors, recorded_motion
 from crane.formats.machine_loading import load
 from crane.machine.machine import Machine
 
 _ARRAYS = (
     "q", "v_a", "contacts", "tau", "friction", "friction_at_rest", "a", "cursor", "lengths",
-    "bounds", "tolerances",
+    "bounds", "tolerances", "history",
 )  # fmt: skip
 _PARAMETERS = ("geometry", "dynamics", "settings")
 _TEMPLATES = (
@@ -32,6 +35,8 @@ _TEMPLATES = (
 _TEXTS = {
     "initialize": "Close the loops from the active coordinates in q, the others as first guess,\n"
     "and start at rest; pressures hold the machine, joints with stiction stick or slip.",
+    "update_modes": "After an event, or a change of parameters during a motion: find which joints "
+    "stick.",
     "advance": "Integrate over `step` with controlled errors. The inputs go linearly from those\n"
     "of the last call to those that are set now.",
     "advance_fixed": "One step of the classical Runge-Kutta method of length `step`. Joints begin "
@@ -40,7 +45,6 @@ _TEXTS = {
     "derivatives": "Derivatives of the state, from `q` on, at the state and inputs.",
     "event_indicators": "Quantities whose change of sign is an event: the margin of stick-slip "
     "transitions,\nthen distances of end stops, contacts, voids.",
-    "update_modes": "Which joints stick or slip at the state; call it after an event.",
     "directional_derivatives": "Derivatives of `derivatives` and the outputs along a direction "
     "(state, inputs).",
     "close_loops": "Newton's method in place: q (nq) closed at its active coordinates, the others "
@@ -52,6 +56,9 @@ _TEXTS = {
     "inverse_dynamics_with_friction": "Active forces (n) at accelerations x (n).",
     "forward_dynamics": "Accelerations (n) under active forces x (n), without friction.",
     "forward_dynamics_with_friction": "Accelerations (n) under active forces x (n).",
+    "set_payload": "Hang a payload (10) on the tip: mass, centre of mass (3) and inertia about it "
+    "(xx,\nxy, xz, yy, yz, zz), in the frame of the tip; it replaces the last one. The body of the"
+    "\ntip without it is `unladen_`.",
     "mass_matrix": "(n, n); v_a and x are not used, as for gravity and energy.",
     "bias": "Forces (n) of inertia, gravity and springs at a_a = 0.",
     "gravity": "Active forces (n) that hold the machine.",
@@ -69,7 +76,12 @@ def c_identifier(name: str) -> str:
 
 
 def write_c(
-    machine: Machine | str | Path, folder: str | Path, *, name: str = "", overwrite: bool = True
+    machine: Machine | str | Path,
+    folder: str | Path,
+    *,
+    controller: Controller | ValveCommand | None = None,
+    name: str = "",
+    overwrite: bool = True,
 ) -> Path:
     """Write a machine as C99 sources, with a self-test, examples and a CMakeLists.txt.
 
@@ -80,6 +92,7 @@ def write_c(
     Args:
         machine: The machine, or what `crane.load` takes.
         folder: Folder of the files.
+        controller: See `InstanceProgram`; the inputs are forces or valve signals without it.
         name: Prefix of all public names; that of the machine by default.
         overwrite: Whether files of the same names are replaced.
 
@@ -92,22 +105,27 @@ def write_c(
     """
     check_folder_is_writable(Path(folder), overwrite)
     loaded = machine if isinstance(machine, Machine) else load(machine)
-    texts = CSources(InstanceProgram(loaded), name).files()
+    texts = CSources(InstanceProgram(loaded, controller=controller), name).files()
+    return write_texts(folder, texts, overwrite)
+
+
+def write_texts(folder: str | Path, texts: Mapping[str, str], overwrite: bool) -> Path:
+    """Write files of a folder by name."""
     with replace_folder(folder, overwrite) as output_folder:
         for file, text in texts.items():
             (output_folder / file).write_text(text, encoding="utf-8")
     return Path(folder)
 
 
-class CSources:
-    """The C sources of a machine.
+class FunctionSources:
+    """Header and functions of a machine in C.
 
     Args:
         program: The machine as a program.
         name: Prefix of all public names; that of the machine by default.
     """
 
-    def __init__(self, program: InstanceProgram, name: str = ""):
+    def __init__(self, program: InstanceProgram | KinematicsProgram, name: str = ""):
         self._program, self.name = program, c_identifier(name or program.machine.name)
         self._values = [
             _number(x) if x == y else f"sizeof({self.name}_real) < 8 ? {_number(y)} : {_number(x)}"
@@ -115,31 +133,20 @@ class CSources:
         ]
         self._loads = instance_loads(program)
 
-    def files(self) -> dict[str, str]:
-        """Texts of all files by name."""
-        name = self.name
-        found = {
-            f"{name}.h": self.header(),
-            f"{name}.c": self.source(),
-            f"{name}_test.c": self.test(),
-        }
-        for template in _TEMPLATES:
-            found[template.replace("machine", name)] = self.fill(read_template(template))
-        return found
-
-    def fill(self, text: str, further: Mapping[str, str] = MappingProxyType({})) -> str:
-        """A template with the values of the machine in place of @VALUE@."""
+    def fill(self, template: str, further: Mapping[str, str] = MappingProxyType({})) -> str:
+        """The text of a template with the values of the machine in place of @VALUE@."""
+        text = (files("crane.export") / "templates" / f"{template}.template").read_text("utf-8")
         machine, inputs = self._program.machine, _inputs_of(self._program)
         values = {
             "NAME": self.name, "UPPER": self.name.upper(), "MACHINE": machine.name,
             "VERSION": crane.__version__, "NQ": str(machine.model.nv),
             "N": str(len(machine.active)), "INPUT_COUNT": str(len(inputs)),
-            "FIRST_INPUT": self._members()[inputs[0]] if inputs else "time",
-            "OUTPUTS": str(sum(self._program.chart.output_layout.parts.values())), **further,
+            "FIRST_INPUT": self.members()[inputs[0]] if inputs else "time",
+            "OUTPUTS": str(self._program.output_count), **further,
         }  # fmt: skip
         return re.sub(r"@([A-Z_]+)@", lambda match: values[match[1]], text)
 
-    def _members(self) -> dict[int, str]:
+    def members(self) -> dict[int, str]:
         """Member of the struct for each element of an instance."""
         found: dict[int, str] = {}
         taken: set[str] = {*_ARRAYS}
@@ -158,7 +165,7 @@ class CSources:
 
     def _struct_lines(self) -> Iterator[tuple[str, str]]:
         """Declaration of each member, and the initial values."""
-        members, layout = self._members(), self._program.layout
+        members, layout = self.members(), self._program.layout
         unused: list[int] = []
 
         def padding() -> Iterator[tuple[str, str]]:
@@ -202,7 +209,7 @@ class CSources:
             "MEMBERS": _join([line for line, _ in self._struct_lines()]),
             "PROTOTYPES": "\n".join(prototypes),
         }
-        return self.fill(read_template("machine.h"), values)
+        return self.fill("machine.h", values)
 
     def _prototype(self, entry: str, linked: LinkedFunction) -> str:
         real, parameters = f"{self.name}_real", c_parameters(linked).replace("real *", "@*")
@@ -223,30 +230,61 @@ class CSources:
             "DEFAULTS": _join([f"{value}," for _, value in self._struct_lines()]),
             "WRAPPERS": "\n".join(wrappers),
         }
-        return self.fill(read_template("machine.c"), values)
+        return self.fill("machine.c", values)
+
+
+class CSources(FunctionSources):
+    """The C sources of a machine.
+
+    Args:
+        program: The machine as a program.
+        name: Prefix of all public names; that of the machine by default.
+    """
+
+    def __init__(self, program: InstanceProgram, name: str = ""):
+        super().__init__(program, name)
+        self._instance_program = program
+
+    def files(self) -> dict[str, str]:
+        """Texts of all files by name."""
+        name = self.name
+        found = {
+            f"{name}.h": self.header(),
+            f"{name}.c": self.source(),
+            f"{name}_test.c": self.test(),
+        }
+        for template in _TEMPLATES:
+            found[template.replace("machine", name)] = self.fill(template)
+        return found
 
     def test(self) -> str:
         """A program that compares the functions with recorded values of crane."""
-        program, name = self._program, self.name
-        (vectors, scales), motion = random_vectors(program), recorded_motion(program)
-        sizes = {key: rows[0].size for key, rows in vectors.items()}
-        checks = []
-        for key in (x for x in vectors if x in DYNAMICS_ROUTINES):
-            scale = _number(scales[key])
-            arguments = f'"{key}", found, {key}[i], {sizes[key]}, {scale}'
+        program, name = self._instance_program, self.name
+        vectors, motion = random_vectors(program), recorded_motion(program)
+        sizes = {key: rows[0].size for key, rows in vectors.values.items()}
+        checks, bounds = [], {}
+        for key, rows in vectors.values.items():
+            # rounding errors of n operations grow as sqrt(n) where they are independent
+            growth = np.sqrt(_costs(program.entries[key])[0])
+            bounds[f"bound_of_{key}"] = growth * vectors.changes[key]
+            scale = _number(float(np.abs(rows).max()) or 1.0)
+            arguments = f'"{key}", found, {key}[i], {sizes[key]}, {scale}, bound_of_{key}[i][0]'
             checks += [f"{name}_{key}(&m, q, v, x, found);", f"compare({arguments});"]
         inputs = _inputs_of(program)
         set_inputs = f"for (j = 0; j < {len(inputs)}; ++j)\n            " + (
-            f"(&m.{self._members()[inputs[0]]})[j] = ({name}_real)inputs[i][j];" if inputs else ";"
+            f"(&m.{self.members()[inputs[0]]})[j] = ({name}_real)inputs[i][j];" if inputs else ";"
         )
-        tables = {**vectors, "inputs": motion.inputs, "motion": motion.q}
+        tables = {
+            **vectors.states, **vectors.values, **bounds, "inputs": motion.inputs,
+            "motion": motion.q,
+        }  # fmt: skip
         values = {
             "TABLES": "\n".join(_table(key, np.array(rows)) for key, rows in tables.items()),
-            "STATES": str(len(vectors["second"])), "STEPS": str(len(motion.q)),
+            "STATES": str(len(vectors.states["second"])), "STEPS": str(len(motion.q)),
             "STEP": repr(motion.step), "LARGEST": str(max(sizes.values())),
             "CHECKS": "\n        ".join(checks), "SET_INPUTS": set_inputs,
         }  # fmt: skip
-        return self.fill(read_template("self_test.c"), values)
+        return self.fill("self_test.c", values)
 
 
 def _join(lines: list[str]) -> str:
@@ -259,12 +297,12 @@ def _number(value: float) -> str:
     return repr(float(value))
 
 
-def _inputs_of(program: InstanceProgram) -> range:
+def _inputs_of(program: InstanceProgram | KinematicsProgram) -> range:
     start = program.layout.start_index("inputs")
     return range(start, start + program.layout.parts["inputs"])
 
 
-def instance_loads(program: InstanceProgram) -> frozenset[int]:
+def instance_loads(program: InstanceProgram | KinematicsProgram) -> frozenset[int]:
     """Elements of an instance that formulas read."""
     entries = program.entries.values()
     return frozenset().union(*(x.loads.get("instance", frozenset()) for x in entries))
@@ -289,12 +327,6 @@ def _operations(formula: Formula) -> list[int]:
     tapes = [x.tape for x in formula.outputs if isinstance(x, SymbolicExpression)]
     required = required_operations(formula.outputs)
     return [i for i in required if tapes[0].operations[i][0] != "load"]
-
-
-def read_template(name: str) -> str:
-    """The text of a template."""
-    folder = files("crane.export") / "templates"
-    return (folder / f"{name}.template").read_text(encoding="utf-8")
 
 
 def _table(name: str, rows: Array) -> str:

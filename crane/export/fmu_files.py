@@ -11,8 +11,8 @@ from xml.etree import ElementTree as ET
 
 import crane
 from crane.common.atomic_output import check_file_is_writable, replace_file
-from crane.common.errors import check_name
-from crane.export.c_sources import CSources, read_template
+from crane.common.errors import InputError, check_name
+from crane.export.c_sources import CSources
 from crane.export.fmu_libraries import PLATFORMS, compile_libraries, library_compilers
 from crane.export.fmu_variables import (
     FIXED,
@@ -90,7 +90,13 @@ def write_fmu(
     check_file_is_writable(Path(path), overwrite)
     compilers = library_compilers()
     loaded = machine if isinstance(machine, Machine) else load(machine)
-    files = FmuFiles(InstanceProgram(loaded, (), for_exchange=True), fmi)
+    program = InstanceProgram(loaded, (), has_derivatives=True)
+    if program.layout.parts["delays"]:
+        raise InputError(
+            f"valves of '{loaded.name}' have a dead time, which an FMU has not: set delay to 0, or "
+            "delay the signals before"
+        )
+    files = FmuFiles(program, fmi)
     members = files.texts(about) | files.icon_members(icon)
     for key, library in compile_libraries(compilers, files.sources, files.name).items():
         platform = PLATFORMS[key]
@@ -160,24 +166,24 @@ class FmuFiles:
     def _runtime(self) -> str:
         """The C source between the functions of FMI and those of the machine."""
         values, program, machine = self._values, self._program, self._program.machine
-        layout, frame, events = values.layout, program.tip_frame, program.routines.event_parts
+        layout, events = values.layout, program.routines.event_parts
         starts = {
             name.upper(): layout.start_index(name)
             for name in ("time", "step", "inputs_start", "inputs", "q", "lengths", "cursor",
-                         "derivatives", "event", "tip_position", "payload")
+                         "derivatives", "event", "tip_position", "unladen", "payload")
         }  # fmt: skip
-        dynamics = program.chart.dynamics.formula_structure.constants_layout
-        body = layout.start_index("dynamics") + dynamics.start_index("inertias")
         indices = starts | {
             "SIZE": layout.size, "INPUT_COUNT": layout.parts["inputs"],
             "STATE_SIZE": program.chart.state_layout.size,
             "OUTPUT_SIZE": program.chart.output_layout.size,
             "CURSOR_SIZE": layout.parts["cursor"], "EVENT_SIZE": layout.parts["event"],
             "TIP_SIZE": layout.parts["tip_position"], "HAS_MARGIN": int("margin" in events),
-            "TIP_BODY": body + (10 * (frame.body - 1) if frame is not None else 0),
+            "UNLADEN_SIZE": layout.parts["unladen"],
         }  # fmt: skip
-        stubs = {"event_indicators": "(m, x) 1", "tip": "(m, q, v, tip) ((void)(m), 1)",
-                 "directional_derivatives": "(m, direction, found) (-3)"}  # fmt: skip
+        stubs = {
+            "event_indicators": "(m, x) 1", "tip": "(m, q, v, tip) ((void)(m), 1)",
+            "set_payload": "(m, payload) 1", "directional_derivatives": "(m, direction, x) (-3)",
+        }  # fmt: skip
         further = {
             **_WORDS[self._fmi], "FMI": str(self._fmi), "ID": f"0x{self._token[:16]}",
             "TOKEN": self._token, "MARGIN_SHIFT": str(1.5 * EVENT_TOLERANCE),
@@ -191,10 +197,9 @@ class FmuFiles:
             "STATES": _numbers(values.states), "NOMINALS": _numbers(values.nominals.tolist()),
             "LIMITS": ",\n    ".join(f"{{{_numbers(row)}}}" for row in _limits(machine)),
             "REASONS": ", ".join(f'"{text}"' for text in STATUS_TEXTS.values()),
-            "TIP_POINT": _numbers([0.0] * 3 if frame is None else frame.frame_offset.tolist()),
             "ROTATIONS": "".join(f"{x}, " for x in machine.coordinates.rotation_columns),
         }  # fmt: skip
-        return self._c.fill(read_template("fmu.c") + read_template(f"fmi{self._fmi}.c"), further)
+        return self._c.fill("fmu.c", further) + self._c.fill(f"fmi{self._fmi}.c", further)
 
     def description(self) -> str:
         """modelDescription.xml."""

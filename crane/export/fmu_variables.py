@@ -77,7 +77,8 @@ class FmuVariables:
         tip = 0 if program.tip_frame is None else 3
         events = sum(program.routines.event_parts.values())
         parts = {"derivatives": len(self.states), "event": events, "tip_position": tip}
-        self.layout = Layout(**layout.parts, **parts, payload=tip // 3)
+        payload = min(1, layout.parts["unladen"])
+        self.layout = Layout(**layout.parts, **parts, payload=payload)
         extra = self.layout.size - layout.size
         self.start = np.concatenate([program.defaults, np.zeros(extra)])
 
@@ -96,7 +97,10 @@ class FmuVariables:
 
     def _variables(self) -> Iterator[FmuVariable]:
         program, at = self.program, self.layout.start_index
-        names, units = [*map(self._structured_name, program.names)], program.units
+        own_names, units = [*program.names], [*program.units]
+        for i, j in zip(self._indices("unladen"), self._tip_inertia, strict=True):
+            own_names[i], units[i] = own_names[j], units[j]
+        names = [*map(self._structured_name, own_names)]
         kinds = {i: kind for part, kind in _KINDS.items() for i in self._indices(part)}
         kinds |= dict.fromkeys(self._indices("q"), GUESS)
         kinds |= {i: STATE_START for i in self.states if i in self._indices("q")}
@@ -123,18 +127,32 @@ class FmuVariables:
         start = self.layout.start_index(part)
         return range(start, start + self.layout.parts[part])
 
+    @property
+    def _tip_inertia(self) -> range:
+        """Indices of the inertia of the body of the tip with its payload."""
+        structure, size = (
+            self.program.chart.dynamics.formula_structure,
+            self.layout.parts["unladen"],
+        )
+        start = self.layout.start_index("dynamics") + structure.constants_layout.start_index(
+            "inertias"
+        )
+        start += size * ((structure.tip_body or 1) - 1)
+        return range(start, start + size)
+
     def _parameters(self) -> Iterator[tuple[int, str]]:
         """Indices and kinds of the parameters that formulas read."""
         program, loads = self.program, instance_loads(self.program)
         dynamics = program.chart.dynamics.formula_structure.constants_layout
-        start = program.layout.start_index("dynamics")
+        start, tip = program.layout.start_index("dynamics"), self._tip_inertia
         for i in self._indices("geometry"):
             if i in loads and "_position_" in program.names[i]:
                 yield i, FIXED
         for part in _TUNABLE_DYNAMICS:
             first = start + dynamics.start_index(part)
             yield from ((i, TUNABLE) for i in range(first, first + dynamics.parts[part])
-                        if i in loads)  # fmt: skip
+                        if i in loads and i not in tip)  # fmt: skip
+        yield from ((i, TUNABLE) for i in self._indices("unladen"))
         yield from ((i, TUNABLE) for i in self._indices("settings") if i in loads)
 
     def _structured_name(self, name: str) -> str:

@@ -6,7 +6,7 @@ any number of them may be used at once. The routines return a status, 1 for succ
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import cached_property
 from types import MappingProxyType
@@ -17,23 +17,31 @@ from crane.codegen import (
     FormulaTooLongError,
     Layout,
     Program,
-    Routine,
     Scalar,
     SymbolicExpression,
 )
 from crane.codegen.differentiation import directional_derivative
-from crane.codegen.linked_functions import LinkedFunction, link_functions
+from crane.codegen.linked_functions import LinkedFunction
 from crane.codegen.vector_layout import Formula
 from crane.common.errors import CraneWarning, InputError
 from crane.common.samples import Array
-from crane.control.control_law import ControlLaw
+from crane.control.control_law import ControlLaw, Controller
 from crane.control.force_inputs import ForceInputs
-from crane.control.valve_commands import ValveSignals
+from crane.control.valve_commands import ValveCommand, ValveSignals
 from crane.control.valve_drive import ValveDrive
-from crane.description.external_forces import Wrench
+from crane.description.external_forces import TIP_WRENCH_NAME, Wrench
 from crane.dynamics.compiled_dynamics import DERIVATIVES_OF, build_quantity
 from crane.dynamics.dynamics import Dynamics
+from crane.dynamics.formula_structure import BODY_SIZE, FormulaStructure
+from crane.dynamics.joint_forces import LAW_PARAMETER_NAMES, PARAMETER_COUNT
 from crane.export.instance_routines import INNER_ROUTINES, InstanceRoutines
+from crane.export.kinematics_program import (
+    SINGLE_PRECISION_BOUNDS,
+    Linked,
+    check_formulas,
+    joined_program,
+    link_entries,
+)
 from crane.export.parameter_names import parameter_names
 from crane.machine.machine import Machine
 from crane.motion.frame_kinematics import CompiledFrame
@@ -44,13 +52,12 @@ from crane.simulation.integration.error_controlled_stepper import (
 )
 from crane.simulation.integration.machine_code_stepper import RungeKuttaStepper
 from crane.simulation.integration.rosenbrock import RosenbrockStepper
-from crane.simulation.simulation_setup import machine_under_control
+from crane.simulation.simulation_setup import machine_under_control, resolve_controller
 
-TIP_WRENCH_NAME = "tip"
 SINGLE_PRECISION_TOLERANCE = 1e-4  # of a step
-# over those of double precision: residuals of rounding, of closed loops; last step of Newton
-_SINGLE_PRECISION_BOUNDS = np.array([1e9, 1e8, 1e6])
+_SHARPNESS = 1e3  # of friction that is 0 in the machine file, one over its smoothing velocity
 MAX_STEPS, MAX_EVENTS = 10_000, 200  # of one call of `advance`, by default
+_DELAYED_STEP = 1e-3  # shortest steps of which a dead time remembers all [s]
 DYNAMICS_ROUTINES = MappingProxyType(
     {
         "inverse_dynamics": "inverse",
@@ -68,17 +75,54 @@ DYNAMICS_ROUTINES = MappingProxyType(
 )
 
 
+def _exported_control(
+    machine: Machine, controller: Controller | ValveCommand | None
+) -> ControlLaw:
+    """The law of an instance: a given one, or one whose references are forces or signals.
+
+    Raises:
+        InputError: It is computed in Python.
+    """
+    if controller is None:
+        if machine.hydraulics is None:
+            return ForceInputs(machine)
+        return ValveDrive(machine, ValveSignals(machine, [0.0], {}))
+    control = resolve_controller(controller, machine)
+    name = type(controller).__name__
+    drive = control if isinstance(control, ValveDrive) else None
+    if not isinstance(control, ControlLaw) or (drive and drive.command.period):
+        raise InputError(
+            f"{name} is computed in Python, which no other target has: give a crane.control."
+            "ControlLaw, or a ValveCommand without a period"
+        )
+    if drive and drive.period:
+        raise InputError(
+            f"{name} with valves that have a dead time is computed in Python, which no other "
+            "target has: set their delay to 0"
+        )
+    if drive and drive.command.has_measured_pressures:
+        raise InputError(
+            f"{name} has measured pressures, which are no inputs of a program: leave them out"
+        )
+    return control
+
+
 class InstanceProgram:
     """A machine with its drives as one program.
 
     The inputs are the forces of the drives [N], [N m], or the signals at the valves [V] of a
-    machine with a circuit; then force [N] and moment [N m] at the tip, in the axes of the world.
+    machine with a circuit, or the references of a controller; then force [N] and moment [N m] at
+    the tip, in the axes of the world.
 
     Args:
         machine: The machine.
         quantities: Routines of `DYNAMICS_ROUTINES` to include; all by default.
-        for_exchange: Whether to include directional derivatives of rates and outputs, where they
-            are not too long, and all inertial parameters of the body at the tip, for payloads.
+        variants: The machine with other parameters. What differs between them stays an element of
+            the instance, where numbers such as 0 are else part of the formulas.
+        controller: Control law or valve command, as for `simulate`. Its references at time 0 are
+            the defaults of the inputs; its settings are parameters, and its states states.
+        has_derivatives: Whether to include directional derivatives of rates and outputs, where
+            they are not too long.
 
     Attributes:
         machine: The machine, with the wrench at its tip.
@@ -89,63 +133,51 @@ class InstanceProgram:
         names: Name of each element of an instance.
         units: Unit of each.
         defaults: An instance at home, not initialized.
+        variant_defaults: The same of each of `variants`.
         entries: Routines by name; each takes an instance, and further arrays.
         functions: All linked functions, each after what it calls.
 
     Raises:
-        InputError: The formulas are too long, or a load is a function in Python.
+        InputError: The formulas are too long, a load or the controller is a function in Python, or
+            a variant has other formulas.
     """
 
     def __init__(
         self,
         machine: Machine,
         quantities: Sequence[str] = tuple(DYNAMICS_ROUTINES),
-        for_exchange: bool = False,
+        variants: Sequence[Machine] = (),
+        controller: Controller | ValveCommand | None = None,
+        has_derivatives: bool = False,
     ):
-        tip = machine.tip
-        loads = [] if tip is None else [Wrench(tip, name=TIP_WRENCH_NAME)]
-        machine = machine.with_external_forces(*loads)
-        control: ControlLaw
-        if machine.hydraulics is None:
-            control = ForceInputs(machine)
-        else:
-            control = ValveDrive(machine, ValveSignals(machine, [0.0], {}))
-        machine = machine_under_control(machine, control)
-        self.machine, self.control = machine, control
-        if not machine.closure.is_compiled:
-            raise InputError(f"the loops of '{machine.name}' have no formulas to export")
-        if isinstance(control, ValveDrive) and control.delays.any():
-            raise InputError(
-                f"valves of '{machine.name}' have a dead time, which is not exported: set delay "
-                "to 0, or delay the signals before"
-            )
-        if not machine.has_traceable_forces:
-            raise InputError(
-                f"a load of '{machine.name}' is a function in Python, which no other target has: "
-                "give a crane.Wrench"
-            )
-        states = control.circuit.state_count if isinstance(control, ValveDrive) else 0
-        dynamics, self._for_exchange = Dynamics(machine), for_exchange
-        self.chart = Chart.from_dynamics(dynamics, control, states)
+        self._has_derivatives = has_derivatives
+        self.chart = _controlled_chart(machine, controller)
+        self.machine, self.control = machine, control = self.chart.machine, self.chart.control
+        dynamics = self.chart.dynamics
+        others = [_controlled_chart(x, controller) for x in variants]
+        for other in others:
+            if other.dynamics.formula_structure != dynamics.formula_structure:
+                raise InputError(f"a variant of '{machine.name}' has bodies of another kind")
+            changes = other.dynamics.formula_constants != dynamics.formula_constants
+            dynamics.constant_pattern[changes] = np.nan
         is_valve_drive = isinstance(control, ValveDrive)
         self._stepper_class = RosenbrockStepper if is_valve_drive else DormandPrinceStepper
-        self.stepper = self._make_stepper()
-        # of its formulas for other targets, not of its machine code
-        if for_exchange and self.tip_frame is not None:
-            start = dynamics.formula_structure.constants_layout.start_index("inertias")
-            start += 10 * (self.tip_frame.body - 1)
-            dynamics.constant_pattern[start : start + 10] = np.nan
+        self.stepper = self._make_stepper(self.chart)
         self._quantities = {name: DYNAMICS_ROUTINES[name] for name in quantities}
         self._nq, self._n = machine.model.nv, len(machine.active)
         self._k = len(self.chart.stick_slip.columns)
         self._closure = machine.closure.compiled_closure
         self.layout = self._make_layout()
         self.names, self.units = parameter_names(self)
-        self.defaults = self._default_instance()
+        self.defaults = self._default_instance(self.chart)
+        self.variant_defaults = []
+        for other in others:  # of the same formulas
+            other.dynamics.constant_pattern[:] = dynamics.constant_pattern
+            self.variant_defaults.append(self._default_instance(other))
 
-    def _make_stepper(self) -> ErrorControlledStepper:
+    def _make_stepper(self, chart: Chart) -> ErrorControlledStepper:
         try:
-            return self._stepper_class(self.chart)
+            return self._stepper_class(chart)
         except FormulaTooLongError as error:
             raise InputError(
                 f"'{self.machine.name}' has {error.operation_count:,} operations in a step, which "
@@ -153,7 +185,10 @@ class InstanceProgram:
             ) from None
 
     def _make_layout(self) -> Layout:
-        stepper, inputs = self.stepper, self.stepper.reference_columns
+        stepper, inputs, control = self.stepper, self.stepper.reference_columns, self.control
+        spools, rows = 0, 0
+        if isinstance(control, ValveDrive) and control.delays.any():
+            spools, rows = len(control.delays), int(control.delays.max() / _DELAYED_STEP) + 4
         return Layout(
             time=1, step=1, inputs_start=inputs, inputs=inputs,
             **self.chart.state_layout.parts, **self.chart.output_layout.parts,
@@ -161,24 +196,32 @@ class InstanceProgram:
             tolerances=stepper.tolerance.size, max_events=1,
             geometry=self._closure.geometry.constants.size,
             dynamics=self.chart.dynamics.formula_constants.size,
-            settings=self.control.settings.size,
+            settings=control.settings.size, delays=spools, history=rows * (1 + spools),
+            unladen=BODY_SIZE if _tip_inertia(self.chart.dynamics.formula_structure) else 0,
         )  # fmt: skip
 
-    def _default_instance(self) -> Array:
+    def _default_instance(self, chart: Chart) -> Array:
         values = np.zeros(self.layout.size)
-        at, dynamics = self.layout.view(values), self.chart.dynamics
-        self.chart.stick_slip.slip_signs[:] = 0.0
-        self.chart.stick_slip.apply_to(dynamics)
+        at, dynamics, machine = self.layout.view(values), chart.dynamics, chart.machine
+        closure, stepper = machine.closure.compiled_closure, self._make_stepper(chart)
+        structure = dynamics.formula_structure
+        chart.stick_slip.slip_signs[:] = 0.0
+        chart.stick_slip.apply_to(dynamics)
         at.step[:], at.max_events[:] = 1e-3, MAX_EVENTS
-        at.q[:] = self.machine.home
-        at.cursor[:] = self._closure.new_cursor().state
+        at.q[:] = machine.home
+        at.cursor[:] = closure.new_cursor().state
         at.lengths[5] = MAX_STEPS
-        at.bounds[:], at.tolerances[:] = self.stepper.bounds, self.stepper.tolerance
-        at.geometry[:] = self._closure.geometry.constants
-        at.dynamics[:], at.settings[:] = dynamics.formula_constants, self.control.settings
-        if isinstance(self.control, ValveDrive):
-            neutral = [x.neutral for x in self.control.circuit.hydraulics.spools.values()]
-            at.inputs[: len(neutral)] = at.inputs_start[: len(neutral)] = neutral
+        at.bounds[:], at.tolerances[:] = stepper.bounds, stepper.tolerance
+        at.geometry[:] = closure.geometry.constants
+        at.dynamics[:], at.settings[:] = dynamics.formula_constants, chart.control.settings
+        smoothed = sorted({*machine.closure.active.tolist()} - {*structure.stick_slip_columns})
+        sharpness = _law_indices(structure, smoothed, "sharpness")
+        at.dynamics[sharpness] = np.minimum(at.dynamics[sharpness], _SHARPNESS)
+        at.unladen[:] = at.dynamics[_tip_inertia(structure)]
+        references = chart.control.references(np.zeros(1))[0]
+        at.inputs[: len(references)] = at.inputs_start[: len(references)] = references
+        if at.delays.size:
+            at.delays[:] = chart.control.delays
         return values
 
     @cached_property
@@ -186,7 +229,7 @@ class InstanceProgram:
         """`defaults` with tolerances that single precision reaches."""
         values = self.defaults.copy()
         at = self.layout.view(values)
-        at.bounds[:3] *= _SINGLE_PRECISION_BOUNDS
+        at.bounds[:3] *= SINGLE_PRECISION_BOUNDS
         at.tolerances[:] = self._stepper_class(self.chart, SINGLE_PRECISION_TOLERANCE).tolerance
         return values
 
@@ -216,12 +259,12 @@ class InstanceProgram:
                 continue
             programs[name] = program
         programs["steps"] = self.stepper.new_program()
-        if self._for_exchange and not self.machine.coordinates.rotation_columns:
+        if self._has_derivatives and not self.machine.coordinates.rotation_columns:
             with suppress(FormulaTooLongError):
                 programs["tangent"] = self._trace_derivatives(programs["steps"])
         if self.tip_frame is not None:
             programs["tip"] = self.tip_frame.new_program()
-        if isinstance(self.control, ForceInputs):
+        if not isinstance(self.control, ValveDrive):
             programs["fixed"] = RungeKuttaStepper(self.chart).new_program()
         return programs
 
@@ -255,24 +298,17 @@ class InstanceProgram:
         )
 
     @cached_property
-    def _linked(self) -> tuple[dict[str, LinkedFunction], list[LinkedFunction]]:
-        programs = {name: dict(program.functions) for name, program in self._programs.items()}
-        own = Program()
-        for prefix, parts in programs.items():
-            own.functions |= {f"{prefix}_{name}": x for name, x in parts.items()}
+    def _linked(self) -> Linked:
+        parts = {name: dict(program.functions) for name, program in self._programs.items()}
+        own = joined_program(parts)
         known = {*own.functions, *INNER_ROUTINES}
         self.routines.add_to(own)
-        programs["machine"] = own.functions
-        entries = [
-            name
-            for name, function in own.functions.items()
-            if name not in known and isinstance(function, Routine)
-        ]
-        close = "project" if self._closure.has_partly_active_rotations else "close"
-        bindings = {"close": ("loops", close), "follow": ("loops", "follow")}
-        functions = link_functions(programs, [("machine", x) for x in entries], bindings)
-        by_name = {x.name: x for x in functions}
-        return {x: by_name[f"machine_{x}"] for x in entries}, functions
+        return link_entries(parts, own, known, self._closure)
+
+    @property
+    def output_count(self) -> int:
+        """Elements of an instance that `update_outputs` writes."""
+        return sum(self.chart.output_layout.parts.values())
 
     @property
     def entries(self) -> dict[str, LinkedFunction]:
@@ -283,3 +319,54 @@ class InstanceProgram:
     def functions(self) -> list[LinkedFunction]:
         """All linked functions, each after what it calls."""
         return self._linked[1]
+
+
+def _controlled_chart(machine: Machine, controller: Controller | ValveCommand | None) -> Chart:
+    """A machine with a wrench at its tip and its drives.
+
+    Raises:
+        InputError: It cannot be exported.
+    """
+    loads = [] if machine.tip is None else [Wrench(machine.tip, name=TIP_WRENCH_NAME)]
+    machine = machine.with_external_forces(*loads)
+    control = _exported_control(machine, controller)
+    machine = machine_under_control(machine, control)
+    check_formulas(machine)
+    if not machine.has_traceable_forces:
+        raise InputError(
+            f"a load of '{machine.name}' is a function in Python, which no other target has: "
+            "give a crane.Wrench"
+        )
+    states = len(control.start(machine.home[machine.closure.active]))
+    dynamics, active = Dynamics(machine), machine.closure.active.tolist()
+    parameters = _parameter_indices(dynamics.formula_structure, active)
+    dynamics.constant_pattern[parameters] = np.nan
+    return Chart.from_dynamics(dynamics, control, states)
+
+
+def _tip_inertia(structure: FormulaStructure) -> list[int]:
+    """Indices in `dynamics_constants` of the inertia of the body of the tip; none on the world."""
+    start = structure.constants_layout.start_index("inertias")
+    start += BODY_SIZE * ((structure.tip_body or 0) - 1)
+    return [*range(start, start + BODY_SIZE)] if structure.tip_body else []
+
+
+def _law_indices(structure: FormulaStructure, columns: Iterable[int], field: str) -> list[int]:
+    """Indices in `dynamics_constants` of a value of the force laws of joints."""
+    start = structure.constants_layout.start_index("joint_laws") + LAW_PARAMETER_NAMES.index(field)
+    return [start + PARAMETER_COUNT * column for column in columns]
+
+
+def _parameter_indices(structure: FormulaStructure, active: Iterable[int]) -> list[int]:
+    """Indices in `dynamics_constants` of what stays a parameter where it is 0, 1 or -1."""
+    gravity, joints = (
+        structure.constants_layout["gravity"],
+        range(len(structure.motion_parents) - 1),
+    )
+    return [
+        *range(gravity.start, gravity.stop),
+        *_tip_inertia(structure),
+        *_law_indices(structure, active, "coulomb"),
+        *_law_indices(structure, joints, "coulomb_offset"),
+        *_law_indices(structure, joints, "viscous"),
+    ]

@@ -1,7 +1,11 @@
 """Routines of an instance of a machine, see `crane.export.instance_program`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations_with_replacement
 from types import MappingProxyType
+
+import numpy as np
+import pinocchio as pin
 
 from crane.codegen import (
     ArrayPointer,
@@ -14,18 +18,37 @@ from crane.codegen import (
     select,
 )
 from crane.codegen.routine_statements import as_value
-from crane.codegen.symbolic import add_vectors, scale_vector, subtract_vectors
+from crane.codegen.symbolic import (
+    add_vectors,
+    dot,
+    matmul,
+    matvec,
+    maximum,
+    scale_vector,
+    subtract_vectors,
+    transpose,
+)
 from crane.codegen.vector_layout import Formula
 from crane.common.samples import Array
-from crane.control.force_inputs import ForceInputs
+from crane.control.valve_drive import ValveDrive
+from crane.dynamics.formula_structure import BODY_SIZE
+from crane.dynamics.frame_jacobians import frame_placement
+from crane.export.dead_times import DEAD_TIME_ROUTINES, DeadTimes
+from crane.export.kinematics_program import (
+    BEYOND_CHART,
+    DONE,
+    HALTED,
+    NOT_CLOSED,
+    TOO_MANY_CALLS,
+    TOO_MANY_EVENTS,
+    KinematicsRoutines,
+)
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.error_controlled_stepper import ErrorControlledStepper
 from crane.simulation.integration.machine_code_stepper import HELD_INDEX
 from crane.simulation.integration.machine_formulas import AT_REST_SUFFIX
 from crane.simulation.integration.stick_slip_routine import add_stick_slip_routines
 
-# Statuses of the routines, besides the number of what was done.
-DONE, NOT_CLOSED, BEYOND_CHART, HALTED, TOO_MANY_EVENTS = 1, -1, -2, -3, -4
 STATUS_TEXTS = MappingProxyType(
     {
         DONE: "done",
@@ -33,18 +56,20 @@ STATUS_TEXTS = MappingProxyType(
         BEYOND_CHART: "the active joints do not determine the motion: a dead centre",
         HALTED: "the step failed: the motion diverges, or too many steps were needed",
         TOO_MANY_EVENTS: "joints stick and slip too often",
+        TOO_MANY_CALLS: "the dead time of a valve takes more calls than are kept: longer steps",
     }
 )
 _FIRST_STEP_SHARE, _LONGEST_FIRST_STEP = 0.01, 5e-4  # as `ErrorControlledStepper.run`
 _STEP_REDUCTION_AFTER_EVENT = 0.2
 _TIME_TOLERANCE = 1e-9  # of a step
+_LEAST_MASS = 1e-30  # by which moments are divided [kg]
 INNER_ROUTINES = (
     "find_modes", "orthogonalize", "least_squares", "transposed_least_squares",
-    "bounded_least_squares",
+    "bounded_least_squares", *DEAD_TIME_ROUTINES,
 )  # fmt: skip
 
 
-class InstanceRoutines:
+class InstanceRoutines(KinematicsRoutines):
     """Writer of the routines of an instance.
 
     Args:
@@ -65,31 +90,47 @@ class InstanceRoutines:
         quantities: Sequence[str],
         tip_offset: Array | None,
     ):
-        self.chart, self.stepper, self.layout = chart, stepper, layout
+        super().__init__(layout, chart.machine.closure.compiled_closure)
+        self.chart, self.stepper = chart, stepper
         self._programs, self._quantities, self._tip_offset = programs, quantities, tip_offset
         machine = self.machine = chart.machine
         self.control = chart.control
         self._nq, self._n = machine.model.nv, len(machine.active)
         self._k = len(chart.stick_slip.columns)
-        self._closure = machine.closure.compiled_closure
+        self._dead_times = DeadTimes(layout) if layout.parts["delays"] else None
 
     def add_to(self, program: Program) -> None:
         """Add all routines to a program that has the functions of `programs`."""
+        if self._dead_times is not None:
+            self._dead_times.add_to(program)
         self._add_stiction(program)
         self._add_initialize(program)
         self._add_advance(program)
         self._add_evaluations(program)
-        self._add_kinematics(program)
+        self.add_kinematics(program)
+        self._add_tip(program)
         self._add_dynamics(program)
+        if self.layout.parts["unladen"]:
+            self._add_payload(program)
+
+    def _add_payload(self, program: Program) -> None:
+        """set_payload(instance, payload): the inertia of the body of the tip with a payload."""
+        machine, tape = self.machine, Tape()
+        assert machine.tip is not None
+        joint, pose = frame_placement(machine, machine.tip)
+        body = machine.coordinates.body_of_joint[joint]
+        frame = pin.SE3(self._closure.geometry.body_rotations[body].T, np.zeros(3)) * pose
+        unladen, payload = (tape.load_vector(i, 0, BODY_SIZE) for i in range(2))
+        program.add_formula("laden", 2, laden_inertia(unladen, payload, frame))
+        first = self.layout.start_index("dynamics")
+        first += self.chart.dynamics.formula_structure.constants_layout.start_index("inertias")
+        with program.add_routine("set_payload", arrays=("instance", "payload")) as r:
+            inertia = ArrayPointer("instance").element_pointer(first + BODY_SIZE * (body - 1))
+            r.call("laden", self._part(r.instance, "unladen"), r.payload, inertia)
+            r.return_value(DONE)
 
     def _machine_arguments(self, instance: ArrayPointer) -> tuple[ArrayPointer, ...]:
         return tuple(self._part(instance, x) for x in ("geometry", "dynamics", "settings"))
-
-    def _part(self, instance: ArrayPointer, name: str) -> ArrayPointer:
-        return ArrayPointer(instance.name).element_pointer(self.layout.start_index(name))
-
-    def _element(self, instance: ArrayPointer, name: str, index: int = 0) -> RoutineValue:
-        return ArrayPointer(instance.name)[self.layout.start_index(name) + index]
 
     def _store(self, r: Routine, name: str, value: RoutineValue | float, index: int = 0) -> None:
         r.store(ArrayPointer("instance"), self.layout.start_index(name) + index, value)
@@ -134,7 +175,10 @@ class InstanceRoutines:
         self._store(r, "bounds", held, HELD_INDEX)
 
     def _add_initialize(self, program: Program) -> None:
-        """initialize(instance): at rest at the active coordinates in q, with other q as guess."""
+        """initialize(instance): at rest at the active coordinates in q, with other q as guess.
+
+        update_modes(instance): after a change of parameters.
+        """
         tape, layout = Tape(), self.chart.state_layout
         machine = self.stepper.trace_controlled_machine(tape)
         dynamics, loads = machine.dynamics_formulas, machine.external_forces.active_forces
@@ -161,12 +205,24 @@ class InstanceRoutines:
                 start = layout.start_index("controller")
                 r.copy(state.element_pointer(start), values, states)
             r.copy(self._part(r.instance, "inputs_start"), refs, self.layout.parts["inputs"])
+            if self._dead_times is not None:
+                self._dead_times.write_start(r)
             cursor = self._part(r.instance, "cursor")
             r.copy(cursor, state, self._nq)
             r.copy(cursor.element_pointer(self._nq), result.element_pointer("gamma"), size)
             self._store(r, "time", 0.0)
             self._store(r, "lengths", 0.0)
             self._write_find_modes(r, refs)
+            r.return_value(DONE)
+        with program.add_routine("update_modes", arrays=("instance",)) as r:
+            self._store(r, "lengths", 0.0)
+            if self.stepper.has_rotation_vectors:
+                state = self._part(r.instance, "q")
+                wrapped = r.local_array("wrapped", layout.size)
+                r.call("steps_wrap", state, wrapped)
+                r.copy(state, wrapped, self._nq)
+                r.copy(self._part(r.instance, "cursor"), state, self._nq)
+            self._write_find_modes(r, self._part(r.instance, "inputs"))
             r.return_value(DONE)
 
     @property
@@ -181,39 +237,42 @@ class InstanceRoutines:
         columns = self.stepper.reference_columns
         tape = Tape()
         start, end = (tape.load_vector(i, 0, columns) for i in range(2))
-        first = tape.load(2, 0)
-        shares = first, 0.5 + 0.5 * first, 1.0
+        first, last = tape.load_vector(2, 0, 2)
         ramp = subtract_vectors(end, start)
-        rows = [add_vectors(start, scale_vector(share, ramp)) for share in shares[:2]]
-        program.add_formula("ramp", 3, [x for row in (*rows, end) for x in row])
+        rows = [
+            add_vectors(start, scale_vector(share, ramp))
+            for share in (first, 0.5 * (first + last), last)
+        ]
+        program.add_formula("ramp", 3, [x for row in rows for x in row])
         with program.add_routine("advance", arrays=("instance",)) as r:
             self._write_advance(r)
-        if isinstance(self.control, ForceInputs):
+        if not isinstance(self.control, ValveDrive):
             with program.add_routine("advance_fixed", arrays=("instance",)) as r:
                 self._write_fixed_step(r)
 
     def _write_advance(self, r: Routine) -> None:
         columns = self.stepper.reference_columns
-        refs, first = r.local_array("refs", max(1, 3 * columns)), r.local_array("first", 1)
-        row = r.local_array("row", 1)
+        refs, row = r.local_array("refs", max(1, 3 * columns)), r.local_array("row", 1)
         state, lengths = self._part(r.instance, "q"), self._part(r.instance, "lengths")
         bounds, tolerances = (self._part(r.instance, x) for x in ("bounds", "tolerances"))
-        inputs, start = (self._part(r.instance, x) for x in ("inputs", "inputs_start"))
         step = r.new_variable(self._element(r.instance, "step"))
         with r.if_then(~(step > 0.0)):
             r.return_value(HALTED)
+        if self._dead_times is not None:
+            with r.if_then(r.call("append_node", r.instance) < 1):
+                r.return_value(TOO_MANY_CALLS)
         # a run that goes on to the next output instant, see `ErrorControlledStepper.run`
         with r.if_then(~((lengths[0] >= step) & (lengths[0] <= step))):
             r.store(lengths, 0, step)
             longest = select(step < _LONGEST_FIRST_STEP, step, _LONGEST_FIRST_STEP)
             r.store(lengths, 1, longest * _FIRST_STEP_SHARE)
-        time, events = r.new_variable(step * -1.0), r.new_variable(0.0)
+        time, end, events = (r.new_variable(x) for x in (step * -1.0, 0.0, 0.0))
+        write_references = self._references_writer(r, refs, step)
         with r.loop_forever():
-            r.store(first, 0, (time + step) / step)
-            r.call("ramp", start, inputs, first, refs)
+            write_references(time, end)
             r.store(lengths, 2, time)
-            r.store(lengths, 3, time * -1.0)
-            r.store(lengths, 4, 0.0)
+            r.store(lengths, 3, end - time)
+            r.store(lengths, 4, end)
             r.store(lengths, 6, 0.0)
             r.call(
                 "steps_run", 1, *self._machine_arguments(r.instance), refs, state, row, lengths,
@@ -225,18 +284,42 @@ class InstanceRoutines:
                 r.assign(events, events + 1.0)
                 with r.if_then(events > self._element(r.instance, "max_events")):
                     r.return_value(TOO_MANY_EVENTS)
-                r.store(first, 0, (time + step) / step)
-                r.call("ramp", start, inputs, first, refs)
+                write_references(time, end)
                 self._write_find_modes(r, refs)
-            with r.if_else():
-                with r.if_then(~(time < step * -_TIME_TOLERANCE)):
-                    r.break_loop()
+            with r.if_else(), r.if_then(time < end - step * _TIME_TOLERANCE):
                 self._write_halt(r, state)
             with r.if_then(~(time < step * -_TIME_TOLERANCE)):
                 r.break_loop()
         self._store(r, "time", self._element(r.instance, "time") + step)
-        r.copy(start, inputs, columns)
+        r.copy(self._part(r.instance, "inputs_start"), self._part(r.instance, "inputs"), columns)
         r.return_value(DONE)
+
+    def _references_writer(
+        self, r: Routine, refs: ArrayPointer, step: RoutineValue
+    ) -> Callable[[RoutineValue, RoutineValue], None]:
+        """Function that writes the references from a time to `end`, before the end of the call.
+
+        It sets `end` to the next change of a slope, or 0, where valves have dead times.
+        """
+        columns, shares = self.stepper.reference_columns, r.local_array("shares", 2)
+        now, kink = (r.local_array(x, 1) for x in ("now", "kink"))
+        inputs, start = (self._part(r.instance, x) for x in ("inputs", "inputs_start"))
+        goal = r.new_variable(self._element(r.instance, "time") + step)
+
+        def write(time: RoutineValue, end: RoutineValue) -> None:
+            if self._dead_times is not None:
+                r.store(now, 0, goal + time)
+                r.call("find_kink", r.instance, now, kink)
+                r.assign(end, kink[0] - goal)
+                r.assign(end, select(end < step * -_TIME_TOLERANCE, end, 0.0))
+            r.store(shares, 0, (time + step) / step)
+            r.store(shares, 1, (end + step) / step)
+            r.call("ramp", start, inputs, shares, refs)
+            for i, share in enumerate((0.0, 0.5, 1.0) if self._dead_times is not None else ()):
+                r.store(now, 0, goal + time + (end - time) * share)
+                r.call("delay_signals", r.instance, now, refs.row_pointer(i, columns))
+
+        return write
 
     def _write_halt(self, r: Routine, state: ArrayPointer) -> None:
         """Return why a step failed."""
@@ -251,13 +334,14 @@ class InstanceRoutines:
 
     def _write_fixed_step(self, r: Routine) -> None:
         columns, size = self.stepper.reference_columns, self.chart.row_layout.size
-        refs, first = r.local_array("refs", max(1, 3 * columns)), r.local_array("first", 1)
+        refs, shares = r.local_array("refs", max(1, 3 * columns)), r.local_array("shares", 2)
         row, sizes = r.local_array("row", size), r.local_array("sizes", 3)
         state, bounds = self._part(r.instance, "q"), self._part(r.instance, "bounds")
         inputs, start = (self._part(r.instance, x) for x in ("inputs", "inputs_start"))
         step = r.new_variable(self._element(r.instance, "step"))
-        r.store(first, 0, 0.0)
-        r.call("ramp", start, inputs, first, refs)
+        r.store(shares, 0, 0.0)
+        r.store(shares, 1, 1.0)
+        r.call("ramp", start, inputs, shares, refs)
         r.store(sizes, 0, step)
         r.store(sizes, 1, step * 0.5)
         r.store(sizes, 2, 0.0)
@@ -277,8 +361,8 @@ class InstanceRoutines:
     def _add_evaluations(self, program: Program) -> None:
         """update_outputs(instance); derivatives(instance, rate) of the state.
 
-        event_indicators(instance, indicators), update_modes(instance) for other integrators;
-        directional_derivatives(instance, direction, result) of rate and outputs.
+        event_indicators(instance, indicators); directional_derivatives(instance, direction,
+        result) of rate and outputs.
         """
         with program.add_routine("update_outputs", arrays=("instance",)) as r:
             self._write_evaluation(r, "steps_observe", ["outputs"], self._part(r.instance, "tau"))
@@ -287,15 +371,6 @@ class InstanceRoutines:
         if self.event_parts:
             with program.add_routine("event_indicators", arrays=("instance", "indicators")) as r:
                 self._write_evaluation(r, "steps_rate", [*self.event_parts], r.indicators)
-        with program.add_routine("update_modes", arrays=("instance",)) as r:
-            if self.stepper.has_rotation_vectors:
-                state = self._part(r.instance, "q")
-                wrapped = r.local_array("wrapped", self.chart.state_layout.size)
-                r.call("steps_wrap", state, wrapped)
-                r.copy(state, wrapped, self._nq)
-                r.copy(self._part(r.instance, "cursor"), state, self._nq)
-            self._write_find_modes(r, self._part(r.instance, "inputs"))
-            r.return_value(DONE)
         if "tangent" in self._programs:
             arrays = "instance", "direction", "result"
             with program.add_routine("directional_derivatives", arrays=arrays) as r:
@@ -326,6 +401,11 @@ class InstanceRoutines:
         layout = self._programs[program].formula_outputs(own_name)
         values = r.local_array("values", layout)
         inputs, state = (self._part(r.instance, x) for x in ("inputs", "q"))
+        if self._dead_times is not None:
+            row = r.local_array("row", self.layout.parts["inputs"])
+            r.copy(row, inputs, self.layout.parts["inputs"])
+            r.call("delay_signals", r.instance, self._part(r.instance, "time"), row)
+            inputs = row
         arguments = *self._machine_arguments(r.instance), inputs, state, *further, values
         if self._k:
             with r.if_then(self._element(r.instance, "bounds", HELD_INDEX) > 0.5):
@@ -338,28 +418,8 @@ class InstanceRoutines:
         r.copy(target, values.element_pointer(parts[0]), count)
         r.return_value(DONE)
 
-    def _add_kinematics(self, program: Program) -> None:
-        """close_loops, follow_loops, gamma and tip."""
-        newton = self._closure.formula_outputs("newton")
-        with program.add_routine("close_loops", arrays=("instance", "q")) as r:
-            result = r.local_array("result", newton)
-            geometry, bounds = (self._part(r.instance, x) for x in ("geometry", "bounds"))
-            with r.if_then(r.call("loops_close", geometry, r.q, result, bounds) < 1):
-                r.return_value(NOT_CLOSED)
-            r.return_value(DONE)
-        with program.add_routine("follow_loops", arrays=("instance", "q_a", "q")) as r:
-            geometry, cursor, bounds = (
-                self._part(r.instance, x) for x in ("geometry", "cursor", "bounds")
-            )
-            done = r.call("loops_follow", 1, geometry, r.q_a, cursor, r.q, bounds)
-            with r.if_then(done < 1):
-                r.return_value(NOT_CLOSED)
-            r.return_value(DONE)
-        with program.add_routine("gamma", arrays=("instance", "q", "gamma")) as r:
-            geometry = self._part(r.instance, "geometry")
-            with r.if_then(r.call("loops_gamma_each", 1, geometry, r.q, r.gamma) < 1):
-                r.return_value(BEYOND_CHART)
-            r.return_value(DONE)
+    def _add_tip(self, program: Program) -> None:
+        """tip(instance, q, v_a, tip)."""
         if self._tip_offset is None:
             return
         with program.add_routine("tip", arrays=("instance", "q", "v_a", "tip")) as r:
@@ -380,3 +440,42 @@ class InstanceRoutines:
                 geometry, dynamics = (self._part(r.instance, x) for x in ("geometry", "dynamics"))
                 r.call(f"{name}_formula", geometry, dynamics, r.q, inputs, r.result)
                 r.return_value(DONE)
+
+
+def laden_inertia(
+    unladen: Sequence[Scalar], payload: Sequence[Scalar], frame: pin.SE3
+) -> list[Scalar]:
+    """Inertia of a body with a payload on one of its frames.
+
+    With masses m_i, centres c_i and inertias I_i about them, d = c_2 - c_1 and
+    mu = m_1 m_2 / (m_1 + m_2),
+
+        m = m_1 + m_2,    c = c_1 + m_2 / m d,    I = I_1 + I_2 + mu (d.d 1 - d d^T).
+
+    Args:
+        unladen: (10,) mass, centre of mass (3), inertia about it (xx, xy, xz, yy, yz, zz) in the
+            axes of the body.
+        payload: (10,) the same in the frame.
+        frame: The frame in the body.
+
+    Returns:
+        (10,) like `unladen`.
+    """
+    turn = frame.rotation.tolist()
+    mass = unladen[0] + payload[0]
+    share = payload[0] / maximum(mass, _LEAST_MASS)
+    centre = add_vectors(matvec(turn, payload[1:4]), frame.translation.tolist())
+    distance = subtract_vectors(centre, unladen[1:4])
+    xx, xy, xz, yy, yz, zz = payload[4:]
+    tensor = matmul(matmul(turn, [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), transpose(turn))
+    square, reduced = dot(distance, distance), unladen[0] * share
+    moments = [
+        inertia
+        + tensor[i][k]
+        + reduced * ((square if i == k else 0.0) - distance[i] * distance[k])
+        for inertia, (i, k) in zip(
+            unladen[4:], combinations_with_replacement(range(3), 2), strict=True
+        )
+    ]
+    moved = add_vectors(unladen[1:4], scale_vector(share, distance))
+    return [mass, *moved, *moments]

@@ -1,14 +1,16 @@
 """Names and units of the elements of an instance, in the order of `InstanceProgram.layout`."""
 
 from collections.abc import Iterable, Iterator
-from itertools import compress
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from crane.control.valve_drive import ValveDrive
 from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.dynamics.external_forces import reference_counts
 from crane.dynamics.joint_forces import LAW_PARAMETER_NAMES
 from crane.hydraulics.circuit_states import BALANCE_UNITS
+from crane.machine.machine import Machine
 
 if TYPE_CHECKING:
     from crane.export.instance_program import InstanceProgram
@@ -18,6 +20,7 @@ _POSITION = ["position_x", "position_y", "position_z"]
 _INERTIA = ["mass", *(f"com_{x}" for x in "xyz")] + [
     f"inertia_{x}" for x in ("xx", "xy", "xz", "yy", "yz", "zz")
 ]
+_INERTIA_UNITS = ("kg", "m", "m", "m", *("kg m2",) * 6)
 _WRENCH_UNITS = ("N", "N", "N", "N m", "N m", "N m")
 
 
@@ -60,6 +63,16 @@ def _elements(program: "InstanceProgram") -> Iterator[tuple[str, str, str]]:
         for name, unit in program.control.channels:
             yield "channels", name, unit
         yield from (("settings", name, "") for name in _setting_names(program.control))
+        command = program.control.command
+        yield from (("settings", name, unit) for name, unit in command.setting_units.items())
+        if program.layout.parts["delays"]:
+            yield from (("delays", f"{name}_delay", "s") for name in circuit.hydraulics.spools)
+    else:
+        for part, named in (
+            ("controller", program.control.state_units),
+            ("settings", program.control.setting_units),
+        ):
+            yield from ((part, name, unit) for name, unit in named.items())
     yield "work", "work", "J"
     loads = [force.name for force in machine.external_forces]
     yield from (("work", f"work_{name}", "J") for name in loads)
@@ -74,21 +87,23 @@ def _elements(program: "InstanceProgram") -> Iterator[tuple[str, str, str]]:
     if machine.supports:
         for joint in machine.joints:
             yield "a", f"a_{joint}", f"{machine.unit(joint)}/s2"
-    yield from (("geometry", name, unit) for name, unit in _geometry(program))
+    yield from (("geometry", name, unit) for name, unit in geometry_names(program.machine))
     units = _dynamics_units(program)
     yield from (
         ("dynamics", name, unit) for name, unit in zip(_dynamics(program), units, strict=True)
     )
+    if program.layout.parts["unladen"]:
+        for name, unit in zip(_INERTIA, _INERTIA_UNITS, strict=True):
+            yield "unladen", f"unladen_{name}", unit
 
 
 def _inputs(program: "InstanceProgram") -> Iterator[tuple[str, str]]:
     machine = program.machine
-    if isinstance(program.control, ValveDrive):
-        yield from ((f"signal_{name}", "V") for name in program.control.circuit.hydraulics.spools)
-    else:
-        driven = compress(machine.active, machine.is_driven)
-        units = {"m": "N", "rad": "N m"}
-        yield from ((f"force_{joint}", units.get(machine.unit(joint), "")) for joint in driven)
+    names = program.control.reference_units
+    if not names:
+        count = program.control.references(np.zeros(1)).shape[1]
+        names = {f"reference_{i}": "" for i in range(count)}
+    yield from names.items()
     for force in machine.external_forces:
         count = reference_counts([force])[0]
         pairs = zip(WRENCH_COMPONENTS, _WRENCH_UNITS, strict=True)
@@ -97,8 +112,8 @@ def _inputs(program: "InstanceProgram") -> Iterator[tuple[str, str]]:
         yield from ((f"{force.name}_{name}", unit) for name, unit in components)
 
 
-def _geometry(program: "InstanceProgram") -> Iterator[tuple[str, str]]:
-    machine = program.machine
+def geometry_names(machine: Machine) -> Iterator[tuple[str, str]]:
+    """Names and units of the constants of `TreeGeometry`."""
     frames = [f"{joint}_frame" for joint in machine.joints]
     for loop in machine.closure.equations.loops:
         frames += [f"{loop.name}_predecessor", f"{loop.name}_successor"]
@@ -140,7 +155,7 @@ def _setting_names(control: ValveDrive) -> list[str]:
     circuit = control.circuit
     names = circuit.constant_names
     names += [f"{joint}_lower_limit" for joint in circuit.hydraulics.joints]
-    count = len(control.settings) - len(names)
+    count = len(control.settings) - len(names) - len(control.command.setting_units)
     return names + [f"signal_setting_{i}" for i in range(count)]
 
 
@@ -150,7 +165,7 @@ def _dynamics_units(program: "InstanceProgram") -> Iterator[str]:
     laws = [_law_units(machine.unit(joint)) for joint in machine.joints]
     pairs = len(dynamics.forces.lengths.pairs)
     known = {
-        "inertias": ("kg", "m", "m", "m", *("kg m2",) * 6) * len(machine.joints),
+        "inertias": _INERTIA_UNITS * len(machine.joints),
         "joint_laws": [units.get(name, "") for units in laws for name in LAW_PARAMETER_NAMES],
         "distances": [
             *(_law_units("m").get(name, "") for name in LAW_PARAMETER_NAMES), *("m",) * 6,
@@ -164,7 +179,8 @@ def _dynamics_units(program: "InstanceProgram") -> Iterator[str]:
 def _law_units(unit: str) -> dict[str, str]:
     force = "N" if unit == "m" else "N m"
     constant = dict.fromkeys(
-        ("coulomb", "coulomb_offset", "stiction", "constant", "gas_force"), force
+        ("coulomb", "coulomb_offset", "stiction", "stiction_2", "memory", "constant", "gas_force"),
+        force,
     )
     rates = dict.fromkeys(
         ("viscous", "viscous_offset", "damping", "stop_damping"), f"{force} s/{unit}"

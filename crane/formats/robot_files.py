@@ -1,4 +1,4 @@
-"""Files of robots as URDF, whatever they are written in: xacro is expanded, SDF is translated."""
+"""Files of robots as URDF: xacro is expanded, SDF and drawings are translated."""
 
 import json
 import subprocess
@@ -88,7 +88,7 @@ def _run_xacro_process(file: Path) -> dict[str, Any]:
         return {"wrong": f"expanding it takes more than {MAX_SECONDS} s", "file": str(file)}
 
 
-_SDF_SUFFIXES = (".sdf", ".world")
+_SDF_SUFFIXES, DRAWING_SUFFIXES = (".sdf", ".world"), (".yaml", ".yml")
 _ROBOT_SUFFIXES, _AMBIGUOUS_SUFFIXES = (".urdf", ".xacro", *_SDF_SUFFIXES), (".xml", ".mjcf")
 
 
@@ -98,6 +98,12 @@ def open_robot(file: Path) -> tuple[XmlFile, tuple[ForceElement, ...]]:
     Raises:
         DescriptionError: The file cannot be read, expanded or translated.
     """
+    if file.suffix.lower() in DRAWING_SUFFIXES:
+        from crane.formats.drawing.drawing_translation import (
+            open_drawing,  # few machines are drawn
+        )
+
+        return open_drawing(file), ()
     xml = XmlFile(file)
     if file.suffix.lower() == ".xacro" or any(
         element.tag.startswith("{") and "xacro" in element.tag for element in xml.root.iter()
@@ -128,7 +134,7 @@ def is_sdf_file(file: Path) -> bool:
 
 def is_simulator_file(file: Path) -> bool:
     """Whether a file is SDF or MJCF, which give all coordinates of home and are not changed."""
-    is_machine_file = file.suffix.lower() in (".yaml", ".yml")
+    is_machine_file = file.suffix.lower() in DRAWING_SUFFIXES
     return not is_machine_file and (is_sdf_file(file) or not is_robot_file(file))
 
 
@@ -146,6 +152,7 @@ def open_robots(machine: Machine, chains: Iterable[str] | None = None) -> Iterat
             documents = [
                 open_robot(chain.urdf)[0]
                 for chain in machine.chains
-                if is_robot_file(chain.urdf) and (not chain_names or chain.name in chain_names)
+                if (is_robot_file(chain.urdf) or chain.urdf.suffix.lower() in DRAWING_SUFFIXES)
+                and (not chain_names or chain.name in chain_names)
             ]
         yield documents

@@ -120,7 +120,7 @@ def _obstacle(
     if driven := moving & set(_driven_joints(spec)):
         return f", and '{min(driven)}' is driven"
     for name, friction in spec.friction.items():
-        if name in moving and (friction.coulomb or friction.viscous or friction.stiction):
+        if name in moving and (friction.viscous or friction.root or friction.breakaway_force):
             return f", and friction of '{name}' acts on it"
     elements: tuple[AnyForceElement, ...] = (*spec.forces, *spec.gas_springs, *spec.ropes)
     for element in elements:

@@ -180,17 +180,22 @@ class Machine(OneLineRepr, MachineParts):
         return known_as if named.get(known_as) == self.path else str(self.path)
 
     @property
-    def load_expression(self) -> str:
-        """Text from which this machine can be loaded again, without trust in its xacro files.
-
-        For example 'patu655 with {"changes": {"payload.mass": 200.0}, "lock": {"slew": 0.0}}'.
-        """
+    def load_options(self) -> dict[str, Any]:
+        """Further arguments of `crane.load` for this machine, by name."""
         given = {
             "changes": dict(self.parameter_changes), "lock": dict(self.locked_joints),
             "floating": self.floating_base, "packages": self.packages,
             "arguments": dict(self.arguments),
         }  # fmt: skip
-        options = {name: x for name, x in (given | dict(self.chosen_joints)).items() if x}
+        return {name: x for name, x in (given | dict(self.chosen_joints)).items() if x}
+
+    @property
+    def load_expression(self) -> str:
+        """Text from which this machine can be loaded again, without trust in its xacro files.
+
+        For example 'patu655 with {"changes": {"payload.mass": 200.0}, "lock": {"slew": 0.0}}'.
+        """
+        options = self.load_options
         return self.load_name + (CHANGES_SEPARATOR + json.dumps(options) if options else "")
 
     @property

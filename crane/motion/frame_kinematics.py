@@ -41,7 +41,6 @@ class CompiledPoint:
         frame: Index of the frame in the Pinocchio model.
 
     Attributes:
-        body: Index of the body of the frame.
         frame_offset: (3,) origin of the frame in its body, the second argument of the formulas.
 
     Raises:
@@ -51,13 +50,13 @@ class CompiledPoint:
     def __init__(self, machine: Machine, frame: int):
         compiled_closure = self._compiled_closure = machine.closure.compiled_closure
         model_frame = machine.model.frames[frame]
-        self.body = machine.coordinates.body_of_joint[model_frame.parentJoint]
+        self._body = machine.coordinates.body_of_joint[model_frame.parentJoint]
         self.frame_offset = (
-            compiled_closure.geometry.body_rotations[self.body].T
+            compiled_closure.geometry.body_rotations[self._body].T
             @ model_frame.placement.translation
         )
         self._nq, self._n = machine.model.nv, len(machine.active)
-        name = ("frame", type(self).__name__, self.body, folding_pattern(self.frame_offset))
+        name = ("frame", type(self).__name__, self._body, folding_pattern(self.frame_offset))
         if name not in compiled_closure.programs:
             compiled_closure.programs[name] = compiled_closure.cached_program(
                 name, self._build_program
@@ -86,7 +85,7 @@ class CompiledPoint:
         _, bodies, loops = self._compiled_closure.trace_kinematics(tape, 0, 2)
         frame_offset = FormulaConstants(tape, 1, self.frame_offset).vector(0)
         point = add_vectors(
-            bodies.origin[self.body], matvec(bodies.rotation[self.body], frame_offset)
+            bodies.origin[self._body], matvec(bodies.rotation[self._body], frame_offset)
         )
         return bodies, loops, point
 
@@ -112,7 +111,7 @@ class CompiledFrame(CompiledPoint):
 
     def _output_expressions(self, tape: Tape) -> list[Scalar]:
         """Expressions of an output row: x (3), J gamma (3 n), bias (3)."""
-        n, body = self._n, self.body
+        n, body = self._n, self._body
         bodies, loops, point = self._trace_point(tape)
         v_a, parents = tape.load_vector(3, 0, n), bodies.geometry.parents
         joint_rates: list[Scalar] = [0.0]

@@ -38,6 +38,7 @@ from crane.recordings.measured_configurations import (
     tolerance,
 )
 from crane.recordings.recording import (
+    CHANGES_NOTE,
     FORCE_SUFFIX,
     FORCE_UNITS,
     FREE_JOINTS_NOTE,
@@ -196,6 +197,14 @@ def complete_recording(
     Raises:
         RecordingError: As for `read_measured`.
     """
+    if changes := table.notes.get(CHANGES_NOTE):
+        warnings.warn(
+            f"{path}: parameters of the machine change during the recording ({changes}), which "
+            "fits and power balances do not follow: choose a part by --from and --until, and its "
+            "parameters by --set",
+            CraneWarning,
+            stacklevel=2,
+        )
     with located_errors(path):
         table = _remove_free_forces(machine, table)
         # before computations, so that the message names a column of the file

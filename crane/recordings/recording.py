@@ -57,6 +57,9 @@ SENSORS_NOTE, IDEAL_SENSORS = "sensors", "ideal"  # note of ideal quantities
 FREE_JOINTS_NOTE = "free"  # note of free joints
 MACHINE_NAME_NOTE = "machine name"  # note of a name that is not that of the file
 START = "start"  # note of a run that does not start at home
+CHANGES_NOTE = "changes"  # note of parameters that change during a run
+# note of a run in the active coordinates throughout, also near their dead centres
+COORDINATES_NOTE, KEPT_COORDINATES = "coordinates", "kept"
 STOPPED = "stopped"  # note of a run that ended early
 _ACCELERATION_SUFFIX = "_acceleration"
 
@@ -87,6 +90,8 @@ class Recording(Result):
         machine_name: Name of the machine, "" if unknown.
         stopped: Time and reason of an early end, "at t = 1.2 s: ..."; "" if there is none.
         start: Description of a start other than that of the machine file, else "".
+        changes: Parameters that change during the run, "" if none do; see
+            `crane.simulation.parameter_schedule`.
     """
 
     time: Array
@@ -105,6 +110,7 @@ class Recording(Result):
     machine_name: str = ""
     stopped: str = ""
     start: str = ""
+    changes: str = ""
     copy: InitVar[bool] = True
 
     def __post_init__(self, copy: bool) -> None:
@@ -150,7 +156,15 @@ class Recording(Result):
             )
         for name, unit in self.column_units().items():
             timeseries.check_column_name(name, unit)
-        for name in ("machine", "task", "controller", "machine_name", "stopped", "start"):
+        for name in (
+            "machine",
+            "task",
+            "controller",
+            "machine_name",
+            "stopped",
+            "start",
+            "changes",
+        ):
             text = getattr(self, name)
             if text != text.strip() or not is_one_line(text):
                 raise RecordingError(f"{name} {text!r} is not one line of text, give one")
@@ -363,6 +377,7 @@ class Recording(Result):
             FREE_JOINTS_NOTE: ", ".join(self.free),
             STOPPED: self.stopped,
             START: self.start,
+            CHANGES_NOTE: self.changes,
         }
         notes = {"crane recording": "", "machine": self.machine, "task": self.task}
         return notes | {key: text for key, text in optional.items() if text}
@@ -446,5 +461,6 @@ class Recording(Result):
             machine_name=table.notes.get(MACHINE_NAME_NOTE, ""),
             stopped=table.notes.get(STOPPED, ""),
             start=table.notes.get(START, ""),
+            changes=table.notes.get(CHANGES_NOTE, ""),
             copy=False,
         )

@@ -135,10 +135,11 @@ def tipping_message(recording: Recording) -> str:
         return ""
     first = int(np.argmax(channels["stability"] < 0))
     lines = {x: channels[x] for x in channels if x.startswith("stability_")}
-    line = min(lines, key=lambda x: float(lines[x][first]))
+    line = min(lines, key=lambda x: float(lines[x][first]), default="")
+    worst = f"{line} is {lines[line].min():.3g} N m at worst; " if line else ""
     return (
-        f"it would tip at t = {time[first]:.4g} s, where it is fixed all the same: {line} is "
-        f"{lines[line].min():.3g} N m at worst; let a machine that may tip float on contacts"
+        f"it would tip at t = {time[first]:.4g} s, where it is fixed all the same: {worst}let a "
+        "machine that may tip float on contacts"
     )
 
 

@@ -17,6 +17,7 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.progress import progress_reporter
 from crane.common.result import Result
 from crane.common.samples import Array, as_number
+from crane.control.control_law import ControlLaw
 from crane.control.valve_commands import ValveSignals, require_circuit
 from crane.control.valve_drive import ValveDrive
 from crane.description.sensors import SUPPLY_PRESSURE, TANK_PRESSURE, VALVE_SIGNAL_PREFIX
@@ -40,7 +41,14 @@ from crane.recordings.recording import (
 )
 from crane.recordings.recording_reader import FULL_TIME_SPAN, TimeSpan, read_quantities
 from crane.recordings.sensor_discrepancy import warn_discrepancies
-from crane.recordings.timeseries import TIME, Table, table_column, time_derivative
+from crane.recordings.timeseries import (
+    TIME,
+    Table,
+    table_column,
+    time_derivative,
+)
+from crane.simulation.parameter_schedule import ParameterSchedule
+from crane.simulation.recorded_inputs import add_recorded_tip_force, recorded_references
 from crane.simulation.recorded_run import read_simulation, simulated_columns
 from crane.simulation.simulation_run import Progress, simulate
 
@@ -122,15 +130,20 @@ def replay(
     progress: Progress | None = None,
     columns: str | Path | None = None,
     span: TimeSpan = FULL_TIME_SPAN,
+    controller: str | None = None,
 ) -> tuple[Recording, Comparison]:
-    """Simulate a hydraulic machine with measured valve signals.
+    """Simulate a machine with measured valve signals, or without a circuit with measured forces.
 
     The file has a column voltage_X [V] for every valve that was moved, pressures of pump and tank
     where they were measured (pressure_supply, pressure_tank), and whatever else is to be compared:
     strokes or angles, velocities, pressures (see `crane.recordings.measured_recordings`). The
     simulation starts from the measured configuration and velocity, at rest or fitted over the
     first tenth of a second, and from the measured pressures. Where they are not measured, it
-    starts at home and rest, and with pressures that hold the machine.
+    starts at home and rest, and with pressures that hold the machine. Parameters change where the
+    file says so, see `crane.simulation.parameter_schedule`.
+
+    A force at the tip that the file has (load_tip_force_x [N]) acts on it. With a controller the
+    references of the file are followed in place of the signals.
 
     Args:
         machine: The machine.
@@ -140,32 +153,32 @@ def replay(
         columns: Assignment of the columns of a log, if not that of the sensors of the machine,
             see `crane.recordings.logs`.
         span: Time span [s] by the clock of the file; the simulation starts at zero.
+        controller: Name of a built-in controller whose references the file has.
 
     Returns:
         The simulated recording, and its comparison with the file.
 
     Raises:
         RecordingError: The file is malformed, or has no signals.
-        InputError: The machine has no valves.
+        InputError: A parameter that changes is unknown.
     """
     progress = progress_reporter(progress)
     step = as_number(step, "the step", "s", greater_than=0)
     table = read_quantities(path, machine, columns, span)
     try:
-        inputs = replay_inputs(machine, table)
-        drive, time = inputs.valve_drive(machine), inputs.time
+        machine = add_recorded_tip_force(machine, table)
+        schedule = ParameterSchedule.from_notes(table.notes)
+        time, drive, initial = _recorded_drive(machine, table, controller)
         steps = int(time[-1] / step + 1e-9)
         if steps < 1:
             raise RecordingError(f"is shorter than a step of {step:g} s, shorten the step")
-        recording = simulate(
-            machine,
-            drive,
-            inputs.initial,
-            steps * step,
-            step,
-            label=Path(path).stem,
-            progress=progress,
-        )
+        label = Path(path).stem
+        if schedule.changes or schedule.keeps_chart:
+            recording = schedule.simulate(machine, drive, initial, steps, step, label, progress)
+        else:
+            recording = simulate(
+                machine, drive, initial, steps * step, step, label=label, progress=progress
+            )
         names = simulated_columns(machine, table, recording)
     except RecordingError as error:
         raise RecordingError(prefix_location(str(path), error)) from None
@@ -182,6 +195,16 @@ def replay(
         )
     ]
     return recording, Comparison(time[inside], tuple(channels), recording)
+
+
+def _recorded_drive(
+    machine: Machine, table: Table, controller: str | None
+) -> tuple[Array, ControlLaw, tuple[Array, Array] | None]:
+    """Instants (N,) [s] from zero, the recorded references, signals or forces, and the start."""
+    if controller is not None or machine.hydraulics is None:
+        return recorded_references(machine, table, controller)
+    inputs = replay_inputs(machine, table)
+    return inputs.time, inputs.valve_drive(machine), inputs.initial
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from crane.common.errors import (
     is_one_line,
 )
 from crane.common.progress import ignore_progress, progress_reporter
-from crane.common.samples import as_number
+from crane.common.samples import Array, as_number
 from crane.common.threads import single_threaded_blas
 from crane.control.control_law import (
     ControlLaw,
@@ -205,6 +205,8 @@ def integrate(
     tolerance: float | None = None,
     records_transitions: bool = False,
     ends_with_command: bool = False,
+    earlier: IntegrationResult | None = None,
+    keeps_chart: bool = False,
 ) -> IntegrationResult:
     """Integrate a run without computing its channels; see `simulate`.
 
@@ -219,6 +221,8 @@ def integrate(
         tolerance: See `simulate`.
         records_transitions: Whether the stick-slip modes of the chart record their transitions.
         ends_with_command: Whether the run ends with the command of the valves.
+        earlier: A run of a variant of the machine, whose last state is the initial one.
+        keeps_chart: See `ChartSwitchingIntegrator`.
 
     Returns:
         The run; it is shorter where it was stopped, or where the command ended.
@@ -229,29 +233,20 @@ def integrate(
         SimulationError: The run cannot start.
     """
     machine = dynamics.machine
-    q_a, v_a = initial_motion(machine, initial, control)
-    start_text = ""
-    if initial is None:
-        q_a, start_text = equilibrium_on_contacts(dynamics, q_a)
-    try:
-        # from home, so that a run does not depend on earlier solutions
-        configuration = machine.closure.solve(q_a, initial_guess=machine.home)
-        if isinstance(control, ControlLaw) and dynamics.formulation == "exact":
-            controller_state = control.start_closed(dynamics, configuration)
-        else:
-            controller_state = control.start(configuration[machine.closure.active])
-    except ClosureError as error:
-        raise SimulationError(f"at t = 0 s, where the motion starts: {error}") from None
-    if text := buried_contact_text(machine, configuration):
-        raise SimulationError(f"at t = 0 s, where the motion starts: {text}")
-    contact_states = np.zeros(state_count(machine.external_forces))
-    energies = np.zeros(2 + len(machine.external_forces))
-    state = np.concatenate([configuration, v_a, contact_states, controller_state, energies])
-    chart = Chart.from_dynamics(dynamics, control, len(controller_state))
+    start_text, first = "", 0
+    if earlier is None:
+        state, controller_states, start_text = _initial_state(dynamics, control, initial)
+    else:
+        layout = earlier.chart.state_layout
+        state = earlier.array[-1, : layout.size].copy()
+        controller_states, first = layout.parts["controller"], round(earlier.time[-1] / step)
+    chart = Chart.from_dynamics(dynamics, control, controller_states)
     if records_transitions:
         chart.stick_slip.transitions = []
-    integrator = ChartSwitchingIntegrator(chart, integrator_factory(chart, method, tolerance))
-    times = step * np.arange(step_count + 1, dtype=np.float64)
+    integrator = ChartSwitchingIntegrator(
+        chart, integrator_factory(chart, method, tolerance), keeps_chart
+    )
+    times = step * np.arange(first, first + step_count + 1, dtype=np.float64)
     # stored by columns, so that channels are views
     rows = scratch_arrays.empty_array(step_count + 1, chart.row_layout.size)
     released_until = 0  # instants whose memory pages are released
@@ -293,6 +288,34 @@ def integrate(
     if invalid_motion is not None:
         return run.first_instants(invalid_motion[0], SimulationError(invalid_motion[1]))
     return run
+
+
+def _initial_state(
+    dynamics: Dynamics,
+    control: Controller,
+    initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None,
+) -> tuple[Array, int, str]:
+    """Initial state, the number of states of the controller, and a note about the state."""
+    machine = dynamics.machine
+    q_a, v_a = initial_motion(machine, initial, control)
+    start_text = ""
+    if initial is None:
+        q_a, start_text = equilibrium_on_contacts(dynamics, q_a)
+    try:
+        # from home, so that a run does not depend on earlier solutions
+        configuration = machine.closure.solve(q_a, initial_guess=machine.home)
+        if isinstance(control, ControlLaw) and dynamics.formulation == "exact":
+            controller_state = control.start_closed(dynamics, configuration)
+        else:
+            controller_state = control.start(configuration[machine.closure.active])
+    except ClosureError as error:
+        raise SimulationError(f"at t = 0 s, where the motion starts: {error}") from None
+    if text := buried_contact_text(machine, configuration):
+        raise SimulationError(f"at t = 0 s, where the motion starts: {text}")
+    contact_states = np.zeros(state_count(machine.external_forces))
+    energies = np.zeros(2 + len(machine.external_forces))
+    state = np.concatenate([configuration, v_a, contact_states, controller_state, energies])
+    return state, len(controller_state), start_text
 
 
 def has_fixed_steps(dynamics: Dynamics, control: Controller, method: str | None) -> bool:

@@ -7,7 +7,8 @@ import numpy as np
 from crane.common.errors import CraneError, InputError, warn
 from crane.common.plausible_ranges import LONGEST
 from crane.common.samples import Array
-from crane.formats.additions.steel_cylinder import AttachmentPair, SteelCylinder
+from crane.formats.additions.cylinder_addition import AttachmentPair
+from crane.formats.steel_cylinder import SteelCylinder
 from crane.machine.machine import Machine
 
 _FINE_SAMPLES = 400  # over the range of the joint
@@ -268,7 +269,7 @@ def _solve_at(machine: Machine, joint: str, value: float, guess: Array) -> Array
 def warn_about_masses(machine: Machine, cylinder: SteelCylinder, joint: str) -> None:
     """Warn if all bodies that a joint moves are lighter than its cylinder."""
     model = machine.model
-    cylinder_mass = cylinder.barrel_inertial.mass + cylinder.rod_inertial.mass
+    cylinder_mass = cylinder.barrel_inertia.mass + cylinder.rod_inertia.mass
     rates = machine.closure.gamma(machine.home)[:, machine.active.index(joint)]
     moved_bodies = [
         i for i, x in enumerate(model.joints)

@@ -15,6 +15,11 @@ from crane.common.errors import (
     warn,
 )
 from crane.common.package_search import use_load_options
+from crane.formats.additions.cylinder_addition import (
+    AttachmentPair,
+    add_barrel_and_rod,
+    parse_attachment_point,
+)
 from crane.formats.additions.distance_curve import (
     DistanceCurve,
     distance_curve,
@@ -22,15 +27,10 @@ from crane.formats.additions.distance_curve import (
     warn_about_strokes,
 )
 from crane.formats.additions.open_loop_search import LoopProposal, propose_loops
-from crane.formats.additions.steel_cylinder import (
-    AttachmentPair,
-    SteelCylinder,
-    add_barrel_and_rod,
-    parse_attachment_point,
-)
 from crane.formats.machine_file.machine_reader import read_machine_spec
 from crane.formats.machine_file.machine_writer import MachineDraft, loop_data
 from crane.formats.machine_loading import load
+from crane.formats.steel_cylinder import SteelCylinder
 from crane.machine.machine import Machine
 
 _NAME_SUFFIXES = (
@@ -171,7 +171,7 @@ def add_cylinder(
         length_range=(float(distances.length.min()), float(distances.length.max())),
         stroke_range=(float(strokes[0]), float(strokes[1])),
         lever_arm_range=(min(lever_arms), max(lever_arms)),
-        masses=(cylinder.barrel_inertial.mass, cylinder.rod_inertial.mass),
+        masses=(cylinder.barrel_inertia.mass, cylinder.rod_inertia.mass),
         notes=tuple(notes),
     )
 

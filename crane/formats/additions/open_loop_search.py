@@ -18,7 +18,7 @@ from crane.closure.loop_equations import frame_id
 from crane.common.samples import Array
 from crane.description.kinematic_tree import Z_AXIS, Joint, Vector, to_vector
 from crane.description.specification import LoopSpec, MachineSpec
-from crane.formats.additions.steel_cylinder import joints_between
+from crane.formats.additions.cylinder_addition import joints_between
 from crane.formats.machine_file.structure_sections import loop_end_pairs
 
 # largest gaps relative to the characteristic length, the second without a common normal

@@ -15,6 +15,7 @@ from crane.common.plausible_ranges import LONGEST
 from crane.common.samples import Array
 from crane.description.kinematic_tree import TENSOR_ATTRIBUTES, Inertial, inertia_problem
 from crane.description.specification import MachineSpec
+from crane.formats.robot_files import DRAWING_SUFFIXES
 from crane.formats.visuals.urdf_shapes import MeshShape, UrdfShapes, Visual
 from crane.formats.xml_file import XmlFile, parse_attribute
 from crane.hydraulics.circuit_elements import MAIN_PUMP, TANK_NODE
@@ -71,6 +72,8 @@ def warn_about_implausible_values(files: Sequence[XmlFile], spec: MachineSpec | 
         bounds = _bounds_by_link(shapes.shapes["collision"]) | _bounds_by_link(
             shapes.shapes["visual"]
         )
+        if xml.file.suffix.lower() in DRAWING_SUFFIXES:  # lines between points
+            bounds = {}
         for link in xml.root.iterfind("link"):
             name = link.get("name", "").strip()
             _warn_about_body(xml, link, joint_distances.get(name, 0.0), bounds.get(name))

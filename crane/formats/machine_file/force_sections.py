@@ -28,15 +28,14 @@ def read_friction(top: YamlSection, tree: TreeBuilder) -> dict[str, Friction]:
         values = item.values()
         is_drive_intended = values.pop("is_driving", False)
         law = Friction(**values)
-        for kind in () if is_drive_intended else ("coulomb", "viscous"):
+        if (kind := law.driving_kind) and not is_drive_intended:
             mean, offset = getattr(law, kind), getattr(law, f"{kind}_offset")
-            if abs(offset) > mean:
-                warn(
-                    f"{item.source_location()}: friction of '{joint}' drives the joint in one "
-                    f"direction (|{kind}_offset| {abs(offset):g} > {kind} {mean:g}), a constant "
-                    "force may hide in it; write drives: true if it is meant",
-                    stacklevel=3,
-                )
+            warn(
+                f"{item.source_location()}: friction of '{joint}' drives the joint in one "
+                f"direction (|{kind}_offset| {abs(offset):g} > {kind} {mean:g}), a constant "
+                "force may hide in it; write drives: true if it is meant",
+                stacklevel=3,
+            )
         return law
 
     return top.read_map("friction", read_law, tree.check_joint)

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 from crane.common.errors import DescriptionError, InputError, suggest_names
 from crane.common.package_search import load_options
 from crane.common.unit_conversions import accepted_units, is_quantity, unit_size
+from crane.description.circuit_schema import CYLINDER_SIZE_KEYS
 from crane.description.estimation_settings import (
     EstimationSettings,
     ParameterPrior,
@@ -59,6 +60,7 @@ from crane.formats.machine_file.structure_sections import (
     TreeBuilder,
     read_chains,
     read_couplings,
+    read_drawn_chain,
     read_drives,
     read_home,
     read_loops,
@@ -121,23 +123,20 @@ def read_plain_data(path: Path) -> dict[str, Any]:
 def _read_machine(path: Path) -> MachineSpec:
     top = YamlSection.read(path, MACHINE)
     name, source = top.text("name"), top.text("source")
-    chains, tree, friction, couplings, springs, gravity = read_chains(top, path)
+    drawn = read_drawn_chain(top, path)
+    chains, tree, friction, couplings, springs, gravity = read_chains(top, path, drawn)
     top.turns |= dict.fromkeys(TIP_COORDINATES, False)
     top.turns |= {x: True for group in ATTITUDE_COORDINATES for x in group}
     top.turns |= {name: joint.kind != "prismatic" for name, joint in tree.joints.items()}
-    loops = read_loops(top, tree)
+    loops = drawn.loops + read_loops(top, tree)
+    _fill_circuit(top)
     couplings += read_couplings(top, tree)
-    active: tuple[str, ...] = UnknownNames()
-    with error_recovery():
-        active = top.names("active")
-    for joint in active:
-        with error_recovery():
-            tree.check_joint(joint, top.source_location("active"))
-    if not all(joint in tree.joints for joint in active):
-        active = UnknownNames()
+    active = _read_active_joints(top, tree, drawn)
     free = _read_free_joints(top, tree, active)
     locations = {key: top.source_location(key) for key in top} | source_locations(loops, couplings)
     home, home_locations = read_home(top, tree)
+    home = dict(drawn.home) | home
+    locations |= {f"home {joint}": drawn.source_locations[f"home {joint}"] for joint in drawn.home}
     locations |= home_locations
     rotor_inertias = _read_or_default(
         top.value_map, {}, "rotor_inertia", YamlSection.number, tree.check_joint
@@ -191,6 +190,25 @@ def _read_machine(path: Path) -> MachineSpec:
         gravity=gravity,
         written_numbers=top.written_numbers(),
     )
+
+
+def _read_active_joints(
+    top: YamlSection, tree: TreeBuilder, drawn: MachineSpec
+) -> tuple[str, ...]:
+    active: tuple[str, ...] = UnknownNames()
+    with error_recovery():
+        active = top.names("active") if "active" in top else drawn.active or ()
+    for joint in active:
+        with error_recovery():
+            tree.check_joint(joint, top.source_location("active"))
+    return active if all(joint in tree.joints for joint in active) else UnknownNames()
+
+
+def _fill_circuit(top: YamlSection) -> None:
+    """Let the cylinders of the circuit have the dimensions that the drawing has."""
+    drawing, circuit = top.section("drawing"), top.section("hydraulics")
+    if drawing is not None and circuit is not None:
+        circuit.fill_items("cylinders", drawing, CYLINDER_SIZE_KEYS)
 
 
 def _read_supports(

@@ -6,6 +6,7 @@ The tree grows chain by chain, and knows whether names that others use are in it
 import math
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -178,8 +179,21 @@ class TreeBuilder:
         return leaves[0] if len(leaves) == 1 else None
 
 
+def read_drawn_chain(top: YamlSection, path: Path) -> MachineSpec:
+    """The machine that the section `drawing` has, of one chain; of none without the section."""
+    if "drawing" in top:
+        with error_recovery():
+            spec = read_urdf(path)
+            chain = replace(
+                spec.chains[0], name="drawing", source_location=top.source_location("drawing")
+            )
+            return replace(spec, chains=(chain,))
+        top.is_complete = False
+    return MachineSpec(name="", source="", path=path, chains=(), tree=Tree({}, {}))
+
+
 def read_chains(
-    top: YamlSection, path: Path
+    top: YamlSection, path: Path, drawn: MachineSpec
 ) -> tuple[
     tuple[Chain, ...], TreeBuilder, dict[str, Friction], tuple[Coupling, ...],
     tuple[ForceElement, ...], tuple[float, ...],
@@ -191,6 +205,9 @@ def read_chains(
     couplings: tuple[Coupling, ...] = ()
     springs: tuple[ForceElement, ...] = ()
     gravities: dict[tuple[float, ...], str] = {}  # name of a chain that states each
+    for chain in drawn.chains:
+        tree.add_chain(chain, drawn)
+        chains.append(chain)
     for item in top.list_items("chains"):
         tree.is_complete &= top.is_complete
         was_complete = tree.is_complete
@@ -207,7 +224,9 @@ def read_chains(
                 gravities.setdefault(urdf.gravity, chain.name)
     tree.is_complete &= top.is_complete
     if not chains and tree.is_complete:
-        report_error(top.error_at("chains", "there are no chains, add one under 'chains:'"))
+        report_error(
+            top.error_at("chains", "there are no chains, add one under 'chains:', or a 'drawing:'")
+        )
         tree.is_complete = False
     with error_recovery(harmless=True):
         tree.add_floating_base(check_freedoms(top.names("floating")))

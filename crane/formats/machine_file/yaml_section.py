@@ -222,6 +222,29 @@ class YamlSection(YamlValues):
                 item.copy_key(common, common_key)
             outer[name], outer.locations[name] = item, outer.locations.get(name, location)
 
+    def fill_items(self, key: str, source: "YamlSection", names: Iterable[str]) -> None:
+        """Let the items of a mapping have what those of another section have.
+
+        Args:
+            key: Of the mapping in both sections.
+            source: The other section.
+            names: Keys to take over into items that have none of them.
+        """
+        items, names = source._data.get(key), set(names)
+        if not isinstance(items, LocatedMapping):
+            return
+        location = source._data.locations[key]
+        outer = self._data.setdefault(key, LocatedMapping(*location))
+        self._data.locations.setdefault(key, location)
+        for name in items if isinstance(outer, LocatedMapping) else ():
+            item = outer.setdefault(name, LocatedMapping(*items.locations[name]))
+            outer.locations.setdefault(name, items.locations[name])
+            if not isinstance(items[name], LocatedMapping) or not isinstance(item, LocatedMapping):
+                continue
+            if names.isdisjoint(item):
+                for shared in names & items[name].keys():
+                    item.copy_key(items[name], shared)
+
     def item_names(self, key: str) -> tuple[str, ...]:
         """Names in a mapping, none where there is none."""
         outer = self._data.get(key)

@@ -290,7 +290,7 @@ class _MjcfWriter:
         return {
             "armature": self.tree.joints[name].rotor_inertia,
             "damping": damping + friction.viscous,
-            "frictionloss": friction.coulomb,
+            "frictionloss": friction.sliding_force,
         }
 
     def _add_composite_joint(self, body: etree._Element, joint: int, placement: pin.SE3) -> None:

@@ -95,7 +95,7 @@ def write_urdf_plus(machine: Machine, path: str | Path) -> None:
 
 def _add_joint_friction(element: etree._Element, machine: Machine, joint: str) -> None:
     if (friction := machine.friction.get(joint)) is not None:
-        add_friction(element, friction.viscous, friction.coulomb)
+        add_friction(element, friction.viscous, friction.sliding_force)
 
 
 def _add_loop(tree: Tree, robot: etree._Element, loop: LoopSpec) -> None:
@@ -327,9 +327,8 @@ def warn_about_unsupported(machine: Machine, format_name: str, others: Sequence[
     names = [
         f"the friction law of {joint}"
         for joint, law in machine.friction.items()
-        if law.coulomb_offset or law.viscous_offset or law.stiction or (
-            law.coulomb and law.smoothing
-        )
+        if law.coulomb_offset or law.viscous_offset or law.stiction or law.stiction_2 or law.root
+        or law.has_history or (law.coulomb and law.smoothing)
     ]  # fmt: skip
     sections = {
         "gas springs": machine.gas_springs,

@@ -9,13 +9,14 @@ is positive definite (Wensing, Kim, Slotine 2018, IEEE Robotics and Automation L
 """
 
 import math
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
-from crane.common.errors import CraneError, InputError
+from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.common.optional_libraries import import_optional_library
 from crane.common.samples import Array
 from crane.identification.estimation.estimators import Estimate, Prior, RegressionProblem
@@ -175,6 +176,8 @@ def solve_feasible(
 def _solve_convex_problem(problem: Any) -> None:
     """Solve a convex problem, with looser tolerances or another solver if necessary.
 
+    Warnings of solvers, which refer to calls of CVXPY, become one line.
+
     Raises:
         CraneError: All solvers fail.
     """
@@ -184,14 +187,30 @@ def _solve_convex_problem(problem: Any) -> None:
         *((cp.CLARABEL, x) for x in (_SOLVER_TOLERANCES, {}, _CAUTIOUS_OPTIONS)),
         (cp.SCS, _SCS_OPTIONS),
     )
+    inaccurate: list[Array] = []  # values of the first inaccurate solution
     for solver, options in solvers:
-        with suppress(cp.SolverError):  # reported below
-            problem.solve(solver=solver, **options)
+        if inaccurate and solver == cp.SCS:  # it is less accurate
             break
-    if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
+        status = cp.SOLVER_ERROR
+        with warnings.catch_warnings(action="ignore"), suppress(cp.SolverError):  # reported below
+            problem.solve(solver=solver, **options)
+            status = problem.status
+        if status == cp.OPTIMAL:
+            return
+        if status == cp.OPTIMAL_INACCURATE and not inaccurate:
+            inaccurate = [variable.value for variable in problem.variables()]
+    if not inaccurate:
         raise CraneError(
-            f"no feasible estimate (solver: {problem.status}), give a larger weight to the prior"
+            f"no feasible estimate (solver: {status}), give a larger weight to the prior"
         )
+    for variable, value in zip(problem.variables(), inaccurate, strict=True):
+        variable.save_value(value)
+    warnings.warn(
+        "the feasible estimate is accurate to few digits only, as the recording hardly determines "
+        "it: give a larger weight to the prior (--prior)",
+        CraneWarning,
+        stacklevel=4,
+    )
 
 
 def divergence_hessian_root(body: Array) -> Array:

@@ -20,6 +20,7 @@ from crane.identification.signals.signal_quality import (
 )
 from crane.recordings.recording import Recording
 
+STANDSTILL_SHARE = 0.05  # of a joint's largest velocity, below which rows are omitted
 _MAX_FORCE_FACTOR = 30.0  # largest ratio of a force to that of the model
 _MIN_CORRELATION = 0.9  # least correlation for a significant factor
 _BLOCK_COUNT = 10  # of time, for the standard error of that factor
@@ -138,11 +139,14 @@ def check_forces(
         # like inertia a quarter of a period later
         if not 0.5 < ratio < 2.0:
             continue
-        correlation = shifted_correlation(
-            expected, measured, round(lag / sampling_step(motion.time))
-        )
-        if abs(lag) > longest_delay and correlation > max(
-            0.9, shifted_correlation(expected, measured, 0) + 0.05
+        # static friction balances whatever acts: rows in motion have to confirm it
+        speed = np.abs(motion.v[:, i])
+        moving = np.flatnonzero(speed >= STANDSTILL_SHARE * speed.max())
+        shift = round(lag / sampling_step(motion.time))
+        if abs(lag) > longest_delay and all(
+            shifted_correlation(expected, measured, shift, rows)
+            > max(0.9, shifted_correlation(expected, measured, 0, rows) + 0.05)
+            for rows in (None, moving)
         ):
             reject_delay(f"{joint}_force", lag, "its model", trust)
     if messages:

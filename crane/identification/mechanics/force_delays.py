@@ -8,6 +8,7 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.common.scratch_arrays import release_pages
 from crane.identification.mechanics.base_parameters import BaseParameters
+from crane.identification.mechanics.force_comparison import STANDSTILL_SHARE
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.signals.signal_processing import Motion, low_pass
 from crane.identification.signals.signal_quality import shift_remedy, spectral_edge_frequency
@@ -17,7 +18,6 @@ _CUTOFF_FACTOR = 10.0  # cutoff, times the frequency of the motion
 _SAMPLES_PER_PERIOD = 20.0  # samples of the regressor per period of the cutoff
 _ROW_STRIDE = 5  # samples per row
 _MAX_SAMPLES = 30_000  # samples that are used
-_STANDSTILL_SHARE = 0.05  # of a joint's largest velocity, below which rows are omitted
 _MAX_BLOCKS, _MIN_BLOCKS = 20, 5  # number of blocks for standard errors
 _PERIODS_PER_BLOCK = 2.0  # periods of the motion per block
 _MAX_ITERATIONS = 10
@@ -134,7 +134,7 @@ def force_delays(
     known = low_pass(time, model.known_forces(at), cutoff)
     force = low_pass(motion.time, motion.tau, cutoff)[chosen]
     fastest = np.maximum(motion.v.max(axis=0), -motion.v.min(axis=0))
-    is_resting = np.abs(motion.v[chosen]) <= np.maximum(min_speed, _STANDSTILL_SHARE * fastest)
+    is_resting = np.abs(motion.v[chosen]) <= np.maximum(min_speed, STANDSTILL_SHARE * fastest)
     is_used = ~binary_dilation(is_resting, np.ones((2 * filter_reach + 1, 1), dtype=bool))
     is_used[:filter_reach] = is_used[-filter_reach:] = False
     is_used[:, ~model.machine.is_driven] = False  # forces of free joints are zero

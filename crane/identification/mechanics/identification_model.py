@@ -121,7 +121,7 @@ class IdentificationModel:
 
 TERM_KINDS = {
     **dict.fromkeys((*_FRICTION_KINDS, "root", "rotor_inertia", "gas_scale"), (0, 0, "")),
-    "stiction": (0, 9, "the Stribeck velocities"),
+    "stiction": (0, 2, "the Stribeck velocities"),
     "presliding": (1, 1, "the characteristic distance"),
     "memory": (2, 2, "the time constant and the characteristic speed"),
 }

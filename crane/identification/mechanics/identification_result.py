@@ -1,7 +1,6 @@
 """Result of an identification: parameters, covariance, prediction errors, tables."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -44,8 +43,6 @@ class Identification(EstimatedValues, Result):
         magnitude: (r,) magnitudes of the base parameters: sqrt(sum_j (K_ij s_j)^2) for the group
             K_i and the `parameter_magnitudes` s.
         advice: Text that recommends a motion for the parameters that are not determined.
-        speeds: Least and largest speed of the training data by direction of friction [m/s],
-            [rad/s].
         bandwidth: Bandwidth of the low-pass [Hz].
         min_speed: (n,) standstill velocities, below which rows were omitted [m/s], [rad/s].
         validation: Comparison of forces on held-out data, None without them.
@@ -63,7 +60,6 @@ class Identification(EstimatedValues, Result):
     training: ForceComparison
     magnitude: Array
     advice: str
-    speeds: Mapping[str, tuple[float, float]]
     bandwidth: float
     min_speed: Array
     validation: ForceComparison | None = None
@@ -170,8 +166,10 @@ class Identification(EstimatedValues, Result):
             (N, n) [N], [N m].
         """
         at = self.model.samples(q_a, v_a, a_a, step)
-        W = self.model.regressor(at)[:, :, self.base.independent]
-        return W @ self.values + self.model.known_forces(at)
+        W, values = self.model.regressor(at), self.parameters
+        if values is None:
+            W, values = W[:, :, self.base.independent], self.values
+        return W @ values + self.model.known_forces(at)
 
     @property
     def described_machine(self) -> Machine:

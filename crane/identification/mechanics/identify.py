@@ -41,7 +41,7 @@ from crane.identification.mechanics.identifiability import (
 )
 from crane.identification.mechanics.identification_model import IdentificationModel, TermChanges
 from crane.identification.mechanics.identification_result import Identification
-from crane.identification.mechanics.model_terms import FrictionTerm, ModelTerm, body_names
+from crane.identification.mechanics.model_terms import ModelTerm, body_names
 from crane.identification.mechanics.regression_equations import (
     CombinedRegressor,
     RegressionEquations,
@@ -68,7 +68,6 @@ _PASSBAND_SHARE = 0.75  # of the passband of a smoother: there it passes 91 %
 _MIN_BANDWIDTH_FACTOR = 3.0  # least bandwidth, times the spectral edge frequency of the velocities
 _POWER_SHARE = 0.99
 _MAX_BANDWIDTH_FACTOR = 40.0  # times the spectral edge frequency of the accelerations
-_SPEED_SAMPLES = 500  # samples for ranges of speeds
 _PASS_SHARE = 0.3  # of the remaining progress, per pass over a recording
 
 
@@ -167,7 +166,6 @@ def identify(
     training, validation_comparison = equations.compare(predicting_values), None
     base, bandwidth, min_speeds = equations.base, equations.bandwidth, equations.min_speed
     advice = motion_advice(machine, motions)
-    speeds = speed_ranges(model, motions, min_speeds)
     del equations, motions
     if validation is not None:
         validation_motions = prepare_motions(machine, validation, trust, progress, "validation")
@@ -180,7 +178,7 @@ def identify(
     magnitudes = np.sqrt(identifiable.grouping**2 @ parameter_sizes**2)
     identification = Identification(
         model, identifiable, values, covariance, parameters, estimate, method, feasible, training,
-        magnitudes, advice, speeds, bandwidth, min_speeds, validation_comparison, delays,
+        magnitudes, advice, bandwidth, min_speeds, validation_comparison, delays,
     )  # fmt: skip
     if all(mark == "not determined" for mark in identification.marks):
         reject_unless_trusted(identification.warning, trust)
@@ -342,26 +340,6 @@ def as_list(
     if recordings is None:
         return []
     return [recordings] if isinstance(recordings, Recording | Motion) else list(recordings)
-
-
-def speed_ranges(
-    model: IdentificationModel, motions: Sequence[Motion], min_speed: Array
-) -> dict[str, tuple[float, float]]:
-    """Least and largest speed along each direction of friction."""
-    directions = {
-        x.direction.name: x.direction for x in model.terms if isinstance(x, FrictionTerm)
-    }
-    fastest = dict.fromkeys(directions, 0.0)
-    for motion in motions:
-        sample_slice = slice(None, None, max(1, len(motion.time) // _SPEED_SAMPLES))
-        at = model.samples(motion.q[sample_slice], motion.v[sample_slice], motion.a[sample_slice])
-        for name, direction in directions.items():
-            speed = np.einsum("ij,ij->i", direction.jacobian(model.machine, at), at.v_a)
-            fastest[name] = max(fastest[name], float(np.abs(speed).max()))
-    lowest = dict(zip(model.machine.active, min_speed.tolist(), strict=True))
-    return {
-        name: (lowest.get(name, _SLOW_SPEED_SHARE * most), most) for name, most in fastest.items()
-    }
 
 
 def multi_pass_progress(progress: Progress) -> Progress:

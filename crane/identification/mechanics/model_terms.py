@@ -12,7 +12,8 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.description.force_elements import Friction
 from crane.dynamics.dynamics import Dynamics
-from crane.dynamics.joint_forces import JointForces
+from crane.dynamics.friction_history import dahl_deflections, remembered_speeds
+from crane.dynamics.joint_forces import JointForces, root_speed
 from crane.machine.machine import Machine
 
 BODY_PARAMETERS = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
@@ -105,7 +106,10 @@ class DirectionalTerm(ModelTerm):
 
     Attributes:
         direction: The direction.
+        law_constants: Fields of `Friction` that are no parameters of the term.
     """
+
+    law_constants: Mapping[str, float] = {}
 
     def __init__(
         self,
@@ -192,12 +196,7 @@ class VelocityFriction(DirectionalTerm):
         shapes: Functions velocity (N,) -> (N,) by name of the parameter.
         nominal: Nominal values; default zero.
         nonnegative: Names of parameters that must not be negative.
-
-    Attributes:
-        stribeck_velocities: Stribeck velocities [m/s], [rad/s].
     """
-
-    stribeck_velocities: tuple[float, ...] = ()
 
     def __init__(
         self,
@@ -216,11 +215,19 @@ class VelocityFriction(DirectionalTerm):
         """See `ModelTerm`."""
         rows = self.direction.jacobian(self._machine, samples)
         speed = np.einsum("ij,ij->i", rows, samples.v_a)
-        return rows[:, :, None] * self.steady_forces(speed)[:, None, :]
+        force = np.stack([shape(speed) for shape in self._shapes.values()], axis=1)
+        return rows[:, :, None] * force[:, None, :]
 
-    def steady_forces(self, v: Array) -> Array:
-        """Forces (N, k) per parameter at steady speeds (N,)."""
-        return np.stack([shape(v) for shape in self._shapes.values()], axis=1)
+
+def _described_law(machine: Machine, direction: str | ForceDirection) -> Friction:
+    """Described friction along a direction; where there is none, with an unsmoothed sign."""
+    name = direction if isinstance(direction, str) else direction.name
+    return machine.friction.get(name, Friction(smoothing=0.0))
+
+
+def _smoothed_sign(v: Array, smoothing: float) -> Array:
+    """Sign of velocities as in the simulation."""
+    return np.tanh(v / smoothing) if smoothing else np.sign(v)
 
 
 def friction_term(
@@ -233,21 +240,20 @@ def friction_term(
     """Friction term of equation (5) of the reduced-scale forwarder paper, with stiction.
 
         coulomb s + coulomb_offset + viscous v + viscous_offset |v|
-        + sum_i stiction_i s e^-(v / v_i)^2,    s = sign(v).
+        + stiction s e^-(v / v_1)^2 + stiction_2 s e^-(v / v_2)^2,    s = sign(v).
 
     Args:
         machine: The machine, whose friction gives the nominal values.
         direction: Name of a joint, or a combination.
         kinds: Names of the kinds, some of the four.
         smoothing: Smoothing velocity of the sign [m/s], [rad/s]; default that of the machine.
-        stribeck: Stribeck velocities v_i [m/s], [rad/s]; parameters of several are stiction_1, ...
+        stribeck: At most two Stribeck velocities v_i [m/s], [rad/s].
     """
-    name = direction if isinstance(direction, str) else direction.name
-    law = machine.friction.get(name, Friction(smoothing=0.0))
+    law = _described_law(machine, direction)
     width = law.smoothing if smoothing is None else smoothing
 
-    def sign(v: Array) -> Array:  # as in the simulation
-        return np.tanh(v / width) if width else np.sign(v)
+    def sign(v: Array) -> Array:
+        return _smoothed_sign(v, width)
 
     shapes_by_kind: dict[str, ForceShape] = {
         "coulomb": sign,
@@ -259,23 +265,24 @@ def friction_term(
         check_name(kind, shapes_by_kind, f"friction '{kind}' is unknown")
     shapes = {kind: shapes_by_kind[kind] for kind in kinds}
     nominal = {kind: getattr(law, kind) for kind in kinds}
-    for i, v_s in enumerate(stribeck, start=1):
-        label = "stiction" if len(stribeck) == 1 else f"stiction_{i}"
+    constants = {"smoothing": width}
+    for number, v_s in zip(("", "_2"), stribeck, strict=False):
+        label = f"stiction{number}"
         shapes[label] = lambda v, v_s=v_s: sign(v) * np.exp(-((v / v_s) ** 2))  # type: ignore[misc]
-        if law.stribeck == v_s:
-            nominal[label] = law.stiction
+        constants[f"stribeck{number}"] = v_s
+        if getattr(law, f"stribeck{number}") == v_s:
+            nominal[label] = getattr(law, label)
     term = VelocityFriction(
         machine, direction, shapes, nominal, nonnegative=("coulomb", "viscous")
     )
-    term.stribeck_velocities = tuple(stribeck)
+    term.law_constants = constants
     return term
 
 
 def root_friction_term(machine: Machine, direction: str | ForceDirection) -> VelocityFriction:
     """Friction term of mixed lubrication: root sign(v) sqrt |v|."""
-    return VelocityFriction(
-        machine, direction, {"root": lambda v: np.sign(v) * np.sqrt(np.abs(v))}
-    )
+    nominal = {"root": _described_law(machine, direction).root}
+    return VelocityFriction(machine, direction, {"root": root_speed}, nominal)
 
 
 class FrictionalMemory(DirectionalTerm):
@@ -293,33 +300,32 @@ class FrictionalMemory(DirectionalTerm):
     def __init__(
         self, machine: Machine, direction: str | ForceDirection, lag: float, speed: float
     ):
-        super().__init__(machine, direction, ("memory",), (0.0,), (False,))
+        law = _described_law(machine, direction)
+        is_described = (lag, speed) == (law.memory_time, law.memory_speed)
+        super().__init__(
+            machine, direction, ("memory",), (law.memory if is_described else 0.0,), (False,)
+        )
         if not (lag > 0 and speed > 0):
             raise InputError(
                 f"the memory of '{self.direction.name}' has the lag {lag:g} s and the speed "
                 f"{speed:g}, give two numbers above 0"
             )
-        self._lag, self._speed = lag, speed
+        self._lag, self._speed, self._smoothing = lag, speed, law.smoothing
+        self.law_constants = {"memory_time": lag, "memory_speed": speed}
 
     def columns(self, samples: MotionSamples) -> Array:
         """See `ModelTerm`."""
-        from scipy.signal import lfilter
-
         if samples.step is None:
             raise InputError(f"'{self.names[0]}' depends on time, give the step of the samples")
         rows = self.direction.jacobian(self._machine, samples)
         v = np.einsum("ij,ij->i", rows, samples.v_a)
-        share = -np.expm1(-samples.step / self._lag)  # exact for constant speed
-        w, state = np.empty_like(v), samples.term_states.get(self, np.zeros(1))
+        w, state = np.empty_like(v), samples.term_states.get(self, 0.0)
         for start, end in pairwise(sorted({0, *samples.starts, len(v)})):
-            state = np.zeros(1) if start in samples.starts else state
-            w[start:end], state = lfilter([share], [1, share - 1], np.abs(v[start:end]), zi=state)
+            state = 0.0 if start in samples.starts else state
+            w[start:end], state = remembered_speeds(v[start:end], samples.step, self._lag, state)
         samples.term_states[self] = state
-        return (rows * (np.sign(v) * np.exp(-w / self._speed))[:, None])[:, :, None]
-
-    def steady_forces(self, v: Array) -> Array:
-        """Force (N, 1) per parameter at steady speeds (N,), where w = |v|."""
-        return (np.sign(v) * np.exp(-np.abs(v) / self._speed))[:, None]
+        force = _smoothed_sign(v, self._smoothing) * np.exp(-w / self._speed)
+        return (rows * force[:, None])[:, :, None]
 
 
 class PreslidingFriction(DirectionalTerm):
@@ -334,32 +340,24 @@ class PreslidingFriction(DirectionalTerm):
     """
 
     def __init__(self, machine: Machine, direction: str | ForceDirection, length: float):
-        super().__init__(machine, direction, ("presliding",), (0.0,), (True,))
+        law = _described_law(machine, direction)
+        nominal = law.presliding if length == law.presliding_length else 0.0
+        super().__init__(machine, direction, ("presliding",), (nominal,), (True,))
         if not length > 0:
             raise InputError(f"the length of presliding of '{self.direction.name}' is {length:g}")
-        self._length = length
+        self._length, self.law_constants = length, {"presliding_length": length}
 
     def columns(self, samples: MotionSamples) -> Array:
         """See `ModelTerm`."""
         rows = self.direction.jacobian(self._machine, samples)
         travel = self.direction.coordinate(self._machine, samples)
-        state, last = samples.term_states.get(self, (0.0, travel[0]))
-        steps = np.diff(travel, prepend=last) / self._length
-        steps[list(samples.starts)] = 0.0
-        z = np.empty(len(travel))
-        restarts = set(samples.starts)
-        for i, step in enumerate(steps.tolist()):
-            if i in restarts:
-                state = 0.0
-            limit = 1.0 if step > 0 else -1.0
-            state = limit + (state - limit) * np.exp(-abs(step))  # exact for a constant direction
-            z[i] = state
-        samples.term_states[self] = (state, travel[-1])
+        state, z = samples.term_states.get(self, (0.0, None)), np.empty(len(travel))
+        for start, end in pairwise(sorted({0, *samples.starts, len(travel)})):
+            state = (0.0, None) if start in samples.starts else state
+            z[start:end] = dahl_deflections(travel[start:end], self._length, *state)
+            state = (z[end - 1], travel[end - 1])
+        samples.term_states[self] = state
         return rows[:, :, None] * z[:, None, None]
-
-    def steady_forces(self, v: Array) -> Array:
-        """Force (N, 1) per parameter at steady speeds (N,), fully developed."""
-        return np.sign(v)[:, None]
 
 
 FrictionTerm = VelocityFriction | PreslidingFriction | FrictionalMemory

@@ -39,7 +39,6 @@ from crane.identification.mechanics.model_terms import (
     DirectionalTerm,
     ForceDirection,
     FrictionTerm,
-    VelocityFriction,
     body_names,
 )
 from crane.machine.machine import Machine
@@ -47,11 +46,7 @@ from crane.machine.machine import Machine
 T = TypeVar("T")
 _FEASIBLE_REMEDY = "give feasible=True"
 _FORCE_TOLERANCE = 1e-9  # of the largest force, for the check of the written machine
-SpeedRanges = Mapping[str, tuple[float, float]]
-FRICTION_PARAMETERS = tuple(item.name for item in fields(Friction))
-_SPEED_COUNT = 100  # speeds of a comparison of laws, in each direction
-_MAX_STRIBECK_SHARE = 0.3  # largest Stribeck velocity, relative to the largest speed
-_STRIBECK_GRID_SIZE = 30  # Stribeck velocities of the search
+FRICTION_PARAMETERS = frozenset(item.name for item in fields(Friction))
 _FLATNESS_TOLERANCE = 1e-6  # smallest eigenvalue of the scaled pseudo-inertia of a flat body
 
 
@@ -64,11 +59,11 @@ def write_identified(identification: Identification, folder: str | Path) -> Path
 
     The parameters of a body are written to the link that its joint moves; inertials of links fixed
     to it are removed. Friction, rotor inertias and gas pressures are the identified ones, all else
-    is that of the machine, see `write_machine`. Friction without a law in machine files is written
-    as the nearest law at steady speeds, with a warning about the difference. A motor that turns
-    several joints becomes a rotor with a coupling. Bodies of locked joints are divided among their
-    links by the descriptions. The written files are loaded and compared with the identification
-    before they replace existing ones.
+    is that of the machine, see `write_machine`. The written machine predicts as the parameters do:
+    `Dynamics.inverse` with friction and the step of a motion is `Identification.predict`. A motor
+    that turns several joints becomes a rotor with a coupling. Bodies of locked joints are divided
+    among their links by the descriptions. The written files are loaded and compared with the
+    identification before they replace existing ones.
 
     Args:
         identification: Identification of all parameters, with a prior or feasibility constraints.
@@ -102,21 +97,11 @@ def _write_identified(identification: Identification, folder: str | Path) -> Pat
     with warnings.catch_warnings(action="ignore", category=CraneWarning):
         unlocked_machine = _unlocked_machine(machine) if machine.locked_joints else machine
     bodies = divide_locked_bodies(machine, parameters, unlocked_machine)
-    laws, deviations = friction_laws(identification.model, parameters, identification.speeds)
+    laws = friction_laws(identification.model, parameters)
     draft = _identified_draft(identification, unlocked_machine, bodies, laws)
-    check = partial(_check_written_machine, identification, bodies, exact=not deviations)
-    file = draft.write_folder(folder, check=check)
-    if deviations:
-        worst = max(deviations, key=lambda name: deviations[name])
-        unit = "N" if worst in machine.joints and machine.unit(worst) == "m" else "N m"
-        warnings.warn(
-            f"a machine file has no place for all of the friction of {', '.join(deviations)}: "
-            "the nearest law at steady speeds is written, off by at most "
-            f"{deviations[worst]:.3g} {unit} ({worst})",
-            CraneWarning,
-            stacklevel=3,
-        )
-    return file
+    return draft.write_folder(
+        folder, check=partial(_check_written_machine, identification, bodies)
+    )
 
 
 def _unlocked_machine(machine: Machine) -> Machine:
@@ -223,7 +208,7 @@ def _parameters_of_kind(result: Identification, kind: str) -> dict[str, float]:
 
 
 def _check_written_machine(
-    result: Identification, bodies: Mapping[str, Array], file: Path, exact: bool
+    result: Identification, bodies: Mapping[str, Array], file: Path
 ) -> None:
     """Load the written machine and compare its forces with those of the identification.
 
@@ -231,7 +216,6 @@ def _check_written_machine(
         result: The identification.
         bodies: Parameters (10,) by link.
         file: The machine file.
-        exact: Whether friction is exact; otherwise it is excluded from the comparison.
     """
     try:
         with warnings.catch_warnings(action="ignore", category=CraneWarning):
@@ -244,14 +228,9 @@ def _check_written_machine(
     model, parameters = result.model, result.parameters
     assert parameters is not None
     at = random_samples(model, 20)
-    parameter_values, first = parameters.copy(), 0
-    for term in model.terms:
-        if isinstance(term, FrictionTerm) and not exact:
-            parameter_values[first : first + len(term.names)] = 0.0
-        first += len(term.names)
-    expected_forces = model.regressor(at) @ parameter_values + model.known_forces(at)
+    expected_forces = model.regressor(at) @ parameters + model.known_forces(at)
     written_forces = Dynamics(written, backend="pinocchio").inverse(
-        at.q_a, at.v_a, at.a_a, friction=exact
+        at.q_a, at.v_a, at.a_a, friction=True, step=at.step
     )
     force_differences = np.abs(written_forces - expected_forces).max(axis=0)
     if force_differences.max() <= _FORCE_TOLERANCE * np.abs(expected_forces).max():
@@ -262,85 +241,35 @@ def _check_written_machine(
     raise InputError(f"the model has {what}, for which a machine file has no place, leave it out")
 
 
-def friction_laws(
-    model: IdentificationModel, parameters: Array, speed_ranges: SpeedRanges
-) -> tuple[dict[str, Friction], dict[str, float]]:
+def friction_laws(model: IdentificationModel, parameters: Array) -> dict[str, Friction]:
     """Friction law of each direction with friction terms in the model.
-
-    Terms that a machine file does not contain (presliding, frictional memory, root of the speed,
-    several Stribeck velocities) are replaced by the law that is nearest in least squares to the
-    total friction at steady speeds in both directions.
 
     Args:
         model: The model.
         parameters: All parameters (p,).
-        speed_ranges: Least and largest speed of the comparison by direction [m/s], [rad/s].
-
-    Returns:
-        Laws by direction; and of those that are not exact the largest difference at a steady
-        speed [N], [N m].
 
     Raises:
-        InputError: Identified friction is negative.
+        InputError: Identified friction is negative, or no law has a term.
     """
     values = dict(zip(model.names, parameters.tolist(), strict=True))
-    terms_by_direction: dict[str, list[FrictionTerm]] = {}
+    numbers_by_direction: dict[str, dict[str, float]] = {}
     for term in model.terms:
         if isinstance(term, FrictionTerm):
-            terms_by_direction.setdefault(term.direction.name, []).append(term)
-    laws, deviations = dict[str, Friction](), dict[str, float]()
-    for name, terms in terms_by_direction.items():
-        law = _exact_law(model, name, terms, values)
-        if law is None:
-            law, deviations[name] = _nearest_law(terms, values, speed_ranges[name])
-        laws[name] = law
-    return laws, deviations
-
-
-def _exact_law(
-    model: IdentificationModel, name: str, terms: list[FrictionTerm], values: Mapping[str, float]
-) -> Friction | None:
-    found = {each.removeprefix(f"{name}."): values[each] for term in terms for each in term.names}
-    if not found.keys() <= set(FRICTION_PARAMETERS) or found.get("stiction", 0.0) < 0:
-        return None
-    # a joint without described friction is identified with an unsmoothed sign
-    law = model.machine.friction.get(name, Friction(smoothing=0.0))
-    stribeck_velocities = [
-        v for term in terms if isinstance(term, VelocityFriction) for v in term.stribeck_velocities
-    ]
-    try:
-        stribeck = stribeck_velocities[0] if stribeck_velocities else law.stribeck
-        return Friction(smoothing=law.smoothing, stribeck=stribeck, **found)
-    except InputError as error:
-        raise InputError(f"'{name}': {error}, give feasible=True") from None
-
-
-def _nearest_law(
-    terms: list[FrictionTerm], values: Mapping[str, float], speed_range: tuple[float, float]
-) -> tuple[Friction, float]:
-    from scipy.optimize import lsq_linear
-
-    low, high = speed_range
-    v = np.linspace(low, high, _SPEED_COUNT)
-    v = np.concatenate([-v[::-1], v])
-    identified_force = np.zeros_like(v)
-    for term in terms:
-        identified_force += term.steady_forces(v) @ [values[each] for each in term.names]
-    sign, best, lowest_cost = np.sign(v), Friction(), np.inf
-    first = min(max(low, high / 1e3), _MAX_STRIBECK_SHARE * high)
-    for stribeck in np.geomspace(first, _MAX_STRIBECK_SHARE * high, _STRIBECK_GRID_SIZE).tolist():
-        basis = np.column_stack(
-            [sign, np.ones_like(v), v, np.abs(v), sign * np.exp(-((v / stribeck) ** 2))]
-        )
-        bounds = np.array([0.0, -np.inf, 0.0, -np.inf, 0.0]), np.full(5, np.inf)
-        found = lsq_linear(basis, identified_force, bounds)
-        if found.cost < lowest_cost:
-            lowest_cost = found.cost
-            max_deviation = float(np.abs(basis @ found.x - identified_force).max())
-            coulomb, offset, viscous, viscous_offset, stiction = np.round(found.x, 12).tolist()
-            stiction_parameters = {"stiction": stiction, "stribeck": stribeck} if stiction else {}
-            best = Friction(coulomb, offset, viscous, viscous_offset, 0.0, **stiction_parameters)
-    return best, max_deviation
+            name = term.direction.name
+            found = {each.removeprefix(f"{name}."): values[each] for each in term.names}
+            if unknown := found.keys() - FRICTION_PARAMETERS:
+                raise InputError(
+                    f"the model has '{name}.{min(unknown)}', for which a machine file has no "
+                    "place, leave it out"
+                )
+            numbers_by_direction.setdefault(name, {}).update(found, **term.law_constants)
+    laws = dict[str, Friction]()
+    for name, numbers in numbers_by_direction.items():
+        try:
+            laws[name] = Friction(**numbers)
+        except InputError as error:
+            raise InputError(f"'{name}': {error}, {_FEASIBLE_REMEDY}") from None
+    return laws
 
 
 def divide_locked_bodies(

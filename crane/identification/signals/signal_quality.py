@@ -27,7 +27,7 @@ _RUN_REACH = _NEIGHBOUR_COUNT + _MAX_RUN  # samples from one that is tested to t
 _MAD_TO_STD = 1.482602218505602
 _MAX_CHANGE = 0.02  # largest change relative to the range of a signal
 _MIN_PERIODS = 3  # least number of periods of a ringing
-_MAX_RESIDUAL_SHARE = 0.5  # largest share of the squares that a sinusoid leaves
+_MAX_LINES = 4  # ringings that are averaged one after the other
 _CORRELATION_TOLERANCE = 0.01  # of a correlation
 _MAX_DELAY = 1.0  # [s] longest delay of the search
 
@@ -189,11 +189,14 @@ def signal_delay(time: Array, one: Array, other: Array) -> float:
     return float((at - reach + shift) * step)
 
 
-def shifted_correlation(one: Array, other: Array, shift: int) -> float:
-    """Correlation of one signal with another one shifted by a number of samples."""
-    count = len(one) - abs(shift)
-    offsets = max(shift, 0), max(-shift, 0)
-    return float(np.corrcoef(one[offsets[1] :][:count], other[offsets[0] :][:count])[0, 1])
+def shifted_correlation(
+    one: Array, other: Array, shift: int, samples: np.ndarray | None = None
+) -> float:
+    """Correlation of some samples of one signal, all by default, with another, shifted one."""
+    samples = np.arange(len(one)) if samples is None else samples
+    shifted = samples + shift
+    is_overlap = (shifted >= 0) & (shifted < len(other))
+    return float(np.corrcoef(one[samples[is_overlap]], other[shifted[is_overlap]])[0, 1])
 
 
 def _products(one: Array, other: Array, reach: int) -> Array:
@@ -284,8 +287,9 @@ class SteadyMeans:
 def steady_means(time: Array, settle: float, signal: Array, answer: Array) -> SteadyMeans:
     """Steady samples of a signal and its response, which may ring about a steady mean.
 
-    Samples of `steady_samples` are not changed. Others are used if both have steady means over one
-    period of the ringing, which is determined in each segment with a steady signal.
+    Samples of `steady_samples` are not changed. Others are used if both have steady means over
+    the period of the ringing, which is determined in each segment with a steady signal; if the
+    means ring at another frequency, over the period of that, too.
 
     Args:
         time: Equidistant instants (N,) [s].
@@ -305,18 +309,21 @@ def steady_means(time: Array, settle: float, signal: Array, answer: Array) -> St
     for start, end in true_runs(held).tolist():
         if plain[start:end].all():
             continue
-        period, amplitude = _ringing(time[start:end], answer[start:end], settle)
-        if not period or end - start <= round((period + settle) / step):
-            continue
-        part = _period_means(time[start:end], pairs[:, start:end], period)
-        whole = pairs.copy()  # keeps the range of the whole signal
-        whole[:, start:end] = part
-        new = _steady_mask(time, settle, *whole)[start:end] & ~plain[start:end]
-        new[: round((period + settle) / step)] = False
-        if new.any():
-            means[start:end] |= new
-            pairs[:, start:end] = np.where(new, part, pairs[:, start:end])
-            found.append((1 / period, amplitude))
+        lines: list[tuple[float, float]] = []
+        reach, whole, new = settle, pairs.copy(), np.zeros(end - start, dtype=bool)
+        while len(lines) < _MAX_LINES and not new.any():
+            part = whole[:, start:end]  # the whole keeps the range of the signals
+            period, amplitude = _ringing(time[start:end], part[1], settle)
+            reach += period
+            if not period or end - start <= round(reach / step):
+                break
+            part[:] = _period_means(time[start:end], part, period)
+            lines.append((1 / period, amplitude))
+            new = _steady_mask(time, settle, *whole)[start:end] & ~plain[start:end]
+            new[: round(reach / step)] = False
+        means[start:end] |= new
+        pairs[:, start:end] = np.where(new, whole[:, start:end], pairs[:, start:end])
+        found += lines if new.any() else []
     if not means.any():
         return SteadyMeans(steady_samples(time, settle, signal, answer), signal, answer)  # raises
     if not found:
@@ -327,7 +334,10 @@ def steady_means(time: Array, settle: float, signal: Array, answer: Array) -> St
 
 
 def _ringing(time: Array, x: Array, settle: float) -> tuple[float, float]:
-    """Period [s] and amplitude of a ringing about a straight line, zeros without ringing."""
+    """Period [s] and amplitude of a ringing about a straight line, zeros without ringing.
+
+    It is the strongest line of the spectrum below 4 / settle, and may decay.
+    """
     length = float(time[-1] - time[0])
     if length < max(_MIN_PERIODS * settle, 16 * float(time[1] - time[0])):
         return 0.0, 0.0
@@ -338,15 +348,14 @@ def _ringing(time: Array, x: Array, settle: float) -> tuple[float, float]:
     size = 16 * len(windowed)  # zero padding resolves frequencies to a few thousandths
     power = np.abs(np.fft.rfft(windowed, size)) ** 2
     at = np.fft.rfftfreq(size, t[1] - t[0])
-    power[(at * (t[-1] - t[0]) < _MIN_PERIODS) | (at > 4 / settle)] = 0
-    frequency = float(at[power.argmax()])
-    if not power.any():
+    band = (at * (t[-1] - t[0]) >= _MIN_PERIODS) & (at <= 4 / settle)
+    power, at = power[band], at[band]
+    if not power.any() or power.max() < _MIN_POWER_RATIO * np.median(power):
         return 0.0, 0.0
+    frequency = float(at[power.argmax()])
     angle = 2 * np.pi * frequency * t
     rows = np.column_stack([np.cos(angle), np.sin(angle)])
     coefficients = np.linalg.lstsq(rows, rest, rcond=None)[0]
-    if np.sum((rest - rows @ coefficients) ** 2) > _MAX_RESIDUAL_SHARE * np.sum(rest**2):
-        return 0.0, 0.0
     return 1 / frequency, float(np.hypot(*coefficients))
 
 

@@ -160,10 +160,12 @@ class ErrorControlledStepper(MachineCodeStepper):
                     time_to_break, self._control.next_delayed_jump(next_time) - now
                 )
             starts_at_break = following and breaks[following - 1] > next_time - 2.0 * difference
-            ends_at_break = time_to_break < segment_end + difference
             segment_end = min(segment_end, time_to_break)
-            if self._steps_end_at_outputs and offset < 0:  # samples of a log are output instants
-                segment_end = min(segment_end, 0.0)
+            last_output = np.floor((segment_end + difference) / step) * step
+            has_outputs = last_output > segment_start + difference
+            if self._steps_end_at_outputs and has_outputs:  # samples of a log are output instants
+                segment_end = min(segment_end, 0.0 if offset < 0 else last_output)
+            ends_at_break = time_to_break < segment_end + difference
             pairs = max(1, int(np.ceil((segment_end - segment_start) / pair - _TIME_TOLERANCE)))
             lengths[2:5] = segment_start, (segment_end - segment_start) / pairs, segment_end
             # references have one-sided limits where they may jump

@@ -14,123 +14,145 @@ from typing import Any
 import numpy as np
 
 from crane.codegen.wasm_emitter import emit_wasm_module
-from crane.common.errors import ClosureError, InputError
+from crane.common.atomic_output import portable_file_name
+from crane.common.errors import ClosureError
 from crane.common.samples import Array
+from crane.control.controller_registry import make_controller
 from crane.control.valve_drive import ValveDrive
+from crane.description.external_forces import TIP_WRENCH_NAME, WRENCH_COMPONENTS
+from crane.dynamics.tipping_stability import has_supports
 from crane.export.instance_program import InstanceProgram
 from crane.export.instance_routines import STATUS_TEXTS
 from crane.hydraulics.circuit_elements import MAIN_PUMP
 from crane.hydraulics.circuit_states import BALANCE_UNITS
 from crane.machine.machine import Machine
-from crane.recordings.recording import FORCE_UNITS, VELOCITY_UNITS
+from crane.recordings.recording import (
+    COORDINATES_NOTE,
+    FORCE_UNITS,
+    KEPT_COORDINATES,
+    REFERENCE_PREFIX,
+    VELOCITY_UNITS,
+)
 from crane.recordings.recording_summary import DISPLAY_UNITS, result_title
+from crane.simulation.integration.chart_switching import KEPT_CHART_RELAXATION
+from crane.view.page.drive_conditions import DriveConditions
+from crane.view.page.drive_goals import goal_data
+from crane.view.page.drive_hand import pull_data, target_data
+from crane.view.page.drive_levers import INTERVAL, lever_data
 from crane.view.page.html_document import write_page
-from crane.view.page.page_motion import pack_base64
+from crane.view.page.page_motion import frame_data, joint_tree, pack_base64
 from crane.view.page.report_page import machine_data, scene_commands, script_json, viewer_script
 from crane.view.page.scene import build_scene, link_poses, read_visuals, scene_bounds
 
-INTERVAL = 0.01  # of the recording, at whose ends the inputs are given [s]
 RAMP = 0.15  # time from neutral to the end of a lever [s]
-_SCRIPTS = ("data", "kinematics", "scene", "drive")
-# axes of a gamepad by the kind of lever: of excavators the ISO pattern
-_AXES = ((0, 1.0), (1, -1.0), (3, -1.0), (2, 1.0))
+_SCRIPTS = (
+    "data", "kinematics", "scene", "drive_scene", "drive_levers", "drive_gauges", "drive_pull",
+    "drive_recording", "drive",
+)  # fmt: skip
+_WORKER_SCRIPTS = ("kinematics", "drive_stability", "drive_goals", "drive_hand", "drive_worker")
 _RESERVED_NUMBERS = 4096  # of the memory, besides the instance
 
 
-def drive_page(machine: Machine, path: str | Path) -> Path:
+def drive_page(machine: Machine, path: str | Path, controller: str | None = None) -> Path:
     """Write a page on which a machine is driven by keys, sliders or a gamepad, as one HTML file.
 
     Its levers move the valves of a machine with a circuit, else the forces of its drives up to
-    their efforts. The drive can be saved as a recording, which `simulate --inputs` repeats.
+    their efforts, or the targets of a controller. A spring pulls the tip to the pointer. Payload
+    and slope change between steps. The drive can be saved as a recording, which `simulate
+    --inputs` repeats.
 
     Args:
         machine: The machine.
         path: The file to write; replaced if it exists.
+        controller: Name of a controller, see `crane.control.make_controller`.
 
     Raises:
-        InputError: See `crane.export.InstanceProgram`; or no drive has an effort or a valve.
+        InputError: See `crane.export.InstanceProgram`; or nothing drives the machine.
         OutputError: The file's suffix is not .html or .htm, or it cannot be written.
     """
-    return write_page(path, lambda: drive_html(machine))
+    return write_page(path, lambda: drive_html(machine, controller))
 
 
-def drive_html(machine: Machine) -> str:
+def drive_html(machine: Machine, controller: str | None = None) -> str:
     """Return the page of `drive_page` as HTML."""
-    program = InstanceProgram(machine, quantities=())
+    law = None if controller is None else make_controller(controller, machine)
+    quantities = ("gravity",) if machine.hydraulics is None and law is None else ()
+    conditions = DriveConditions(machine, quantities, law)
     scene = build_scene(machine)
-    data = machine_data(machine, scene, None) | {"task": "", "drive": _drive_data(program)}
+    data = machine_data(machine, scene, None) | {"task": ""}
+    data["drive"] = _drive_data(conditions, controller) | {
+        "goals": goal_data(machine, conditions.masses, scene.ground_height)
+    }
     data["lower"], data["upper"] = (x.tolist() for x in _motion_bounds(machine, scene))
     assets = files("crane.view.page") / "assets"
-    commands, style = scene_commands(scene), ("page.css", "drive.css")
-    return Template((assets / "drive.html").read_text(encoding="utf-8")).substitute(
+
+    def read(*names: str) -> str:
+        return "\n".join((assets / name).read_text(encoding="utf-8") for name in names)
+
+    return Template(read("drive.html")).substitute(
         title=escape(result_title(machine.name, "drive")),
-        style="\n".join((assets / name).read_text(encoding="utf-8") for name in style),
+        style=read("page.css", "drive.css"),
         viewer=viewer_script(),
         data=script_json(data),
-        commands=commands,
-        worker=(assets / "drive_worker.js").read_text(encoding="utf-8"),
-        script="\n".join((assets / f"{x}.js").read_text(encoding="utf-8") for x in _SCRIPTS),
+        commands=scene_commands(scene),
+        worker=read(*(f"{x}.js" for x in _WORKER_SCRIPTS)),
+        script=read(*(f"{x}.js" for x in _SCRIPTS)),
     )
 
 
-def _drive_data(program: InstanceProgram) -> dict[str, Any]:
-    """What the script needs of the program."""
+def _drive_data(conditions: DriveConditions, controller: str | None) -> dict[str, Any]:
+    """What the scripts need of the program."""
+    program = conditions.program
     machine, start = program.machine, program.layout.start_index
-    module = emit_wasm_module(
-        program.functions, program.entries, program.layout.size + _RESERVED_NUMBERS
-    )
+    levers = lever_data(program)
+    nq, n = machine.model.nv, len(machine.active)
+    hand = program.layout.size + _RESERVED_NUMBERS + nq * n
+    module = emit_wasm_module(program.functions, program.entries, hand + nq + 4 * n + 64 + 6)
+    defaults = np.nan_to_num(program.defaults, posinf=1e300)
+    program.layout.view(defaults).bounds[3:5] *= KEPT_CHART_RELAXATION
     columns = list(_columns(program))
-    levers = list(_levers(program))
-    if not levers:
-        raise InputError(
-            f"no drive of '{machine.name}' has a valve or an effort: give joints an effort limit"
-        )
     order = {header: i for i, (header, _) in enumerate(columns)}
+    inputs = range(start("inputs"), start("inputs") + program.layout.parts["inputs"])
     return {
         "wasm": base64.b64encode(module).decode(),
-        "defaults": pack_base64(np.nan_to_num(program.defaults, posinf=1e300), "f8"),
-        "step": start("step"),
+        "defaults": pack_base64(defaults, "f8"),
         "interval": INTERVAL,
         "ramp": RAMP,
-        "q": start("q"),
-        "nq": machine.model.nv,
-        "v": start("v_a"),
+        "parts": {
+            part: [start(part), program.layout.parts[part]]
+            for part in ("step", "q", "v_a", "dynamics")
+        },
+        "inputs": {program.names[i]: i for i in inputs},
+        "holdsWeight": "gravity" in program.entries,
         "hasTip": machine.tip is not None,
+        "tree": joint_tree(machine),
         "levers": levers,
-        "axes": [{"index": index, "sign": sign} for index, sign in _AXES][: len(levers)],
+        "pull": pull_data(program),
+        "targets": target_data(program),
+        "handMemory": hand,
         "columns": [index for _, index in columns],
         "headers": [header for header, _ in columns],
-        "gauges": list(_gauges(program, order)),
+        "dials": list(_dials(program, order)),
+        "joints": list(_joints(program, order)),
+        "energy": _energy(program, order),
+        "loads": [
+            {"name": force.name, "frame": frame_data(machine, force.frame), "column": order[header]}
+            for force in machine.external_forces
+            if (header := f"load_{force.name}_force_x [N]") in order
+            and force.name != TIP_WRENCH_NAME
+        ],
         "statuses": dict(STATUS_TEXTS),
         "notes": [
-            "crane recording", f"machine: {machine.name}", "task: drive", "controller: levers",
-            "sensors: ideal",
+            "crane recording", f"machine name: {machine.name}", "task: drive",
+            f"controller: {controller or 'levers'}", "sensors: ideal",
+            f"{COORDINATES_NOTE}: {KEPT_COORDINATES}",
+            *([f"free: {', '.join(machine.free)}"] if machine.free else []),
         ],
-        "file": f"{machine.name}_drive",
-    }  # fmt: skip
-
-
-def _levers(program: InstanceProgram) -> Iterator[dict[str, Any]]:
-    """Each lever: its input, and the signals in the middle and at the end."""
-    machine, first = program.machine, program.layout.start_index("inputs")
-    if isinstance(program.control, ValveDrive):
-        spools = program.control.circuit.hydraulics.spools
-        for i, (name, spool) in enumerate(spools.items()):
-            yield {
-                "name": name, "index": first + i, "neutral": spool.neutral, "full": spool.full,
-                "overlap": spool.overlap,
-            }  # fmt: skip
-        return
-    driven = [
-        x for x, is_driven in zip(machine.active, machine.is_driven, strict=True) if is_driven
-    ]
-    limits = dict(zip(machine.joints, machine.model.effortLimit.tolist(), strict=False))
-    for i, joint in enumerate(driven):
-        effort = limits.get(joint, np.inf)
-        if 0.0 < effort < 1e9:
-            yield {
-                "name": joint, "index": first + i, "neutral": 0.0, "full": effort, "overlap": 0.0,
-            }  # fmt: skip
+        "expression": [machine.load_name, machine.load_options],
+        "command": f"crane simulate {machine.command_line_arguments}"
+        + (f" --controller {controller}" if controller else ""),
+        "file": portable_file_name(f"{machine.name}_drive"),
+    } | conditions.data()  # fmt: skip
 
 
 def _columns(program: InstanceProgram) -> Iterator[tuple[str, int]]:
@@ -144,12 +166,26 @@ def _columns(program: InstanceProgram) -> Iterator[tuple[str, int]]:
         ("v_a", "velocity", VELOCITY_UNITS), ("tau", "force", FORCE_UNITS),
     ):  # fmt: skip
         for i, joint in enumerate(machine.active):
-            yield f"{joint}_{suffix} [{units[machine.unit(joint)]}]", start(part) + i
+            if part != "tau" or joint not in machine.free:
+                yield f"{joint}_{suffix} [{units[machine.unit(joint)]}]", start(part) + i
     for column, joint in enumerate(machine.joints):
         if column not in active:
             yield f"{joint} [{machine.unit(joint)}]", start("q") + column
     for name in ("kinetic", "potential", "work", "dissipated"):
         yield f"{name} [J]", start(name)
+    references = program.control.reference_units
+    if any(name.startswith(REFERENCE_PREFIX) for name in references):
+        for i, (name, unit) in enumerate(references.items()):
+            yield f"{name} [{unit}]" if unit else name, start("inputs") + i
+    first = start("external")
+    for k, force in enumerate(machine.external_forces):
+        for i, axis in enumerate("xyz"):
+            yield f"load_{force.name}_force_{axis} [N]", first + i
+        yield f"work_{force.name} [J]", start("work") + 1 + k
+        first += len(WRENCH_COMPONENTS)
+        for name, unit in force.channels:
+            yield f"{name} [{unit}]" if unit else name, first
+            first += 1
     if isinstance(program.control, ValveDrive):
         for i, (name, unit) in enumerate(program.control.channels):
             yield f"{name} [{unit}]" if unit else name, start("channels") + i
@@ -158,37 +194,81 @@ def _columns(program: InstanceProgram) -> Iterator[tuple[str, int]]:
             yield f"{name} [{unit}]", balances + i
 
 
-def _gauges(program: InstanceProgram, order: dict[str, int]) -> Iterator[dict[str, Any]]:
-    """Each gauge: sums of columns with factors, and its range."""
+def _dials(program: InstanceProgram, order: dict[str, int]) -> Iterator[dict[str, Any]]:
+    """Dials: sums of columns with factors, and their ranges."""
     machine = program.machine
     if machine.tip is not None:
-        yield {"name": "tip speed", "unit": "m/s", "kind": "speed", "low": 0.0, "high": 2.0}
-    for joint, lower, upper in zip(machine.active, machine.lower, machine.upper, strict=True):
-        unit, scale = DISPLAY_UNITS[machine.unit(joint)]
-        ends = (lower, upper) if np.isfinite([lower, upper]).all() else (-np.pi, np.pi)
-        column = order[f"{joint} [{machine.unit(joint)}]"]
-        yield _gauge(joint, unit, column, scale, float(ends[0]), float(ends[1]))
+        yield _dial("tip speed", "m/s", [], 0.0, 0.5 * _reach(machine)) | {"kind": "speed"}
+    if has_supports(machine):
+        yield _dial("tipping margin", "%", [], 0.0, 100.0) | {"kind": "stability"}
     if not isinstance(program.control, ValveDrive):
         return
     circuit = program.control.circuit.hydraulics
-    highest = max(x.pressure for x in (circuit.supply, *circuit.supplies.values()))
-    for name in (
-        f"pressure_{MAIN_PUMP}",
-        *(f"pressure_{x}_{s}" for x in circuit.joints for s in "ab"),
-    ):
-        title = name.removeprefix("pressure_").replace("_", " ")
-        yield _gauge(title, "bar", order[f"{name} [Pa]"], 1e-5, 0.0, highest)
-    for name in (x for x in order if x.startswith("shaft_")):
-        yield _gauge("shaft power", "kW", order[name], 1e-3, 0.0, 1e5)
+    pumps = [MAIN_PUMP, *circuit.supplies]
+    for name, pump in zip(pumps, (circuit.supply, *circuit.supplies.values()), strict=True):
+        if (header := f"pressure_{name} [Pa]") in order:
+            title = "pressure" if name == MAIN_PUMP else f"pressure {name}"
+            yield _dial(title, "bar", [(order[header], 1e-5)], 0.0, pump.pressure)
+    shafts = [(order[x], 1e-3) for x in order if x.startswith("shaft_")]
+    flows = [
+        x.flow * 6e4 for x in (circuit.supply, *circuit.supplies.values()) if np.isfinite(x.flow)
+    ]
+    yield _dial("flow", "l/min", [], 0.0, sum(flows) / 6e4 or 1e-3) | {"kind": "flow"}
+    if shafts:
+        highest = 1e3 * sum(flows) / 6e4 * circuit.supply.pressure / 1e3
+        yield _dial("power", "kW", shafts, 0.0, highest)
+    if circuit.engine is not None and (header := "engine_speed [rad/s]") in order:
+        highest = 1.2 * circuit.engine.speed
+        yield _dial("engine", "rpm", [(order[header], 30.0 / np.pi)], 0.0, highest)
 
 
-def _gauge(
-    name: str, unit: str, column: int, scale: float, low: float, high: float
+def _dial(
+    name: str, unit: str, terms: list[tuple[int, float]], low: float, high: float
 ) -> dict[str, Any]:
-    return {
-        "name": name, "unit": unit, "terms": [(column, scale)], "low": scale * low,
-        "high": scale * high,
-    }  # fmt: skip
+    scale = {"bar": 1e-5, "kW": 1e-3, "l/min": 6e4, "rpm": 30.0 / np.pi}.get(unit, 1.0)
+    return {"name": name, "unit": unit, "terms": terms, "low": scale * low, "high": scale * high}
+
+
+def _joints(program: InstanceProgram, order: dict[str, int]) -> Iterator[dict[str, Any]]:
+    """Each active joint: its position, and pressures and flow, or force."""
+    machine = program.machine
+    for joint, lower, upper in zip(machine.active, machine.lower, machine.upper, strict=True):
+        kind = machine.unit(joint)
+        unit, scale = DISPLAY_UNITS[kind]
+        ends = (lower, upper) if np.isfinite([lower, upper]).all() else (-np.pi, np.pi)
+        row: dict[str, Any] = {
+            "name": joint, "unit": unit, "scale": scale, "column": order[f"{joint} [{kind}]"],
+            "low": scale * float(ends[0]), "high": scale * float(ends[1]),
+            "force": order.get(f"{joint}_force [{FORCE_UNITS[kind]}]"),
+            "forceUnit": FORCE_UNITS[kind], "pressures": [], "flow": None,
+        }  # fmt: skip
+        sides = [order.get(f"pressure_{joint}_{side} [Pa]") for side in "ab"]
+        if None not in sides and isinstance(program.control, ValveDrive):
+            circuit = program.control.circuit.hydraulics
+            row |= {"pressures": sides, "flow": order[f"flow_{joint}_a [m3/s]"]}
+            row["highest"] = circuit.cylinders[joint].relief or circuit.supply.pressure
+        yield row
+
+
+def _energy(program: InstanceProgram, order: dict[str, int]) -> dict[str, Any]:
+    """What counts as spent: work of the pumps and fuel, or work of the drives."""
+    columns: dict[str, Any] = {"pump": order.get("pump_work [J]"), "engine": None}
+    columns["shafts"] = [order[x] for x in order if x.startswith("shaft_")]
+    columns["oil"] = order.get("oil_pumped [m3]")
+    hydraulics = program.machine.hydraulics
+    if hydraulics is not None and hydraulics.engine is not None and hydraulics.engine.fuel:
+        engine = hydraulics.engine
+        columns["engine"] = {
+            "speed": engine.speed, "torque": engine.torque, "droop": engine.speed_droop,
+            "fuel": engine.fuel, "idle": engine.idle, "column": order.get("engine_speed [rad/s]"),
+        }  # fmt: skip
+    return columns
+
+
+def _reach(machine: Machine) -> float:
+    """Distance of the tip at home from the first joint that moves it, 1 without a tip [m]."""
+    lower, upper = _motion_bounds(machine, build_scene(machine))
+    return float(np.linalg.norm(upper - lower)) / 2
 
 
 def _motion_bounds(machine: Machine, scene: Any) -> tuple[Array, Array]:
@@ -197,7 +277,7 @@ def _motion_bounds(machine: Machine, scene: Any) -> tuple[Array, Array]:
     configurations = [machine.home]
     for i, (lower, upper) in enumerate(zip(machine.lower, machine.upper, strict=True)):
         turns = machine.unit(machine.active[i]) == "rad" and not upper - lower < np.pi
-        for value in () if turns else (lower, upper):
+        for value in () if turns else filter(np.isfinite, (lower, upper)):
             try:
                 q_a = np.where(np.arange(len(home)) == i, value, home)
                 configurations.append(machine.closure.solve(q_a, initial_guess=machine.home))

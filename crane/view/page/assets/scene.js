@@ -1,8 +1,22 @@
 // The machine in space: meshcat's viewer, its light and camera, and the pose of every link.
 
 // Where a browser cannot draw in space, there is no viewer: plots and numbers remain.
-const viewer = make("canvas").getContext("webgl") ? new MeshCat.Viewer(element("pane")) : null;
 const THREE = MeshCat.THREE;
+const context = make("canvas").getContext("webgl");
+const isSoftware = context !== null && drawsBySoftware();
+const viewer = context ? new MeshCat.Viewer(element("pane"), !page.drive, page.drive && isSoftware ? plainRenderer() : undefined) : null;
+
+function drawsBySoftware() {
+    const info = context.getExtension("WEBGL_debug_renderer_info");
+    return /swiftshader|llvmpipe|software|basic render/i.test(info ? context.getParameter(info.UNMASKED_RENDERER_WEBGL) : "");
+}
+
+// Without shadows and smooth edges, which a processor draws too slowly.
+function plainRenderer() {
+    const renderer = new THREE.WebGLRenderer({ antialias: false, alpha: false, powerPreference: "high-performance" });
+    element("pane").appendChild(renderer.domElement);
+    return renderer;
+}
 
 // The viewer's scene is turned, so that its z axis points up; the camera lives outside, y up.
 const vector = ([x, y, z]) => new THREE.Vector3(x, z, -y);

@@ -1,0 +1,1 @@
+"""Machines drawn by their pins, translated to URDF."""

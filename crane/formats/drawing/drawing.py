@@ -1,0 +1,384 @@
+"""A machine as a drawing has it: points, bodies between them, pins, cylinders, slides."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from crane.common.errors import DescriptionError, suggest_names, warn
+from crane.common.samples import Array
+from crane.description.findings import FollowUpError, error_recovery
+from crane.description.kinematic_tree import Limits
+from crane.formats.drawing.body_inertia import (
+    plate_inertia,
+    polygon_moments,
+    rigid_inertia,
+    scale_inertia,
+    spread_inertia,
+    tube_inertia,
+)
+from crane.formats.machine_file.yaml_section import YamlSection
+from crane.formats.steel_cylinder import STEEL_DENSITY, SteelCylinder, sum_inertias
+
+# Of a body without mass: times the section of the largest pistons that act on it, over its length.
+# Boom and arm of the bundled excavator have 1.6 and 1.9, the lift boom of the log crane 0.8.
+_ESTIMATED_SECTION = 1.5
+_BAR_SHARE = 0.05  # of the size of a body, as the thickness of lines between its points
+# Angles count counterclockwise in the drawing, whose z points up: about -y.
+_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A straight part of the shape of a body.
+
+    Attributes:
+        ends: (2, 3) centres of its end faces [m].
+        height: In the plane of the drawing [m].
+        width: Across it [m]; None: it is round.
+    """
+
+    ends: Array
+    height: float
+    width: float | None = None
+
+
+@dataclass(frozen=True)
+class DrawnBody:
+    """A rigid body.
+
+    Attributes:
+        points: Names of its points.
+        bars: Its shape: tubes, the edges of plates, or lines between its points.
+        inertia: About its centre, along the axes of the drawing; the lever counts from the
+            origin of the drawing.
+        location: File and line.
+    """
+
+    points: tuple[str, ...]
+    bars: tuple[Bar, ...]
+    inertia: pin.Inertia
+    location: str
+
+
+@dataclass(frozen=True)
+class DrawnPin:
+    """What a pin permits.
+
+    Attributes:
+        axis: Unit vector (3,); None: a ball joint.
+        is_driven: Whether a motor turns it.
+        limits: Of its angle from the posture drawn.
+        location: File and line.
+    """
+
+    axis: Array | None
+    is_driven: bool = False
+    limits: Limits = field(default_factory=Limits)
+    location: str = ""
+
+
+@dataclass(frozen=True)
+class DrawnSlide:
+    """A body that slides in another, or the rod of a cylinder in its barrel.
+
+    Attributes:
+        points: A point of each.
+        shortest: Their distance at coordinate zero [m].
+        stroke: Largest coordinate [m].
+        location: File and line.
+        bodies: Outer and inner body; none for a cylinder.
+        is_driven: Whether a drive acts along it.
+        cylinder: Dimensions of a cylinder.
+        offsets: Positions of its cylinders across [m].
+    """
+
+    points: tuple[str, ...]
+    shortest: float
+    stroke: float
+    location: str
+    bodies: tuple[str, ...] = ()
+    is_driven: bool = True
+    cylinder: SteelCylinder | None = None
+    offsets: tuple[float, ...] = (0.0,)
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A machine in the posture in which it is drawn.
+
+    Attributes:
+        base: The body that stands on the world.
+        points: (3,) by name [m].
+        bodies: By name.
+        pins: What distinguishes some pins, by point.
+        slides: By name of the joint; those of cylinders, too.
+        location: File and line.
+    """
+
+    base: str
+    points: Mapping[str, Array]
+    bodies: Mapping[str, DrawnBody]
+    pins: Mapping[str, DrawnPin]
+    slides: Mapping[str, DrawnSlide]
+    location: str
+
+    def bodies_at(self, point: str) -> list[str]:
+        """Return the bodies that have a point."""
+        return [name for name, body in self.bodies.items() if point in body.points]
+
+    def distance(self, points: Sequence[str]) -> float:
+        """Return the distance of two points [m]."""
+        first, second = (self.points[name] for name in points)
+        return float(np.linalg.norm(second - first))
+
+
+def read_drawing(section: YamlSection) -> Drawing:
+    """Read the section `drawing` of a machine file.
+
+    Raises:
+        DescriptionError: With file and line, in the terms of the drawing.
+    """
+    reader = _DrawingReader(section)
+    with error_recovery():
+        return reader.read()
+    raise FollowUpError("the drawing is not complete")
+
+
+class _DrawingReader:
+    """Reads the parts of a drawing."""
+
+    def __init__(self, section: YamlSection):
+        self._section = section
+        self._points: dict[str, Array] = {}
+        self._piston_areas: dict[str, float] = {}  # by point the largest of cylinders there
+        self._estimates: list[str] = []
+
+    def read(self) -> Drawing:
+        """Return the drawing."""
+        section = self._section
+        self._points = section.value_map("points", _read_point)
+        cylinders = section.read_map("cylinders", self._read_cylinder)
+        bodies = section.read_map("bodies", self._read_body)
+        base = section.text("base")
+        section.check_name("base", base, bodies, f"'base' is the unknown body '{base}'")
+        slides = section.read_map("slides", lambda _, item: self._read_slide(item, bodies))
+        pins = section.read_map("pins", lambda _, item: _read_pin(item), self._check_pin)
+        parts: Mapping[str, Mapping[str, object]] = {
+            "points": self._points, "cylinders": cylinders, "bodies": bodies, "slides": slides,
+            "pins": pins,
+        }  # fmt: skip
+        if any(len(found) < len(section.item_names(key)) for key, found in parts.items()):
+            raise FollowUpError("a part of the drawing is missing")
+        if self._estimates:
+            warn(
+                f"{section.source_location('bodies')}: masses are estimated of "
+                f"{', '.join(self._estimates)}, give mass, plates or tubes",
+                stacklevel=4,
+            )
+        return Drawing(
+            base, self._points, bodies, pins, cylinders | slides, section.source_location()
+        )
+
+    def _check_pin(self, name: str, location: str) -> None:
+        if name not in self._points:
+            problem = f"pin '{name}' is no point, {suggest_names(self._points, name)}"
+            raise DescriptionError(f"{location}: {problem}")
+
+    def _point_names(self, item: YamlSection, key: str, least: int = 2) -> tuple[str, ...]:
+        """Names of known points."""
+        names = item.names(key)
+        for name in names:
+            problem = f"{item.title} has the unknown point '{name}'"
+            item.check_name(key, name, self._points, problem)
+        size = getattr(item.schema.keys[key], "size", None)
+        if len(names) < least or (size is not None and len(names) != size):
+            raise item.error_at(
+                key, f"{item.title} has {len(names)} points under '{key}', give {size or least}"
+            )
+        return names
+
+    def _coordinates(self, names: Sequence[str]) -> Array:
+        return np.array([self._points[name] for name in names])
+
+    def _read_cylinder(self, _: str, item: YamlSection) -> DrawnSlide:
+        points = self._point_names(item, "points")
+        values = item.values("points")
+        count, spacing = values.pop("count", 1), values.pop("spacing", 0.0)
+        shortest, stroke = self._range(item, points)
+        if count < 1 or count % 1:
+            raise item.error_at("count", f"{item.title} is there {count:g} times, give 1, 2, ...")
+        cylinder = item.create(
+            SteelCylinder.from_dimensions, values["bore"], values["rod"], stroke, shortest
+        )
+        for point in points:
+            area = count * np.pi / 4 * cylinder.bore**2
+            self._piston_areas[point] = max(self._piston_areas.get(point, 0.0), area)
+        offsets = tuple(np.linspace(-spacing / 2, spacing / 2, int(count)).tolist())
+        return DrawnSlide(
+            points, shortest, stroke, item.source_location(), cylinder=cylinder,
+            offsets=(0.0,) if count == 1 else offsets,
+        )  # fmt: skip
+
+    def _range(self, item: YamlSection, points: Sequence[str]) -> tuple[float, float]:
+        """Return shortest length and stroke, between which the drawing has to be."""
+        shortest, longest = item.number("shortest"), item.number("longest")
+        if not longest > shortest:
+            raise item.error_at(
+                "longest", f"{item.title} is {shortest:g} to {longest:g} m long, exchange them"
+            )
+        first, second = self._coordinates(points)
+        drawn = float(np.linalg.norm(second - first))
+        if not shortest <= drawn <= longest:
+            raise item.error_at(
+                "points",
+                f"{item.title} is {drawn:.4g} m from {' to '.join(points)} in the drawing, and "
+                f"{shortest:g} to {longest:g} m long: move a point, or correct its lengths",
+            )
+        return shortest, longest - shortest
+
+    def _read_slide(self, item: YamlSection, bodies: Mapping[str, DrawnBody]) -> DrawnSlide:
+        names, points = item.names("bodies"), self._point_names(item, "points")
+        if len(names) != 2:
+            raise item.error_at("bodies", f"{item.title} is between two bodies, name both")
+        for body, point in zip(names, points, strict=True):
+            problem = f"{item.title} is of the unknown body '{body}'"
+            item.check_name("bodies", body, bodies, problem)
+            if point not in bodies[body].points:
+                raise item.error_at(
+                    "points",
+                    f"point {point} of {item.title} is not on '{body}', "
+                    f"{suggest_names(bodies[body].points, point)}",
+                )
+        is_driven = "driven" in item and item.boolean("driven")
+        return DrawnSlide(
+            points, *self._range(item, points), item.source_location(), names, is_driven
+        )
+
+    def _read_body(self, name: str, item: YamlSection) -> DrawnBody:
+        points = self._point_names(item, "points", least=1)
+        parts = [*self._read_plates(item), *self._read_tubes(item)]
+        mass = item.number("mass") if "mass" in item else None
+        bars = [bar for bars, _ in parts for bar in bars]
+        if parts:
+            body = sum_inertias(*(inertia for _, inertia in parts))
+            body = body if mass is None else scale_inertia(body, mass)
+        else:
+            if mass is None:  # the base does not move
+                is_base = name == self._section.text("base")
+                mass = 0.0 if is_base else self._estimate_mass(name, item, points)
+            body = spread_inertia(
+                mass, self._coordinates(points), item.number("width") if "width" in item else 0.0
+            )
+        centre, tensor = body.lever, body.inertia
+        if "centre" in item:
+            centre = self._read_centre(item)
+        if "inertia" in item:
+            tensor = _read_tensor(item)
+        return DrawnBody(
+            points,
+            tuple(bars or self._outline_bars(points)),
+            rigid_inertia(body.mass, centre, tensor),
+            item.source_location(),
+        )
+
+    def _outline_bars(
+        self, points: Sequence[str], width: float | None = None, y: float = 0.0
+    ) -> list[Bar]:
+        """Return bars along a polygon, or a line of two points."""
+        places = self._coordinates(points) + [0.0, y, 0.0]
+        size = _BAR_SHARE * float(np.linalg.norm(np.ptp(places, axis=0)))
+        last = len(places) if len(places) > 2 else len(places) - 1
+        pairs = (np.array([places[i], places[(i + 1) % len(places)]]) for i in range(last))
+        return [Bar(ends, size, width) for ends in pairs if np.ptp(ends, axis=0).any()]
+
+    def _read_plates(self, item: YamlSection) -> Iterator[tuple[list[Bar], pin.Inertia]]:
+        for plate in item.list_items("plates", f"a plate of {item.title}"):
+            names = self._point_names(plate, "outline", least=3)
+            outline = self._coordinates(names)
+            values: dict[str, Any] = {"density": STEEL_DENSITY, "y": (0.0,)}
+            values |= plate.values("outline")
+            if polygon_moments(outline[:, [0, 2]])[0] == 0:
+                raise plate.error_at("outline", f"{plate.title} has no area, order its points")
+            for y in values["y"]:
+                yield (
+                    self._outline_bars(names, values["thickness"], y),
+                    plate_inertia(outline, values["thickness"], y, values["density"]),
+                )
+
+    def _read_tubes(self, item: YamlSection) -> Iterator[tuple[list[Bar], pin.Inertia]]:
+        for tube in item.list_items("tubes", f"a tube of {item.title}"):
+            ends = self._coordinates(self._point_names(tube, "points"))
+            values: dict[str, Any] = {
+                "width": None,
+                "wall": None,
+                "density": STEEL_DENSITY,
+                "y": (0.0,),
+            }
+            values |= tube.values("points")
+            for y in values.pop("y"):
+                bar = Bar(ends + [0.0, y, 0.0], values["height"], values["width"])
+                yield [bar], tube_inertia(bar.ends, **values)
+
+    def _estimate_mass(self, name: str, item: YamlSection, points: Sequence[str]) -> float:
+        known = self._piston_areas
+        area = max([known[x] for x in points if x in known] or known.values(), default=0.0)
+        places = self._coordinates(points)
+        length = max(float(np.linalg.norm(a - b)) for a in places for b in places)
+        mass = _ESTIMATED_SECTION * STEEL_DENSITY * area * length
+        if not mass:
+            raise item.error_at(None, f"{item.title} has no mass, give it mass, plates or tubes")
+        self._estimates.append(f"'{name}' ({mass:.3g} kg)")
+        return float(mass)
+
+    def _read_centre(self, item: YamlSection) -> Array:
+        if isinstance(item.raw_value("centre"), str):
+            name = item.text("centre")
+            problem = f"the centre of {item.title} is the unknown point '{name}'"
+            item.check_name("centre", name, self._points, problem)
+            return self._points[name]
+        return _read_point(item, "centre")
+
+
+def _read_point(section: YamlSection, name: str) -> Array:
+    values = section.numbers(name)
+    if len(values) not in (2, 3):
+        raise section.error_at(
+            name, f"point '{name}' has {len(values)} coordinates, give [x, z] or [x, y, z]"
+        )
+    return np.array(values if len(values) == 3 else (values[0], 0.0, values[1]))
+
+
+def _read_tensor(item: YamlSection) -> Array:
+    """Return an inertia (3, 3) that is given by one, three or six numbers.
+
+    One number is that about the y axis, of a flat body: xx = zz = yy / 2.
+    """
+    value = item.raw_value("inertia")
+    numbers = item.numbers("inertia") if isinstance(value, list) else (item.number("inertia"),)
+    if len(numbers) == 1:
+        numbers = (numbers[0] / 2, numbers[0], numbers[0] / 2)
+    if len(numbers) == 3:
+        numbers = (*numbers, 0.0, 0.0, 0.0)
+    if len(numbers) != 6:
+        raise item.error_at(
+            "inertia", f"the inertia of {item.title} has {len(numbers)} numbers, give 1, 3 or 6"
+        )
+    xx, yy, zz, xy, yz, xz = numbers
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def _read_pin(item: YamlSection) -> DrawnPin:
+    values = item.values()
+    axis, is_driven = values.pop("axis", "y"), values.pop("driven", False)
+    direction = None if axis == "ball" else np.array(_AXES[axis])
+    if direction is None and (values or is_driven):
+        raise item.error_at(
+            None, f"{item.title} is a ball joint, which has no motor and no limits"
+        )
+    return DrawnPin(
+        direction, is_driven, Limits(**values, source_location=item.source_location()),
+        item.source_location(),
+    )  # fmt: skip
