@@ -49,7 +49,8 @@ def dragged(page, x, y):
     for share in (0.3, 0.6, 1.0):
         page.mouse.move(left + share * x, top + share * y)
         page.wait_for_timeout(100)
-    page.wait_for_timeout(400)
+    until = page.evaluate("window.crane.state.time") + 0.4
+    page.wait_for_function(f"window.crane.state.time > {until}", timeout=20_000)
     label, hand = page.text_content("output.pull"), page.evaluate("window.crane.state.hand")
     page.mouse.up()
     return np.array(hand["force"]), label
