@@ -187,8 +187,11 @@ def _columns(program: InstanceProgram) -> Iterator[tuple[str, int]]:
             yield f"{name} [{unit}]" if unit else name, first
             first += 1
     if isinstance(program.control, ValveDrive):
-        for i, (name, unit) in enumerate(program.control.channels):
-            yield f"{name} [{unit}]" if unit else name, start("channels") + i
+        spools = program.control.circuit.hydraulics.spools if program.layout.parts["delays"] else ()
+        commanded = {f"voltage_{name}": start("inputs") + i for i, name in enumerate(spools)}
+        for i, (name, unit) in enumerate(program.control.channels):  # signals before dead times
+            index = commanded.get(name, start("channels") + i)
+            yield f"{name} [{unit}]" if unit else name, index
         balances = start("controller") + program.control.circuit.state_count - len(BALANCE_UNITS)
         for i, (name, unit) in enumerate(BALANCE_UNITS.items()):
             yield f"{name} [{unit}]", balances + i
