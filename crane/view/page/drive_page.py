@@ -187,7 +187,7 @@ def _columns(program: InstanceProgram) -> Iterator[tuple[str, int]]:
             yield f"{name} [{unit}]" if unit else name, first
             first += 1
     if isinstance(program.control, ValveDrive):
-        spools = program.control.circuit.hydraulics.spools if program.layout.parts["delays"] else ()
+        spools = list(program.control.circuit.hydraulics.spools)[: program.layout.parts["delays"]]
         commanded = {f"voltage_{name}": start("inputs") + i for i, name in enumerate(spools)}
         for i, (name, unit) in enumerate(program.control.channels):  # signals before dead times
             index = commanded.get(name, start("channels") + i)
