@@ -21,9 +21,9 @@ from crane.simulation.integration.machine_code_stepper import RungeKuttaStepper
 STEPS, STEP, INTERVAL = 500, 1e-3, 0.01  # joints of the mini forwarder stick for 0.5 s
 NATIVE = ("-march=native", "-ffp-contract=fast", "-fno-math-errno")
 BUILDS = [
-    (compiler, *flags)
-    for flags in (("-O2",), ("-O3",), ("-O2", *NATIVE), ("-O3", *NATIVE))
-    for compiler in ("gcc", "clang")
+    (*compiler, *flags)
+    for flags in ((), NATIVE)
+    for compiler in (("gcc", "-O2"), ("gcc", "-O3"), ("clang", "-O2"))
 ]
 _DRIVER = """
 #include "m.h"

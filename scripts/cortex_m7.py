@@ -196,7 +196,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         sources(crane.load(options.machine), folder)
-        flags = ["-Darm_real=float", "-DTOLERANCE=1e-3", "-DMOTION_TOLERANCE=1e300"]
+        flags = ["-Darm_real=float", "-DMOTION_TOLERANCE=1e300"]
         flags = flags if options.float else []
         for program in ("arm_test", "measure"):
             build(folder, program, flags)

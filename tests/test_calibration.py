@@ -149,8 +149,8 @@ def test_what_is_wrong_is_found_without_being_named(fitted, tmp_path):
         true = truth.get(name, one.initial_value)
         assert abs(one.value - true) < 2.0 * one.interval_half_width + 1e-9, one
     assert not found.machine.hydraulics.cylinders["x"].stiffness
-    assert found.unobserved_parameters and not set(found.unobserved_parameters) & {*told, *truth}
-    assert found.unobserved_parameters[0] in found.to_text() and not found.degraded_channels
+    assert found.unselected_parameters and not set(found.unselected_parameters) & {*told, *truth}
+    assert found.unselected_parameters[0] in found.to_text() and not found.degraded_channels
     for sensor, noise in zip(found.channels, (2e-4, 2e4, 2e4), strict=True):
         assert sensor.rms(sensor.simulated_after, False) < 1.2 * noise, sensor.name
 

@@ -256,6 +256,55 @@ def test_a_mass_is_spread_over_its_points():
     plate = spread_inertia(12.0, np.array([[0.0, 0, 0], [2, 0, 0], [2, 0, 1], [0, 0, 1.0]]), 3.0)
     assert plate.lever == pytest.approx([1.0, 0.0, 0.5])
     assert np.diag(plate.inertia) == pytest.approx([1 + 9, 4 + 1, 4 + 9])
+    corners = np.array([[x, y, z] for x in (0, 2.0) for y in (-1, 1.0) for z in (0, 1.0)])
+    box = spread_inertia(12.0, corners, 0.0)  # from its eight corners
+    assert np.diag(box.inertia) == pytest.approx([4 + 1, 4 + 1, 4 + 4])
+    level = spread_inertia(12.0, corners[:, [0, 2, 1]] * [1, 2, 0], 0.0)  # a plate that lies
+    assert np.diag(level.inertia) == pytest.approx([4.0, 4.0, 8.0])
+
+
+def test_a_platform_on_six_legs_by_ball_joints(tmp_path):
+    """Its strokes are distances, and their forces carry the platform's weight by virtual work."""
+    angles = np.deg2rad([-15, 15, 105, 135, 225, 255]), np.deg2rad([-48, 48, 72, 168, 192, 288])
+    points, cylinders = {"top": [0.0, 0.0, 1.0]}, {}
+    for i, (low, high) in enumerate(zip(*angles, strict=True)):
+        points[f"B{i}"] = [float(np.cos(low)), float(np.sin(low)), 0.0]
+        points[f"T{i}"] = [0.6 * float(np.cos(high)), 0.6 * float(np.sin(high)), 1.0]
+        length = np.linalg.norm(np.subtract(points[f"T{i}"], points[f"B{i}"]))
+        ends, middle = [f"B{i}", f"T{i}"], float(length)
+        sizes = {"bore": 0.05, "rod": 0.03, "shortest": middle - 0.3, "longest": middle + 0.3}
+        cylinders[f"X{i}"] = {"points": ends, **sizes}
+    eyes = [f"T{i}" for i in range(6)]
+    bodies = {
+        "ground": {"points": [f"B{i}" for i in range(6)]},
+        "platform": {"points": [*eyes, "top"], "mass": 50.0},
+    }
+    pins = {name: {"axis": "ball"} for name in points if name != "top"}
+    drawing = {"base": "ground", "points": points, "bodies": bodies, "pins": pins,
+               "cylinders": cylinders}  # fmt: skip
+    path = tmp_path / "platform.yaml"
+    path.write_text(yaml.safe_dump({"name": "platform", "drawing": drawing, "tip": "top"}))
+    machine = crane.load(path)
+    assert machine.active == tuple(cylinders) and len(machine.closure.equations.loops) == 5
+    tip = crane.Kinematics(machine, "top")
+    home = home_of(machine)
+    assert home == pytest.approx(np.full(6, 0.3))
+    assert tip.position(home) == pytest.approx([0.0, 0.0, 1.0])
+    # all legs 0.1 m longer: the platform rises until they are, by Pythagoras, and turns if at all
+    moved = home + 0.1
+    for leg in range(6):
+        q = machine.closure.solve(moved)
+        data = machine.model.createData()
+        pin.forwardKinematics(machine.model, data, machine.coordinates.configuration(q))
+        ends = [pin.updateFramePlacement(machine.model, data, machine.frame(name)).translation
+                for name in (f"B{leg}", f"T{leg}")]  # fmt: skip
+        wanted = cylinders[f"X{leg}"]["shortest"] + 0.4
+        assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(wanted, abs=1e-12)
+    dynamics = crane.Dynamics(machine)
+    force = dynamics.gravity(moved)
+    for i, step in enumerate(1e-5 * np.eye(6)):
+        high, low = (dynamics.energy(moved + x, 0 * home)[1] for x in (step, -step))
+        assert force[i] == pytest.approx((high - low) / 2e-5, rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from crane.common.atomic_output import check_folder_is_writable, replace_folder
 from crane.common.samples import Array
 from crane.control.control_law import Controller
 from crane.control.valve_commands import ValveCommand
-from crane.export.instance_program import DYNAMICS_ROUTINES, InstanceProgram
+from crane.export.instance_program import InstanceProgram
 from crane.export.instance_routines import STATUS_TEXTS
 from crane.export.kinematics_program import KinematicsProgram
 from crane.export.recorded_values import random_vectors, recorded_motion
@@ -255,21 +255,27 @@ class CSources(FunctionSources):
     def test(self) -> str:
         """A program that compares the functions with recorded values of crane."""
         program, name = self._instance_program, self.name
-        (vectors, scales), motion = random_vectors(program), recorded_motion(program)
-        sizes = {key: rows[0].size for key, rows in vectors.items()}
-        checks = []
-        for key in (x for x in vectors if x in DYNAMICS_ROUTINES):
-            scale = _number(scales[key])
-            arguments = f'"{key}", found, {key}[i], {sizes[key]}, {scale}'
+        vectors, motion = random_vectors(program), recorded_motion(program)
+        sizes = {key: rows[0].size for key, rows in vectors.values.items()}
+        checks, bounds = [], {}
+        for key, rows in vectors.values.items():
+            # rounding errors of n operations grow as sqrt(n) where they are independent
+            growth = np.sqrt(_costs(program.entries[key])[0])
+            bounds[f"bound_of_{key}"] = growth * vectors.changes[key]
+            scale = _number(float(np.abs(rows).max()) or 1.0)
+            arguments = f'"{key}", found, {key}[i], {sizes[key]}, {scale}, bound_of_{key}[i][0]'
             checks += [f"{name}_{key}(&m, q, v, x, found);", f"compare({arguments});"]
         inputs = _inputs_of(program)
         set_inputs = f"for (j = 0; j < {len(inputs)}; ++j)\n            " + (
             f"(&m.{self.members()[inputs[0]]})[j] = ({name}_real)inputs[i][j];" if inputs else ";"
         )
-        tables = {**vectors, "inputs": motion.inputs, "motion": motion.q}
+        tables = {
+            **vectors.states, **vectors.values, **bounds, "inputs": motion.inputs,
+            "motion": motion.q,
+        }  # fmt: skip
         values = {
             "TABLES": "\n".join(_table(key, np.array(rows)) for key, rows in tables.items()),
-            "STATES": str(len(vectors["second"])), "STEPS": str(len(motion.q)),
+            "STATES": str(len(vectors.states["second"])), "STEPS": str(len(motion.q)),
             "STEP": repr(motion.step), "LARGEST": str(max(sizes.values())),
             "CHECKS": "\n        ".join(checks), "SET_INPUTS": set_inputs,
         }  # fmt: skip

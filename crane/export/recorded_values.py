@@ -17,6 +17,8 @@ from crane.simulation.simulation_run import simulate
 
 _TEST_STATES, _TEST_STEPS, _TEST_STEP = 20, 50, 0.01
 _FOLLOWED = 0.01  # displacement of references [m], [rad]
+_ROUNDED_STATES = 8
+_ROUNDING = float(np.finfo(float).eps)
 
 
 class RecordedMotion(NamedTuple):
@@ -65,29 +67,42 @@ def recorded_motion(program: InstanceProgram) -> RecordedMotion:
     return RecordedMotion(_TEST_STEP, inputs[1:], np.column_stack(columns)[1:])
 
 
-def random_vectors(program: InstanceProgram) -> tuple[dict[str, list[Array]], dict[str, float]]:
-    """Random closed states about home, the quantities of the library at them, and their sizes.
+class RandomVectors(NamedTuple):
+    """Quantities of the library at random closed states about home.
 
-    The size is the largest value, or more where rounding of the configuration changes the
-    quantity by more than 1e-14 of it, as beside change points.
+    Attributes:
+        states: Rows (states, .) of configurations, velocities, and second arguments.
+        values: Rows of each quantity by its routine.
+        changes: (states,) of each quantity: its largest change by one rounding of the state, at
+            least the rounding of its largest value.
     """
+
+    states: dict[str, Array]
+    values: dict[str, Array]
+    changes: dict[str, Array]
+
+
+def random_vectors(program: InstanceProgram) -> RandomVectors:
+    """Quantities at random states, and what rounding changes of them."""
     machine, random = program.machine, np.random.default_rng(0)
     dynamics, n = Dynamics(machine), len(machine.active)
-    found: dict[str, list[Array]] = {"configurations": [], "velocities": [], "second": []}
-    sizes: dict[str, float] = {}
     units = machine.closure.units[machine.closure.active]
-    home = machine.home[machine.closure.active]
-    quantities = {x: DYNAMICS_ROUTINES[x] for x in program.entries if x in DYNAMICS_ROUTINES}
-    for _ in range(_TEST_STATES):
-        q = machine.closure.solve(home + 0.01 * units * random.uniform(-1, 1, n))
-        v, x = random.normal(size=(2, n))
-        rounded = q * (1.0 + 4e-16 * random.uniform(-1, 1, len(q)))
-        for key, row in (("configurations", q), ("velocities", v), ("second", x)):
-            found[key].append(row)
-        for name, quantity in quantities.items():
-            value = dynamics.evaluate_closed(quantity, q, v, x)
-            change = np.abs(dynamics.evaluate_closed(quantity, rounded, v, x) - value).max()
-            found.setdefault(name, []).append(value)
-            size = max(float(np.abs(value).max()), 1e14 * float(change))
-            sizes[name] = max(sizes.get(name, 0.0), size)
-    return found, sizes
+    offsets = 0.01 * units * random.uniform(-1, 1, (_TEST_STATES, n))
+    q = machine.closure.solve(machine.home[machine.closure.active] + offsets)
+    states = (q, *random.normal(size=(2, _TEST_STATES, n)))
+    names = [name for name in program.entries if name in DYNAMICS_ROUTINES]
+
+    def evaluate(*arrays: Array) -> dict[str, Array]:
+        return {x: dynamics.evaluate_closed(DYNAMICS_ROUTINES[x], *arrays) for x in names}
+
+    values = evaluate(*states)
+    changes = {x: _ROUNDING * np.abs(row).max(axis=1) for x, row in values.items()}
+    for _ in range(_ROUNDED_STATES):
+        rounded = evaluate(
+            *(x * (1.0 + random.choice([-1, 1], x.shape) * _ROUNDING) for x in states)
+        )
+        for name, row in values.items():
+            change = np.abs(rounded[name] - row).max(axis=1)
+            changes[name] = np.maximum(changes[name], change)
+    keys = "configurations", "velocities", "second"
+    return RandomVectors(dict(zip(keys, states, strict=True)), values, changes)

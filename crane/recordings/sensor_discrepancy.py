@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from crane.common.errors import ClosureError, CraneWarning, MechanismError
+from crane.common.errors import ClosureError, CraneWarning, MechanismError, RecordingError
 from crane.common.samples import Array, root_mean_square
 from crane.common.scratch_arrays import release_pages
 from crane.description.sensors import (
@@ -66,6 +66,24 @@ def warn_discrepancies(machine: Machine, table: Table) -> None:
         return
     for text in filter(None, messages):
         warnings.warn(text, CraneWarning, stacklevel=3)
+
+
+def displaced_pins(machine: Machine, table: Table) -> dict[str, float]:
+    """Coordinates [m] of pins whose error explains a discrepancy better than a zero does.
+
+    Args:
+        machine: The machine.
+        table: Measured quantities.
+    """
+    try:
+        configurations = MeasuredConfigurations(machine, add_inclination_angles(machine, table))
+        sensors = [
+            _RedundantSensor(configurations, name)
+            for name in _redundant_columns(machine, table, configurations.drives)
+        ]
+    except (ClosureError, MechanismError, RecordingError):
+        return {}
+    return {name: value for x in sensors for name, value in x.displaced_pins().items()}
 
 
 def _redundant_columns(machine: Machine, table: Table, drives: tuple[str, ...]) -> list[str]:
@@ -177,6 +195,15 @@ class _RedundantSensor:
             f"sensors disagree: '{self.name}' deviates from the value computed from {used} by "
             f"{factor * mean:+.3g} {unit} on average ({low:+.3g} to {high:+.3g}); {cause}"
         )
+
+    def displaced_pins(self) -> dict[str, float]:
+        """Coordinates [m] of the pin that explains the discrepancy best, if no zero does."""
+        zero_residual = self._fit_discrepancy([self._zero_column])[1]
+        causes = [] if self.is_rate or zero_residual <= self.limit else self._pin_causes()
+        best = min(causes, key=lambda x: x.residual_rms, default=None)
+        if best is None or best.residual_rms > _IMPROVEMENT_SHARE * zero_residual:
+            return {}
+        return best.pin_positions
 
     def _determining_joints(self) -> list[str]:
         configurations = self._configurations

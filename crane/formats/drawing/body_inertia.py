@@ -8,7 +8,7 @@ import pinocchio as pin
 
 from crane.common.samples import Array
 
-_FLATNESS_TOLERANCE = 1e-9  # width of a convex hull over its length, below which it is a line
+_FLATNESS_TOLERANCE = 1e-6  # extent of points that counts as none, by the largest or by 1 mm
 
 
 def polygon_moments(outline: Array) -> tuple[float, Array, Array]:
@@ -77,24 +77,27 @@ def tube_inertia(
 def spread_inertia(mass: float, points: Array, width: float) -> pin.Inertia:
     """Return the inertia of a mass spread over points (n, 3), and a width across.
 
-    It is a thin rod if the points are in a line, else a plate in the plane x, z that has their
-    convex hull as outline.
+    It is a thin rod if the points are in a line, a plate if they are in a plane, with their convex
+    hull as outline; else the plate of their projection to the plane x, z, and spread over their
+    extent across.
     """
     from scipy.spatial import ConvexHull
 
-    centre = points.mean(axis=0)
-    values, axes = np.linalg.eigh(np.cov((points - centre).T, bias=True))
-    if len(points) < 3 or values[1] <= _FLATNESS_TOLERANCE**2 * values[2]:
-        along = (points - centre) @ axes[:, 2]
-        ends = centre + np.outer([along.min(), along.max()], axes[:, 2])
-        moments = mass * np.outer(*(2 * [ends[1] - ends[0]])) / 12
-        centre = ends.mean(axis=0)
+    mean = points.mean(axis=0)
+    values, axes = np.linalg.eigh((points - mean).T @ (points - mean))
+    is_flat, is_line = values[:2] <= _FLATNESS_TOLERANCE**2 * max(values[2], 1e-6)
+    if not is_flat:
+        projected = np.column_stack([points[:, 0], np.full(len(points), mean[1]), points[:, 2]])
+        return spread_inertia(mass, projected, float(np.hypot(width, np.ptp(points[:, 1]))))
+    plane = axes[:, 1:].T
+    flat = (points - mean) @ plane.T
+    if is_line:
+        centre = mean + (flat[:, 1].min() + flat[:, 1].max()) / 2 * plane[1]
+        moments = mass * np.ptp(flat[:, 1]) ** 2 / 12 * np.outer(plane[1], plane[1])
     else:
-        outline = points[ConvexHull(points[:, [0, 2]]).vertices]
-        area, centroid, planar = polygon_moments(outline[:, [0, 2]])
-        moments = np.zeros((3, 3))
-        moments[np.ix_([0, 2], [0, 2])] = mass / area * planar
-        centre = np.array([centroid[0], centre[1], centroid[1]])
+        area, centroid, planar = polygon_moments(flat[ConvexHull(flat).vertices])
+        centre = mean + centroid @ plane
+        moments = mass / area * plane.T @ planar @ plane
     moments[1, 1] += mass * width**2 / 12
     return inertia_from_moments(mass, centre, moments)
 

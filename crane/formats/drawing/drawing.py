@@ -160,23 +160,27 @@ class _DrawingReader:
         """Return the drawing."""
         section = self._section
         self._points = section.value_map("points", _read_point)
-        slides = section.read_map("cylinders", self._read_cylinder)
+        cylinders = section.read_map("cylinders", self._read_cylinder)
         bodies = section.read_map("bodies", self._read_body)
         base = section.text("base")
         section.check_name("base", base, bodies, f"'base' is the unknown body '{base}'")
-        slides |= section.read_map("slides", lambda _, item: self._read_slide(item, bodies))
+        slides = section.read_map("slides", lambda _, item: self._read_slide(item, bodies))
         pins = section.read_map("pins", lambda _, item: _read_pin(item), self._check_pin)
-        if len(self._points) < len(section.item_names("points")) or len(bodies) < len(
-            section.item_names("bodies")
-        ):
-            raise FollowUpError("a point or a body is missing")
+        parts: Mapping[str, Mapping[str, object]] = {
+            "points": self._points, "cylinders": cylinders, "bodies": bodies, "slides": slides,
+            "pins": pins,
+        }  # fmt: skip
+        if any(len(found) < len(section.item_names(key)) for key, found in parts.items()):
+            raise FollowUpError("a part of the drawing is missing")
         if self._estimates:
             warn(
                 f"{section.source_location('bodies')}: masses are estimated of "
                 f"{', '.join(self._estimates)}, give mass, plates or tubes",
                 stacklevel=4,
             )
-        return Drawing(base, self._points, bodies, pins, slides, section.source_location())
+        return Drawing(
+            base, self._points, bodies, pins, cylinders | slides, section.source_location()
+        )
 
     def _check_pin(self, name: str, location: str) -> None:
         if name not in self._points:
@@ -262,7 +266,9 @@ class _DrawingReader:
             body = sum_inertias(*(inertia for _, inertia in parts))
             body = body if mass is None else scale_inertia(body, mass)
         else:
-            mass = self._estimate_mass(name, item, points) if mass is None else mass
+            if mass is None:  # the base does not move
+                is_base = name == self._section.text("base")
+                mass = 0.0 if is_base else self._estimate_mass(name, item, points)
             body = spread_inertia(
                 mass, self._coordinates(points), item.number("width") if "width" in item else 0.0
             )

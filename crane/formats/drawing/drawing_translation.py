@@ -18,7 +18,6 @@ from scipy.cluster.hierarchy import DisjointSet
 from crane.common.errors import DescriptionError
 from crane.common.samples import Array
 from crane.description.kinematic_tree import (
-    X_AXIS,
     Y_AXIS,
     Z_AXIS,
     Joint,
@@ -99,16 +98,13 @@ class _DrawingTranslation:
             self._add_tree_joint(edge, parent, child)
         for edge in loops:
             self._add_body_loop(edge)
-        for name, slide in self._drawing.slides.items():
-            if slide.cylinder is not None:
-                self._add_cylinder(name, slide, slide.cylinder)
         state = etree.SubElement(self._robot, "group_state", name="home", group="all")
         for joint, value in self._home.items():
             etree.SubElement(state, "joint", name=joint, value=repr(value))
         return XmlFile(file, self._robot, self._locations)
 
     def _edges(self) -> Iterator[_Edge]:
-        """Yield slides of bodies and pins, those with a drive first."""
+        """Yield slides of bodies and pins, those with a drive first, and at last cylinders."""
         drawing = self._drawing
         edges = [
             _Edge(name, (slide.bodies[0], slide.bodies[1]), slide.points, slide)
@@ -121,6 +117,10 @@ class _DrawingTranslation:
                 name = point if len(others) == 1 else f"{point}_{other}"
                 edges.append(_Edge(name, (first, other), (point,), self._pin(point)))
         yield from sorted(edges, key=lambda edge: not edge.constraint.is_driven)
+        for name, slide in drawing.slides.items():
+            if slide.cylinder is not None:
+                first, second = (self._body_of_end(name, slide, x) for x in slide.points)
+                yield _Edge(name, (first, second), slide.points, slide)
 
     def _pin(self, point: str) -> DrawnPin:
         return self._drawing.pins.get(point) or DrawnPin(
@@ -189,7 +189,9 @@ class _DrawingTranslation:
 
     def _add_tree_joint(self, edge: _Edge, parent: str, child: str) -> None:
         part, origin = edge.constraint, self._origins[child] - self._origins[parent]
-        if isinstance(part, DrawnSlide):
+        if isinstance(part, DrawnSlide) and part.cylinder is not None:
+            self._add_cylinder(edge, part, parent, is_tree=True)
+        elif isinstance(part, DrawnSlide):
             direction = self._direction(part) * (1 if child == edge.bodies[1] else -1)
             position = self._drawing.distance(part.points) - part.shortest
             joint = Joint(
@@ -216,6 +218,14 @@ class _DrawingTranslation:
 
     def _add_body_loop(self, edge: _Edge) -> None:
         part = edge.constraint
+        if edge.bodies[0] == edge.bodies[1]:
+            raise DescriptionError(
+                f"{part.location}: cylinder '{edge.name}' has both pins on '{edge.bodies[0]}', "
+                "which is rigid"
+            )
+        if isinstance(part, DrawnSlide) and part.cylinder is not None:
+            self._add_cylinder(edge, part, edge.bodies[0], is_tree=False)
+            return
         if part.is_driven:
             raise DescriptionError(
                 f"{part.location}: '{edge.name}' is driven and closes a loop of other drives, "
@@ -246,50 +256,63 @@ class _DrawingTranslation:
         etree.SubElement(loop, "axis", xyz=format_numbers(axis))
         self._locate(loop, location)
 
-    def _add_cylinder(self, name: str, slide: DrawnSlide, cylinder: SteelCylinder) -> None:
-        """Add barrel, rod, and the loop at the eye of the rod."""
-        parent, other = (self._body_of_end(name, slide, point) for point in slide.points)
-        if parent == other:
-            raise DescriptionError(
-                f"{slide.location}: cylinder '{name}' has both pins on '{parent}', which is rigid"
-            )
+    def _add_cylinder(self, edge: _Edge, slide: DrawnSlide, parent: str, is_tree: bool) -> None:
+        """Add barrel and rod from the body of one end; the other end is a joint or a loop."""
+        assert slide.cylinder is not None
+        name, location = edge.name, slide.location
         rotation, is_planar = self._cylinder_axes(slide)
-        barrel, rod, location = f"{name}_barrel", f"{name}_rod", slide.location
-        start, end = (self._drawing.points[point] for point in slide.points)
-        placement = xyz_rpy_from_se3(pin.SE3(rotation, start - self._origins[parent]))
+        near = int(parent != edge.bodies[0])  # 0: barrel, 1: rod
+        links, sign = (f"{name}_barrel", f"{name}_rod"), -1.0 if near else 1.0
+        ends = f"{name}_barrel", f"{name}_eye"
+        self._add_cylinder_links(links, slide, slide.cylinder)
+        points = [self._drawing.points[point] for point in slide.points]
+        placement = xyz_rpy_from_se3(pin.SE3(rotation, points[near] - self._origins[parent]))
+        if is_planar:
+            pins = [Joint(ends[near], "revolute", parent, links[near], "", *placement, Y_AXIS)]
+        else:
+            cross = Link(f"{name}_cross", "", composite_joint=ends[near])
+            self._locate(add_link(self._robot, cross), location)
+            first, second = f"{ends[near]}_y", f"{ends[near]}_z"
+            pins = [
+                Joint(first, "revolute", parent, cross.name, "", *placement, Y_AXIS),
+                Joint(second, "revolute", cross.name, links[near], "", axis=Z_AXIS),
+            ]
+        for joint in pins:
+            self._add_joint(joint, location, home=0.0)
+        limits = Limits(0.0, slide.stroke, slide.cylinder.max_force * len(slide.offsets))
+        position = self._drawing.distance(slide.points) - slide.shortest
+        self._add_joint(
+            Joint(
+                name, "prismatic", links[near], links[1 - near], "",
+                (sign * slide.shortest, 0.0, 0.0), axis=(sign, 0.0, 0.0), limits=limits,
+            ), location, slide.is_driven, position,
+        )  # fmt: skip
+        far, other = links[1 - near], edge.bodies[1 - near]
+        if is_tree:
+            back = xyz_rpy_from_se3(pin.SE3(rotation.T, np.zeros(3)))
+            kind, axis = ("revolute" if is_planar else "spherical"), to_vector(rotation[:, 1])
+            joint = Joint(ends[1 - near], kind, far, other, "", *back, axis)
+            self._add_joint(joint, location, home=0.0 if is_planar else None)
+            return
+        place = xyz_rpy_from_se3(pin.SE3(rotation, points[1 - near] - self._origins[other]))
+        loop_ends = {far: ((0.0, 0.0, 0.0), _NO_ROTATION), other: place}
+        kind = "revolute" if is_planar else "spherical"
+        self._add_loop(ends[1 - near], kind, loop_ends, Y_AXIS, location)
+
+    def _add_cylinder_links(
+        self, names: tuple[str, str], slide: DrawnSlide, cylinder: SteelCylinder
+    ) -> None:
+        inertias = cylinder.barrel_inertia, cylinder.rod_inertia
         links = [
-            add_link(self._robot, Link(link, "", inertial_from_inertia(
+            add_link(self._robot, Link(name, "", inertial_from_inertia(
                 sum_inertias(*(_shifted(inertia, y) for y in slide.offsets)))))
-            for link, inertia in (
-                (barrel, cylinder.barrel_inertia), (rod, cylinder.rod_inertia))
+            for name, inertia in zip(names, inertias, strict=True)
         ]  # fmt: skip
         add_cylinder_visuals(links[0], links[1], cylinder, slide.offsets)
         for link, colour in zip(links, ("barrel", "rod"), strict=True):
             for visual in link.iterfind("visual"):
                 etree.SubElement(visual, "material", name=colour)
-            self._locate(link, location)
-        if is_planar:
-            pins = [Joint(barrel, "revolute", parent, barrel, "", *placement, Y_AXIS)]
-        else:
-            cross = Link(f"{name}_cross", "", composite_joint=barrel)
-            self._locate(add_link(self._robot, cross), location)
-            pins = [
-                Joint(f"{barrel}_y", "revolute", parent, cross.name, "", *placement, Y_AXIS),
-                Joint(f"{barrel}_z", "revolute", cross.name, barrel, "", axis=Z_AXIS),
-            ]
-        for joint in pins:
-            self._add_joint(joint, location, home=0.0)
-        limits = Limits(0.0, slide.stroke, cylinder.max_force * len(slide.offsets))
-        xyz = (slide.shortest, 0.0, 0.0)
-        position = self._drawing.distance(slide.points) - slide.shortest
-        self._add_joint(
-            Joint(name, "prismatic", barrel, rod, "", xyz, axis=X_AXIS, limits=limits),
-            location, slide.is_driven, position,
-        )  # fmt: skip
-        eye = xyz_rpy_from_se3(pin.SE3(rotation, end - self._origins[other]))
-        kind = "revolute" if is_planar else "spherical"
-        ends = {rod: ((0.0, 0.0, 0.0), _NO_ROTATION), other: eye}
-        self._add_loop(f"{name}_eye", kind, ends, Y_AXIS, location)
+            self._locate(link, slide.location)
 
     def _body_of_end(self, name: str, slide: DrawnSlide, point: str) -> str:
         bodies = self._drawing.bodies_at(point)

@@ -1,7 +1,7 @@
 """Calibration of machines: parameters fitted to recordings through the simulation."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,12 +34,22 @@ from crane.identification.calibration.calibration_statistics import (
     CalibrationEstimate,
     estimate_with_profiles,
     score_tests,
-    select_parameters,
 )
 from crane.identification.calibration.levenberg_marquardt import (
     LOG_COLUMNS,
     LevenbergMarquardt,
     SearchLog,
+)
+from crane.identification.calibration.model_selection import (
+    SelectedModel,
+    block_errors,
+    select_parameters,
+)
+from crane.identification.calibration.plausibility import (
+    PAYLOAD_MASS,
+    implausible_values,
+    near_minima,
+    static_payload,
 )
 from crane.identification.calibration.recording_case import RecordingCase, recording_case
 from crane.identification.calibration.unknowns import Unknown, build_unknowns, candidate_parameters
@@ -53,6 +63,7 @@ from crane.recordings.recording_reader import (
     read_sensor_readings,
     select_time_span,
 )
+from crane.recordings.sensor_discrepancy import displaced_pins
 from crane.recordings.timeseries import Table, parse_heading
 from crane.simulation.recorded_run import simulated_columns
 
@@ -131,14 +142,7 @@ def calibrate(
     automatic = AUTO in requested
     if requested.pop(AUTO, None) is not None:
         raise InputError(f"'{AUTO}' chooses parameters by itself, give it no start")
-    sensor_names = [name for name in requested if name.startswith(SENSOR_PREFIX)]
-    for path, case in zip((*paths, *validation), cases, strict=True):
-        if sensor_names and case.table.notes.get(SENSORS_NOTE) == IDEAL_SENSORS:
-            raise InputError(
-                f"{path}: '{sensor_names[0]}' cannot be fitted to quantities, which its note "
-                f"'{SENSORS_NOTE}: {IDEAL_SENSORS}' says they are: give the readings, or remove "
-                "the note if they are"
-            )
+    _check_readings(requested, (*paths, *validation), cases)
     variants = MachineVariants(machine)
     parameters = variants.values | sensor_parameters(cases[0].known_sensors)
     units = {
@@ -152,41 +156,68 @@ def calibrate(
 
     unknowns = [] if automatic and not requested else unknowns_for(requested)
     used_names = {name for x in unknowns for name in (x.name, *dict(x.members))}
-    proposed = {x.name: x for x in candidate_parameters(machine, cases, parameters)}
+    known_mass = parameters.get(PAYLOAD_MASS, 0.0)
+    pins = {k: v for case in cases for k, v in displaced_pins(machine, case.table).items()}
+    statics = static_payload(variants, pins, cases) if PAYLOAD_MASS in parameters else None
+    proposed = {x.name: x for x in candidate_parameters(machine, cases, parameters, pins)}
+    if statics is not None:
+        proposed |= {x.name: x for x in statics.candidates(known_mass)}
     extras = [
         replace(x, scale=proposed[x.name].scale, prior=1.0)
         for x in unknowns_for({x.name: (x.start, x.low, x.high) for x in proposed.values()})
         if not used_names & {x.name, *dict(x.members)}
     ]
-    problem, excluded = CalibrationProblem(machine, unknowns, cases), list[str]()
+    problem = CalibrationProblem(machine, unknowns, cases)
     start = np.zeros(problem.unknown_count)
     initial_residuals = [problem.residuals(case, start) for case in problem.cases]
     dependencies = {
         "machine data": (variants.spec, machine.locked_joints),
         "recordings": [x.contents for x in cases], "settings": (unknowns, extras, automatic),
     }  # fmt: skip
+    if automatic:
+        problem = CalibrationProblem(machine, [*unknowns, *extras], cases)
+    kept = [x.name for x in unknowns] + [PAYLOAD_MASS] * (not known_mass)
     with open_checkpoint(checkpoint, dependencies, LOG_COLUMNS, 1) as table:
-        log = SearchLog(table)
-        search = LevenbergMarquardt(problem, progress, log)
-        if automatic:
-            problem, search, excluded = select_parameters(
-                CalibrationProblem(machine, [*unknowns, *extras], cases), progress, log
-            )
-        estimate = estimate_with_profiles(search, len(problem.unknowns))
-    tests = []
-    if not automatic:
-        applicable_extras = [x for x in extras if dict(x.members).get(x.name, x.start) == x.start]
-        tests = score_tests(search, applicable_extras, estimate.z)
+        first = LevenbergMarquardt(problem, progress, SearchLog(table))
+        selected = select_parameters(first, kept) if automatic else SelectedModel(first)
+        search = selected.search
+        problem = search.problem
+        estimate = estimate_with_profiles(search, len(problem.unknowns), selected.minimum)
+        errors = block_errors(search, estimate.z) if automatic else {}
+    applicable = [x for x in extras if dict(x.members).get(x.name, x.start) == x.start]
     with warnings.catch_warnings(action="ignore"):
         fitted = variants.machine(problem.changes(estimate.z))
     found = _calibration_result(problem, fitted, search, estimate, initial_residuals, units)
     known = dict(machine.sensors) | dict(cases[0].known_sensors)
+    findings = [
+        statics.finding(known_mass) if statics is not None else "",
+        *implausible_values(problem, estimate.z),
+        *near_minima(first.problem, first.minima),
+    ]  # fmt: skip
     return replace(
         found,
         machine=_machine_with_sensors(fitted, known, columns, found.changes),
-        score_tests=tuple(tests),
-        unobserved_parameters=tuple(excluded),
+        score_tests=() if automatic else tuple(score_tests(search, applicable, estimate.z)),
+        selection=selected.steps,
+        unselected_parameters=selected.left_out,
+        block_errors=errors,
+        minima=tuple(x.cost / first.minima[0].cost for x in first.minima),
+        findings=tuple(filter(None, findings)),
     )
+
+
+def _check_readings(
+    requested: Iterable[str], paths: Sequence[str | Path], cases: Sequence[RecordingCase]
+) -> None:
+    """Refuse parameters of sensors where recordings have quantities instead of readings."""
+    sensor_names = [name for name in requested if name.startswith(SENSOR_PREFIX)]
+    for path, case in zip(paths, cases, strict=True):
+        if sensor_names and case.table.notes.get(SENSORS_NOTE) == IDEAL_SENSORS:
+            raise InputError(
+                f"{path}: '{sensor_names[0]}' cannot be fitted to quantities, which its note "
+                f"'{SENSORS_NOTE}: {IDEAL_SENSORS}' says they are: give the readings, or remove "
+                "the note if they are"
+            )
 
 
 def _read_cases(

@@ -16,6 +16,7 @@ from crane.identification.calibration.calibration_statistics import (
     ScoreTestResult,
     correlated_directions,
 )
+from crane.identification.calibration.model_selection import SelectionStep
 from crane.identification.calibration.recording_case import noise_std
 from crane.machine.machine import Machine
 
@@ -152,8 +153,12 @@ class Calibration(Result):
         correlation: (n, n) correlations of the parameters.
         states: Velocities and chamber pressures of the drives of the fitted machine, by recording.
         is_lowest_minimum: Whether no lower minimum was found at the ends of the intervals.
-        unobserved_parameters: Selected parameters without an effect in the recordings; they are
-            unchanged.
+        unselected_parameters: Candidates that the selection left out; they are unchanged.
+        selection: Steps of the selection of parameters.
+        block_errors: By channel, RMS error in blocks of the training data that were left out of
+            the fit: of all blocks, and of the worst.
+        minima: Costs of the minima of searches from several starts, relative to the lowest.
+        findings: Texts about what is not plausible.
     """
 
     machine: Machine
@@ -166,7 +171,11 @@ class Calibration(Result):
     correlation: Array = field(default_factory=lambda: np.zeros((0, 0)))
     states: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
     is_lowest_minimum: bool = True
-    unobserved_parameters: tuple[str, ...] = ()
+    unselected_parameters: tuple[str, ...] = ()
+    selection: tuple[SelectionStep, ...] = ()
+    block_errors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    minima: tuple[float, ...] = ()
+    findings: tuple[str, ...] = ()
 
     def _one_line(self) -> str:
         """Machine, channels, and identifiable parameters."""
@@ -210,16 +219,13 @@ class Calibration(Result):
     @property
     def quality_warnings(self) -> list[str]:
         """Warnings about the calibration as a whole."""
-        texts = [] if self.is_lowest_minimum else [LOWER_MINIMUM_WARNING]
+        texts = [*self.findings]
+        if not self.is_lowest_minimum:
+            texts.append(LOWER_MINIMUM_WARNING)
         if self.degraded_channels:
             texts.append(
                 "On held-out data the residuals are larger than before in "
                 f"{', '.join(self.degraded_channels)}: fit fewer parameters, or record more."
-            )
-        if self.unobserved_parameters:
-            texts.append(
-                "These have no effect in the recordings and are unchanged: "
-                f"{', '.join(self.unobserved_parameters)}."
             )
         return texts
 
@@ -261,6 +267,7 @@ class Calibration(Result):
                 f"- {x.name} at about {x.value:.3g}: {100 * x.cost_reduction:.0f} %"
                 for x in self.score_tests
             ]
+        lines += self._selection_lines()
         has_held_out = any(not sensor.train_mask.all() for sensor in self.channels)
         lines += [
             "",
@@ -280,9 +287,44 @@ class Calibration(Result):
             words = ["" if word == "nan" else word for word in words]
             lines.append(f"| {name} | {unit} | {' | '.join(words)} |")
         lines += ["", f"RMS of simulated less measured; {self.simulation_count} simulations."]
+        if len(self.minima) > 1:
+            lines += ["", f"Searches from several starts ended at {self._minima_text()} times the "
+                      "lowest sum of squares."]  # fmt: skip
         if self.changes:
             lines += ["", f"    {self.command_line_options}"]
         return "\n".join(lines)
+
+    def _minima_text(self) -> str:
+        return ", ".join(f"{x:.3g}" for x in self.minima)
+
+    def _selection_lines(self) -> list[str]:
+        """Path of the selection, and errors in the blocks that were left out, in Markdown."""
+        if not self.selection:
+            return []
+        units = {x.name: display_unit(x.unit, float(np.ptp(x.measured))) for x in self.channels}
+        names = list(self.selection[0].errors)
+        columns = [f"{name} [{units[name][0]}]" for name in names]
+
+        def cells(errors: Mapping[str, float]) -> str:
+            return " | ".join(f"{units[name][1] * errors[name]:.3g}" for name in names)
+
+        lines = ["", "Selection: parameters in the order of what they reduce in blocks that are "
+                 "left out, by linearization, with the errors there:", "",
+                 f"| | score | BIC | {' | '.join(columns)} |",
+                 "| --- | ---: | ---: |" + " ---: |" * len(names)]  # fmt: skip
+        for step in self.selection:
+            word = (
+                f"{'without' if step.is_removal else 'with'} {step.name}" if step.name else "start"
+            )
+            lines.append(
+                f"| {word} | {step.score:.1f} | {step.information_criterion:.1f} | "
+                f"{cells(step.errors)} |"
+            )
+        for k, word in enumerate(("blocks left out", "the worst block")):
+            errors = {name: self.block_errors[name][k] for name in names}
+            lines.append(f"| simulated, {word} | | | {cells(errors)} |")
+        lines += ["", "Left out: " + ", ".join(self.unselected_parameters) + "."]
+        return lines
 
 
 @dataclass(frozen=True, eq=False, repr=False)

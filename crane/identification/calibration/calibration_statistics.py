@@ -18,11 +18,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crane.common.errors import CraneError, InputError
-from crane.common.progress import Progress
+from crane.common.errors import CraneError
 from crane.common.samples import Array
 from crane.identification.calibration.calibration_problem import CalibrationProblem
-from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt, SearchLog
+from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt
+from crane.identification.calibration.multi_start import minimize_from_starts
 from crane.identification.calibration.unknowns import Unknown
 
 _LOWER_MINIMUM_SHARE = 5e-2  # relative difference of the cost of a lower minimum
@@ -38,8 +38,6 @@ _MIN_COMPONENT = 0.25  # relative to the largest component of a direction
 _MIN_COST_REDUCTION = 0.03  # of the cost, that is reported
 _MAX_REPORTED = 5  # results that are reported
 _MAX_STEP = 2.0  # standard deviations of a change
-# without stiffness the damping has no effect
-_STIFFNESS_SUFFIX, _DAMPING_SUFFIX = ".stiffness", ".damping"
 _MIN_INDEPENDENT_SHARE = 1e-6  # part of a derivative that is independent of the fitted parameters
 
 
@@ -90,17 +88,18 @@ class CalibrationEstimate:
 
 
 def estimate_with_profiles(
-    search: LevenbergMarquardt, parameter_count: int
+    search: LevenbergMarquardt, parameter_count: int, minimum: Array | None = None
 ) -> CalibrationEstimate:
     """Minimize, evaluate the ends of the intervals, and continue from lower minima.
 
     Args:
         search: The minimization.
         parameter_count: Number of parameters, which are the first unknowns.
+        minimum: (p,) minimum at which the search is linearized; None to search it.
     """
     from scipy.stats import t as student
 
-    z = search.run()
+    z = minimize_from_starts(search) if minimum is None else minimum
     for last in [False] * _MAX_RESTARTS + [True]:
         covariance, blocks = search.covariance(z)
         factor = float(student.ppf(0.975, max(blocks - 1, 1)))
@@ -283,50 +282,3 @@ def score_tests(
         for one in sorted(found, key=lambda one: -one.cost_reduction)
         if one.cost_reduction > _MIN_COST_REDUCTION
     ][:_MAX_REPORTED]
-
-
-def select_parameters(
-    problem: CalibrationProblem, progress: Progress, log: SearchLog
-) -> tuple[CalibrationProblem, LevenbergMarquardt, list[str]]:
-    """Fit all parameters with their priors, and remove those without an effect.
-
-    A parameter is removed if it stays on a bound at the value of the machine: no air, no leakage,
-    no delay, or a rigid structure.
-
-    Args:
-        problem: Problem of all candidates; parameters without a prior are always kept.
-        progress: See `calibrate`.
-        log: States of the searches.
-
-    Returns:
-        Problem of the kept parameters, a search that continues from the fit, and names of the
-        removed parameters.
-
-    Raises:
-        InputError: No parameter is kept.
-    """
-    search = LevenbergMarquardt(problem, progress, log)
-    z, unknowns = search.smoothed_minimum(), problem.unknowns
-    excluded = set()
-    for i, unknown in enumerate(unknowns):
-        rigid = dict(unknown.members).get(unknown.name) == 0.0 and unknown.start > 0.0
-        if unknown.prior and (z[i] == 0.0 or rigid and z[i] >= search.high[i]):
-            excluded.add(unknown.name)
-    excluded_springs = [
-        name.removesuffix(_STIFFNESS_SUFFIX)
-        for name in excluded
-        if name.endswith(_STIFFNESS_SUFFIX)
-    ]
-    excluded |= {x.name for x in unknowns if x.prior} & {
-        name + _DAMPING_SUFFIX for name in excluded_springs
-    }
-    included = [i for i, unknown in enumerate(unknowns) if unknown.name not in excluded]
-    if not included:
-        raise InputError("the recordings determine no parameter: move more, or name parameters")
-    reduced_problem = CalibrationProblem(
-        problem.machine, [unknowns[i] for i in included], problem.cases
-    )
-    reduced_problem.simulation_count = problem.simulation_count
-    initial_unknowns = np.concatenate([z[included], z[len(unknowns) :]])
-    names = [unknown.name for unknown in unknowns if unknown.name in excluded]
-    return reduced_problem, search.restricted_search(reduced_problem, initial_unknowns), names

@@ -3,7 +3,6 @@
 Its states are kept, so that an interrupted search goes on from the last one.
 """
 
-import warnings
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -31,14 +30,14 @@ _SMOOTHING_SCHEDULE, _FINAL_SMOOTHING = (
 _COVARIANCE_SMOOTHING = 0.1  # smoothing for derivatives of the covariance
 _MAX_ITERATIONS = 40  # iterations per round
 # relative change of the cost that ends the iterations
-_COST_TOLERANCE, _INITIAL_COST_TOLERANCE = 1e-4, 1e-2
+_COST_TOLERANCE, INITIAL_COST_TOLERANCE = 1e-4, 1e-2
 # least scale per largest value of a channel, and absolute [SI]
 _MIN_RELATIVE_SCALE, _MIN_SCALE = 1e-6, 1e-9
-_MAX_SCALE_SHARE = 0.2  # largest scale per variation of a channel
-# initial damping, and that far from the minimum
-_INITIAL_DAMPING, _CAUTIOUS_DAMPING = 1e-3, 1.0
+# largest scale of a channel, the usual error of a model, per range of its unit in the recordings
+_MAX_SCALE_SHARE = 5e-3
+_NOISE_LEVEL = 1.5  # noises of a channel, up to which nothing is left to explain
+_INITIAL_DAMPING = 1e-3
 _DAMPING_INCREASE, _DAMPING_DECREASE, _MAX_DAMPING = 10.0, 0.2, 1e8  # of the damping
-_PART_DURATION = 2.0  # [s] of the parts of the initial search
 _COARSE_DERIVATIVE_TOLERANCE = 1e-2  # relative error of derivatives far from the minimum
 _BLOCK_COUNT_RANGE = 8, 40  # range of the number of blocks of a covariance
 LOG_COLUMNS = (
@@ -118,6 +117,11 @@ class LevenbergMarquardt:
         jacobian: (M, p) weighted derivatives of the training data at the minimum.
         residual: (M,) weighted residuals, likewise.
         blocks: (M,) time of each row, unique over recordings.
+        channels: (M,) channel of each row, by its index in `channel_scales`.
+        redundancy: Samples per independent residual. Priors count as often, because residuals of
+            model errors are no independent observations.
+        initial_guess: (p,) unknowns from which it goes on, None for a search of its own.
+        minima: Minima of the searches from several starts, the lowest first.
     """
 
     def __init__(
@@ -136,132 +140,127 @@ class LevenbergMarquardt:
         self.high = np.array(
             [(x.high - x.start) / x.scale for x in unknowns] + [np.inf] * start_count
         )
-        self.prior = np.array([x.prior for x in unknowns] + [1.0] * start_count)
         self.training_cases = [case for case in problem.cases if case.train_mask.any()]
+        self._prior = np.array([x.prior for x in unknowns] + [1.0] * start_count)
+        count = sum(int(case.train_mask.sum()) for case in self.training_cases)
+        self._max_redundancy = max(count / _BLOCK_COUNT_RANGE[1], 1.0)
+        self.redundancy = self._max_redundancy
         self._scale_bounds = self._channel_scale_bounds()
         self.channel_scales: dict[str, float] = {}
-        self.jacobian = self.residual = self.blocks = np.zeros(0)
+        self.jacobian = self.residual = self.blocks = self.channels = np.zeros(0)
+        self.minima: list[SearchState] = []
         self._iteration_count = iteration_count
-        self._initial_guess: Array | None = None
+        self.initial_guess: Array | None = None
         self._has_stiction = bool(find_stick_slip_columns(problem.machine))
+
+    @property
+    def prior(self) -> Array:
+        """Weights (p,) of the priors, as many samples count as one independent residual."""
+        return self._prior * np.sqrt(self.redundancy)
 
     def restricted_search(self, problem: CalibrationProblem, z: Array) -> "LevenbergMarquardt":
         """Method for fewer unknowns, with these channel scales and an initial guess."""
         search = LevenbergMarquardt(problem, self._progress, self._log, self._iteration_count)
-        search.channel_scales, search._initial_guess = self.channel_scales, z
+        search.channel_scales, search.initial_guess = self.channel_scales, z
+        search.redundancy = self.redundancy
         return search
 
-    def run(self) -> Array:
-        """Run all rounds; returns the unknowns at the minimum."""
-        problem = self.problem
-        z = self.smoothed_minimum() if self._initial_guess is None else self._initial_guess
-        problem.derivative_tolerance = DERIVATIVE_TOLERANCE
-        # residuals with smoothed friction do not give the final scales: they are updated
-        for problem.smooth, problem.slopes in _SMOOTHING_SCHEDULE if self._has_stiction else ():
-            z = self._minimize(z, _INITIAL_COST_TOLERANCE)
-            self.channel_scales = self._updated_channel_scales(z)
-        return self.nearest_minimum(z)
-
-    def smoothed_minimum(self) -> Array:
-        """Approximate minimum with smoothed friction, and the linearization there."""
+    def start_with_smoothed_friction(self) -> None:
+        """Prepare a search far from the minimum: largest channel scales, smoothed friction."""
         problem = self.problem
         self.channel_scales = {name: most for name, (_, most) in self._scale_bounds.items()}
         problem.smooth = float(self._has_stiction)
         problem.derivative_tolerance = _COARSE_DERIVATIVE_TOLERANCE
-        z = self._best_initial_minimum(np.zeros(problem.unknown_count))
-        self.channel_scales = self._updated_channel_scales(z)
-        z = self._minimize(z, _INITIAL_COST_TOLERANCE)
-        self._linearize(z)
-        return z
+
+    def sharpen_friction(self, z: Array) -> Array:
+        """Follow the minimum of smoothed friction to that of the friction model."""
+        problem = self.problem
+        problem.derivative_tolerance = DERIVATIVE_TOLERANCE
+        # residuals with smoothed friction do not give the final scales: they are updated
+        for problem.smooth, problem.slopes in _SMOOTHING_SCHEDULE if self._has_stiction else ():
+            z = self.minimize(z, INITIAL_COST_TOLERANCE).z
+            self.channel_scales = self.updated_channel_scales(z)
+        return self.nearest_minimum(z)
 
     def nearest_minimum(self, z: Array) -> Array:
         """Nearest minimum to some unknowns, with updated channel scales."""
         problem = self.problem
         problem.smooth, problem.slopes = _FINAL_SMOOTHING
         for _ in range(_MAX_WEIGHT_ROUNDS):
-            z = self._minimize(z)
-            before, self.channel_scales = self.channel_scales, self._updated_channel_scales(z)
+            z = self.minimize(z).z
+            before, self.channel_scales = self.channel_scales, self.updated_channel_scales(z)
             if all(
                 abs(np.log(x / before[name])) < _SCALE_TOLERANCE
                 for name, x in self.channel_scales.items()
             ):
                 break
         problem.slopes = _COVARIANCE_SMOOTHING
-        self._linearize(z)
+        self.linearize(z)
+        self.update_redundancy()
         self._progress(1.0)
         return z
 
-    def _updated_channel_scales(self, z: Array) -> dict[str, float]:
-        """Channel scales by the residuals of the training data."""
+    def training_errors(self, z: Array) -> dict[str, float]:
+        """RMS residual of each channel over the training data."""
         residuals: dict[str, list[Array]] = {}
         for case in self.training_cases:
             residual = self.problem.residuals(case, z)[case.train_mask]
             for name, x in zip(case.sensors, residual.T, strict=True):
                 residuals.setdefault(name, []).append(x)
-        scales = {}
-        for name, parts in residuals.items():
-            rms = max(root_mean_square(np.concatenate(parts)), _MIN_SCALE)
-            least, most = self._scale_bounds[name]
-            scales[name] = min(max(least, rms), most)
-        return scales
+        return {
+            name: max(root_mean_square(np.concatenate(parts)), _MIN_SCALE)
+            for name, parts in residuals.items()
+        }
 
-    def _best_initial_minimum(self, z: Array) -> Array:
-        """The better of two minima: from the initial parameters, and from a fit to short parts.
+    def updated_channel_scales(self, z: Array) -> dict[str, float]:
+        """Channel scales by the residuals of the training data."""
+        return {
+            name: float(np.clip(rms, *self._scale_bounds[name]))
+            for name, rms in self.training_errors(z).items()
+        }
 
-        Long motions have local minima with another number of oscillations, or without motion.
-        """
-        problem, count = self.problem, len(self.problem.unknowns)
-        minima = [self._minimize(z, _INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING)]
-        with warnings.catch_warnings(action="ignore"):
-            parts = [
-                x
-                for case in self.training_cases
-                for x in case.split_training(problem.machine, _PART_DURATION)
-            ]
-        if parts:
-            part_problem = CalibrationProblem(problem.machine, problem.unknowns, parts)
-            part_problem.smooth = problem.smooth
-            part_problem.derivative_tolerance = problem.derivative_tolerance
-            search = LevenbergMarquardt(
-                part_problem, self._progress, self._log, self._iteration_count
-            )
-            search.channel_scales = self.channel_scales
-            part_minimum = search._minimize(
-                np.zeros(part_problem.unknown_count), _INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING
-            )
-            self._iteration_count = search._iteration_count
-            problem.simulation_count += part_problem.simulation_count
-            z = z.copy()
-            z[:count] = part_minimum[:count]
-            if np.isfinite(self._cost(z)):
-                minima.append(self._minimize(z, _INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING))
-        return min(minima, key=self._cost)
+    def update_redundancy(self) -> None:
+        """Set the samples per independent residual, by the correlation of each channel."""
+        total, start = 0.0, 0
+        for case in self.training_cases:
+            count = int(case.train_mask.sum())
+            rows = self.residual[start : start + count * len(case.sensors)].reshape(count, -1)
+            start += rows.size
+            total += sum((2.0 * _correlation_time(x) - 1.0) * float(x @ x) for x in rows.T)
+        power = float(self.residual @ self.residual)
+        self.redundancy = float(np.clip(total / max(power, 1e-300), 1.0, self._max_redundancy))
 
     def _channel_scale_bounds(self) -> dict[str, tuple[float, float]]:
         """Least and largest scale of each channel.
 
         The least is its noise, by third differences, with a lower bound by its digits. The largest
-        is by the largest variation of all channels in the same unit: model errors depend on the
-        motion, not on the channel.
+        is a share of the range of all channels in the same unit, of pressures from vacuum: model
+        errors depend on the motion and the load, not on the channel. No channel is given up.
         """
         variances: dict[str, list[float]] = {}
-        digits, variation = dict[str, float](), dict[str, float]()
+        digits, ranges = dict[str, float](), dict[str, float]()
         units: dict[str, str] = {}
         for case in self.training_cases:
             for name, x in zip(case.sensors, case.measured.T, strict=True):
                 known_noise = case.known_sensors[name].noise if name in case.known_sensors else 0.0
                 variances.setdefault(name, []).append((known_noise or noise_std(x)) ** 2)
-                smallest = _MIN_RELATIVE_SCALE * float(np.abs(x).max())
-                digits[name] = max(digits.get(name, _MIN_SCALE), smallest)
+                largest = float(np.abs(x).max())
+                digits[name] = max(digits.get(name, _MIN_SCALE), _MIN_RELATIVE_SCALE * largest)
                 unit = units[name] = case.table.units[name]
-                variation[unit] = max(
-                    variation.get(unit, 1e-12), float(np.std(x[case.train_mask]))
-                )
+                span = largest if unit == "Pa" else float(np.ptp(x[case.train_mask]))
+                ranges[unit] = max(ranges.get(unit, 1e-12), span)
         bounds = {}
         for name, squares in variances.items():
             least = max(float(np.sqrt(np.mean(squares))), digits[name])
-            bounds[name] = least, max(least, _MAX_SCALE_SHARE * variation[units[name]])
+            bounds[name] = least, max(least, _MAX_SCALE_SHARE * ranges[units[name]])
         return bounds
+
+    def leaves_noise(self, z: Array) -> bool:
+        """Whether the residuals of all channels are about their noise."""
+        return all(
+            rms < _NOISE_LEVEL * self._scale_bounds[name][0]
+            for name, rms in self.training_errors(z).items()
+        )
 
     def channel_weights(self, case: RecordingCase) -> Array:
         """Weights (N, k): one over the channel scales, 0 for held-out data."""
@@ -281,7 +280,7 @@ class LevenbergMarquardt:
             parts.append((residuals * self.channel_weights(case))[case.train_mask].ravel())
         return np.concatenate(parts)
 
-    def _cost(self, z: Array) -> float:
+    def cost(self, z: Array) -> float:
         """Half the sum of squares, infinite if the simulation fails."""
         try:
             residuals = self.weighted_residuals(z)
@@ -289,8 +288,10 @@ class LevenbergMarquardt:
             return np.inf
         return 0.5 * float(residuals @ residuals + np.sum((self.prior * z) ** 2))
 
-    def _linearize(self, z: Array) -> None:
-        rows, weighted, blocks = [], [], []
+    def linearize(self, z: Array) -> None:
+        """Set jacobian, residual, blocks and channels at z."""
+        rows, weighted, blocks, channels = [], [], [], []
+        order = {name: k for k, name in enumerate(self._scale_bounds)}
         for number, case in enumerate(self.training_cases):
             residual, derivatives = self.problem.linearize(case, z)
             weights, mask = self.channel_weights(case), case.train_mask
@@ -300,36 +301,52 @@ class LevenbergMarquardt:
             weighted.append((residual * weights)[mask].ravel())
             time = np.repeat(case.inputs.time[mask], len(case.sensors))
             blocks.append(time + 1e9 * number)
+            channels.append(np.tile([order[x] for x in case.sensors], int(mask.sum())))
         self.jacobian, self.residual = np.vstack(rows), np.concatenate(weighted)
-        self.blocks = np.concatenate(blocks)
+        self.blocks, self.channels = np.concatenate(blocks), np.concatenate(channels)
 
-    def _minimize(
-        self, z: Array, cost_tolerance: float = _COST_TOLERANCE, damping: float = _INITIAL_DAMPING
-    ) -> Array:
-        """Nearest minimum for the present channel scales."""
+    def minimize(
+        self,
+        z: Array,
+        cost_tolerance: float = _COST_TOLERANCE,
+        damping: float = _INITIAL_DAMPING,
+        max_iterations: int = _MAX_ITERATIONS,
+    ) -> SearchState:
+        """Last state of a search for the nearest minimum, for the present channel scales.
+
+        Args:
+            z: (p,) start.
+            cost_tolerance: Relative reduction of the cost by an iteration that ends the search.
+            damping: Initial damping.
+            max_iterations: Number of iterations that ends the search.
+
+        Raises:
+            CraneError: The simulation fails at the start.
+        """
         state = self._log.begin()
         if state is None:
-            state = SearchState(z, self._cost(z), damping)
+            state = SearchState(z, self.cost(z), damping)
         else:
             self._iteration_count = state.total_iterations
             self.problem.simulation_count = state.simulations
         if not np.isfinite(state.cost):  # raises the error
             for case in self.training_cases:
                 self.problem.residuals(case, z)
-        while not state.has_ended:
+        while not state.has_ended and state.iteration < max_iterations:
             state = self._iterate(state, cost_tolerance)
             self._log.add(state)
-        return state.z
+        return state
 
     def _iterate(self, state: SearchState, cost_tolerance: float) -> SearchState:
         """State after an iteration: a step that reduces the cost, if there is one."""
         z, cost, damping = state.z, state.cost, state.damping
-        self._linearize(z)
+        self.linearize(z)
         hessian = self.jacobian.T @ self.jacobian + np.diag(self.prior**2)
         gradient = self.jacobian.T @ self.residual + self.prior**2 * z
         while damping <= _MAX_DAMPING:
-            trial = self._step(z, hessian, gradient, damping)
-            trial_cost = self._cost(trial)
+            trial = z + bounded_step(hessian, gradient, self.low - z, self.high - z, damping)
+            trial = np.clip(trial, self.low, self.high)
+            trial_cost = self.cost(trial)
             self._iteration_count += 1
             self._progress(1.0 - 0.97**self._iteration_count)
             if trial_cost < cost:
@@ -339,31 +356,9 @@ class LevenbergMarquardt:
         iteration, reduction = state.iteration + 1, state.cost - cost
         has_ended = reduction < cost_tolerance * state.cost or not reduction
         return SearchState(
-            z, cost, damping, iteration, has_ended or iteration >= _MAX_ITERATIONS,
+            z, cost, damping, iteration, has_ended,
             self._iteration_count, self.problem.simulation_count,
         )  # fmt: skip
-
-    def _step(self, z: Array, hessian: Array, gradient: Array, damping: float) -> Array:
-        """Damped step within the bounds, by an active set."""
-        size = np.diag(hessian)
-        scaled = hessian + damping * np.diag(np.maximum(size, 1e-12 * size.max()))
-        free = np.ones(len(z), dtype=bool)
-        step = np.zeros(len(z))
-        for _ in range(len(z)):
-            free_indices = np.flatnonzero(free)
-            right_side = (
-                -gradient[free_indices] - scaled[np.ix_(free_indices, ~free)] @ step[~free]
-            )
-            step[free_indices] = np.linalg.lstsq(
-                scaled[np.ix_(free_indices, free_indices)], right_side, rcond=1e-12
-            )[0]
-            trial = z + step
-            outside = free & ((trial < self.low) | (trial > self.high))
-            if not outside.any():
-                break
-            step[outside] = np.clip(trial, self.low, self.high)[outside] - z[outside]
-            free &= ~outside
-        return np.clip(z + step, self.low, self.high)
 
     def covariance(self, z: Array) -> tuple[Array, int]:
         """Covariance (p, p) of the scaled unknowns, and the number of blocks.
@@ -377,7 +372,8 @@ class LevenbergMarquardt:
         sums = np.zeros((numbers.max() + 1, len(z)))
         np.add.at(sums, numbers, self.jacobian * self.residual[:, None])
         count = len(sums)
-        meat = sums.T @ sums * (count / max(count - 1, 1)) + np.diag(self.prior**2)
+        meat = sums.T @ sums * (count / max(count - 1, 1))
+        meat += self.redundancy * np.diag(self.prior**2)
         robust = inverse @ meat @ inverse
         degrees_of_freedom = max(len(self.residual) - len(z), 1)
         white = inverse * float(self.residual @ self.residual) / degrees_of_freedom
@@ -398,6 +394,34 @@ class LevenbergMarquardt:
                 correlation_time = max(correlation_time, step * _correlation_time(x))
         fewest, most = _BLOCK_COUNT_RANGE
         return max(min(max(4.0 * correlation_time, duration / most), duration / fewest), 1e-9)
+
+
+def bounded_step(
+    hessian: Array, gradient: Array, low: Array, high: Array, damping: float = 0.0
+) -> Array:
+    """Damped Gauss-Newton step (p,) between bounds, by an active set.
+
+    Args:
+        hessian: (p, p).
+        gradient: (p,).
+        low: (p,) least step.
+        high: (p,) largest step.
+        damping: Marquardt's, relative to the diagonal.
+    """
+    size = np.diag(hessian)
+    scaled = hessian + damping * np.diag(np.maximum(size, 1e-12 * size.max(initial=0.0)))
+    free = np.ones(len(gradient), dtype=bool)
+    step = np.zeros(len(gradient))
+    for _ in range(len(gradient)):
+        i = np.flatnonzero(free)
+        right_side = -gradient[i] - scaled[np.ix_(i, ~free)] @ step[~free]
+        step[i] = np.linalg.lstsq(scaled[np.ix_(i, i)], right_side, rcond=1e-12)[0]
+        outside = free & ((step < low) | (step > high))
+        if not outside.any():
+            break
+        step[outside] = np.clip(step, low, high)[outside]
+        free &= ~outside
+    return step
 
 
 def _correlation_time(x: Array) -> float:

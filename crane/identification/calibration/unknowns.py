@@ -2,19 +2,20 @@
 
 import fnmatch
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from crane.common.errors import InputError, check_name
 from crane.description.machine_parameters import unknown_parameter_text
-from crane.description.sensors import INCLINATION_PREFIX, SENSOR_PREFIX
+from crane.description.sensors import INCLINATION_PREFIX, PRESSURE_PREFIX, SENSOR_PREFIX
 from crane.description.specification import MachineSpec
 from crane.hydraulics.components import Spool, Valve
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.identification.calibration.recording_case import RecordingCase
 from crane.machine.machine import Machine
+from crane.recordings.timeseries import table_column
 
 SENSOR_PARAMETER_DEFAULTS = {"zero": 0.0, "scale": 1.0, "delay": 0.0}
 # scales of sensor zeros
@@ -29,15 +30,20 @@ _SIGNED_PARAMETERS = (
 _MIN_SPOOL_STROKE = 0.05  # of the stroke of a spool, from which a valve counts as open
 _MIN_BANDWIDTH, _MAX_BANDWIDTH = 5.0, 200.0  # bandwidths of spools [1/s]
 _DELAY_STD, _MAX_DELAY = 0.1, 0.6  # standard deviation and largest value of delays [s]
-_INCLINATION_ZERO_STD = 0.05  # standard deviation of inclinometer zeros [rad]
+_STROKE_DELAY_STD = 0.02  # standard deviation of delays of length sensors [s]
+_ANGLE_ZERO_STD = 0.05  # standard deviation of zeros of angle sensors [rad]
+_PIN_STD, _MAX_PIN_ERROR = 0.01, 0.05  # standard deviation and largest error of a pin [m]
 _PRESSURE_ZERO_STD = 2e5  # standard deviation of pressure sensor zeros [Pa]
-_GAS_VOLUME_SHARE = 5e-3  # of the volume of a chamber
-_LEAKAGE_FLOW_SHARE = 1e-2  # of the full flow of a valve at supply pressure
+# pressure [Pa] whose share of the mean pressure is the share of gas in the volume of a chamber:
+# air dissolves under pressure
+_GAS_PRESSURE = 3e4
+_LEAKAGE_FLOW_SHARE = 5e-4  # of the full flow of a valve at supply pressure
+_ORIFICE_STD, _MAX_ORIFICE_FACTOR = 0.3, 2.5  # relative deviation and largest factor of an orifice
 # orifices of the spools of A and B, by direction
 _ORIFICES_BY_DIRECTION = {1: ("c1", "c2"), -1: ("c3", "c4")}
 # bounds of a stiffness, relative to that of the oil or the known one
 _MAX_STIFFNESS_REDUCTION, _MAX_STIFFNESS_INCREASE = 20.0, 4.0
-_FRICTION_FORCE_SHARE = 2e-2  # of the force of a cylinder at supply pressure
+_FRICTION_FORCE_SHARE = 4e-2  # of the force of a cylinder at supply pressure
 
 
 @dataclass(frozen=True)
@@ -175,7 +181,10 @@ def _read_bounds(name: str, given: object) -> tuple[float | None, float | None, 
 
 
 def candidate_parameters(
-    machine: Machine, cases: Sequence[RecordingCase], parameters: Mapping[str, float]
+    machine: Machine,
+    cases: Sequence[RecordingCase],
+    parameters: Mapping[str, float],
+    pins: Iterable[str] = (),
 ) -> list[Unknown]:
     """Candidates that recordings of a machine may determine.
 
@@ -183,10 +192,14 @@ def candidate_parameters(
         machine: The machine.
         cases: The recordings.
         parameters: Parameters of the machine and its sensors by name.
+        pins: Coordinates of pins that may be displaced.
     """
     found: list[Unknown] = []
     for sensor in dict.fromkeys(name for case in cases for name in case.sensors):
-        found += _sensor_candidates(sensor, parameters)
+        found += _sensor_candidates(sensor, machine, parameters)
+    for name in pins:
+        x = parameters[name]
+        found.append(_candidate(name, x, _PIN_STD, x - _MAX_PIN_ERROR, x + _MAX_PIN_ERROR))
     hydraulics = machine.hydraulics
     if hydraulics is None:
         return found
@@ -194,12 +207,10 @@ def candidate_parameters(
         directions = {name: _opening_directions(name, hydraulics, cases) for name in valve.spools}
         for name, spool in valve.spools.items():
             if directions[name]:
-                orifice_slice = slice(None)
-                if len(directions) > 1:  # each spool has its own chamber
-                    orifice_slice = slice(0, 1) if spool is valve else slice(1, 2)
-                found += _spool_candidates(spool, parameters, directions[name], orifice_slice)
+                found += _spool_candidates(spool, parameters, directions[name])
+                found += _orifice_candidates(spool, valve, parameters, directions[name])
         if any(directions.values()):
-            found += _cylinder_candidates(joint, machine, hydraulics, parameters)
+            found += _cylinder_candidates(joint, machine, hydraulics, parameters, cases)
     if parameters.get("payload.mass", 0.0):
         found.append(_positive_candidate("payload.mass", parameters["payload.mass"], 0.5, 3.0))
     found.append(_positive_candidate("oil.bulk_modulus", hydraulics.oil.bulk_modulus, 0.5, 5.0))
@@ -211,6 +222,12 @@ def _candidate(
 ) -> Unknown:
     """Candidate with the standard deviation of its value in a file as prior."""
     return Unknown(name, start, low, high, std, prior=1.0)
+
+
+def _zero_candidate(name: str, parameters: Mapping[str, float], std: float) -> Unknown:
+    """Candidate of the zero of a sensor, which is not believed beyond three deviations."""
+    start = parameters.get(name, 0.0)
+    return _candidate(name, start, std, start - 3.0 * std, start + 3.0 * std)
 
 
 def _positive_candidate(name: str, start: float, relative_std: float, factor: float) -> Unknown:
@@ -235,23 +252,25 @@ def _opening_directions(
     return {way for way, most in ((1, u.max()), (-1, -u.min())) if most > _MIN_SPOOL_STROKE}
 
 
-def _sensor_candidates(name: str, parameters: Mapping[str, float]) -> Iterator[Unknown]:
+def _sensor_candidates(
+    name: str, machine: Machine, parameters: Mapping[str, float]
+) -> Iterator[Unknown]:
     zero, delay = (f"{SENSOR_PREFIX}{name}.{what}" for what in ("zero", "delay"))
-    if name.startswith(INCLINATION_PREFIX):
-        yield _candidate(zero, parameters.get(zero, 0.0), _INCLINATION_ZERO_STD)
+    is_passive = name in machine.joints and name not in machine.active
+    is_angle = is_passive and machine.unit(name) == "rad"
     if name.startswith("pressure_"):  # pressure sensors have little delay
-        yield _candidate(zero, parameters.get(zero, 0.0), _PRESSURE_ZERO_STD)
-    else:
-        yield _candidate(delay, parameters.get(delay, 0.0), _DELAY_STD, 0.0, _MAX_DELAY)
+        yield _zero_candidate(zero, parameters, _PRESSURE_ZERO_STD)
+        return
+    if is_angle or name.startswith(INCLINATION_PREFIX):
+        yield _zero_candidate(zero, parameters, _ANGLE_ZERO_STD)
+    std = _STROKE_DELAY_STD if name in machine.joints and not is_angle else _DELAY_STD
+    yield _candidate(delay, parameters.get(delay, 0.0), std, 0.0, _MAX_DELAY)
 
 
 def _spool_candidates(
-    spool: Spool,
-    parameters: Mapping[str, float],
-    directions: set[int],
-    orifice_slice: slice,
+    spool: Spool, parameters: Mapping[str, float], directions: set[int]
 ) -> Iterator[Unknown]:
-    """Candidates of a spool and of the orifices that it opened."""
+    """Candidates of a spool, by the directions in which it opened."""
     name = f"valve.{spool.joint}" + ("" if isinstance(spool, Valve) else ".spool_b")
     drift, dead = 0.02 * abs(spool.full - spool.neutral), spool.dead_band
     lowest = max(dead - 0.15, 0.0 if dead >= 0 else -0.5)  # an overlap stays one
@@ -259,23 +278,40 @@ def _spool_candidates(
         least, most = spool.neutral - 3.0 * drift, spool.neutral + 3.0 * drift
         yield _candidate(f"{name}.neutral", spool.neutral, drift, least, most)
     yield _candidate(f"{name}.dead_band", dead, 0.05, lowest, dead + 0.15)
-    for orifice in (
-        x
-        for way in sorted(directions, reverse=True)
-        for x in _ORIFICES_BY_DIRECTION[way][orifice_slice]
-    ):
-        parameter = f"valve.{spool.joint}.{orifice}"
-        if parameters[parameter]:
-            yield _positive_candidate(parameter, parameters[parameter], 0.3, 2.5)
     if spool.bandwidth:
         low, high = min(spool.bandwidth, _MIN_BANDWIDTH), max(spool.bandwidth, _MAX_BANDWIDTH)
-        yield _candidate(f"{name}.bandwidth", spool.bandwidth, spool.bandwidth, low, high)
-    delay = spool.delay
-    yield _candidate(f"{name}.delay", delay, _DELAY_STD, 0.0, max(delay, _MAX_DELAY))
+        yield _candidate(f"{name}.bandwidth", spool.bandwidth, 0.5 * spool.bandwidth, low, high)
+    yield _candidate(f"{name}.delay", spool.delay, _DELAY_STD, 0.0, max(spool.delay, _MAX_DELAY))
+
+
+def _orifice_candidates(
+    spool: Spool, valve: Valve, parameters: Mapping[str, float], directions: set[int]
+) -> Iterator[Unknown]:
+    """Candidates of orifices: a common factor where a single spool opened in one direction.
+
+    What holds for the edges that were opened then holds for the others, too.
+    """
+    if len(valve.spools) == 1 and len(directions) == 1:
+        low, high = 1.0 / _MAX_ORIFICE_FACTOR, _MAX_ORIFICE_FACTOR
+        yield _candidate(f"valve.{spool.joint}.c*", 1.0, _ORIFICE_STD, low, high)
+        return
+    which = slice(None)
+    if len(valve.spools) > 1:  # each spool has its own chamber
+        which = slice(0, 1) if spool is valve else slice(1, 2)
+    for way in sorted(directions, reverse=True):
+        for name in (f"valve.{spool.joint}.{x}" for x in _ORIFICES_BY_DIRECTION[way][which]):
+            if parameters[name]:
+                yield _positive_candidate(
+                    name, parameters[name], _ORIFICE_STD, _MAX_ORIFICE_FACTOR
+                )
 
 
 def _cylinder_candidates(
-    joint: str, machine: Machine, hydraulics: Hydraulics, parameters: Mapping[str, float]
+    joint: str,
+    machine: Machine,
+    hydraulics: Hydraulics,
+    parameters: Mapping[str, float],
+    cases: Sequence[RecordingCase],
 ) -> Iterator[Unknown]:
     cylinder, valve = hydraulics.cylinders[joint], hydraulics.valves[joint]
     pressure = hydraulics.supply.pressure
@@ -295,9 +331,13 @@ def _cylinder_candidates(
     )
     leakage_coefficient = _LEAKAGE_FLOW_SHARE * valve.c1 / np.sqrt(pressure)
     for side, volume in zip("ab", volumes, strict=True):
-        hose = f"cylinder.{joint}.hose_{side}"
-        yield _positive_candidate(hose, parameters[hose], 0.5, 3.0)
-        for what, size in (("gas", _GAS_VOLUME_SHARE * volume), ("leakage", leakage_coefficient)):
+        chamber = f"{PRESSURE_PREFIX}{joint}_{side}"
+        measured = [
+            np.mean(table_column(x.table, chamber)) for x in cases if chamber in x.table.units
+        ]
+        mean = max(float(np.mean(measured)) if measured else 0.5 * pressure, _GAS_PRESSURE)
+        gas = _GAS_PRESSURE / mean * volume
+        for what, size in (("gas", gas), ("leakage", leakage_coefficient)):
             name = f"cylinder.{joint}.{what}_{side}"
             start = parameters[name]
             yield _candidate(name, start, max(start, size), 0.0)
@@ -311,9 +351,9 @@ def _cylinder_candidates(
         for area, volume in zip((cylinder.area_a, cylinder.area_b), volumes, strict=True)
     )
     name = f"cylinder.{joint}.stiffness"
-    start = parameters[name] or oil_stiffness
-    yield _candidate(
-        name, start, start, start / _MAX_STIFFNESS_REDUCTION, start * _MAX_STIFFNESS_INCREASE
-    )
+    known = parameters[name] or oil_stiffness
+    low, high = known / _MAX_STIFFNESS_REDUCTION, known * _MAX_STIFFNESS_INCREASE
+    start = parameters[name] or high  # about rigid
+    yield _candidate(name, start, start, low, high)
     name = f"cylinder.{joint}.damping"
     yield _positive_candidate(name, parameters[name], 1.0, 20.0)

@@ -1,0 +1,312 @@
+"""Selection of the parameters of a calibration by the prediction of blocks that are left out.
+
+All candidates are fitted with their priors first. The linearization there, with residual r and
+Jacobian J by the scaled unknowns z, predicts the residuals of every other set S of parameters, the
+others at the values of the machine: r(z_S) = r - J z + J_S z_S. A fit of S without block b of
+contiguous instants is a Gauss-Newton step of normal equations, its error in block b follows from
+their matrices. The set grows by the parameter that reduces
+
+    score = sum_c n_c ln(mean square of channel c over all blocks left out) + sum_S (z / prior)^2
+            + 2 k
+
+most, with the number n_c of independent samples, deviations z of priors and k parameters, up to
+all candidates. The set
+of the lowest score is kept, without parameters that the recordings do not determine: whose
+deviation is that of their prior, or that correlate with another one. It is fitted by simulation,
+and selected again by the linearization there, until it repeats.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from crane.common.samples import Array
+from crane.identification.calibration.calibration_problem import CalibrationProblem
+from crane.identification.calibration.levenberg_marquardt import (
+    INITIAL_COST_TOLERANCE,
+    LevenbergMarquardt,
+    bounded_step,
+)
+from crane.identification.calibration.multi_start import smoothed_minimum
+
+MAX_CORRELATION = 0.98  # of parameters that are both kept
+MAX_PRIOR_SHARE = 0.7  # of the deviation of a prior, up to which recordings determine a parameter
+BLOCK_DURATION = 3.0  # [s] of a block that is left out
+_BLOCK_RANGE = 3, 8  # number of blocks of a recording
+_MAX_ROUNDS = 3  # linearizations
+_BLOCK_ITERATIONS = 3  # of the fits without a block
+
+
+@dataclass(frozen=True)
+class SelectionStep:
+    """Step of a selection.
+
+    Attributes:
+        name: Parameter that was added, or removed.
+        is_removal: Whether it was removed.
+        score: Score of the set after it, by blocks left out; see the module.
+        information_criterion: Bayesian information criterion of the set, n ln(mean square of the
+            residual) + k ln(n).
+        errors: RMS errors of the channels in the blocks left out, in their units.
+    """
+
+    name: str
+    is_removal: bool
+    score: float
+    information_criterion: float
+    errors: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class SelectedModel:
+    """Result of a selection.
+
+    Attributes:
+        search: Search of the selected parameters.
+        minimum: (p,) its minimum, where it is linearized; None if it was not searched.
+        steps: Steps of the selection.
+        left_out: Names of the parameters that were left out.
+    """
+
+    search: LevenbergMarquardt
+    minimum: Array | None = None
+    steps: tuple[SelectionStep, ...] = ()
+    left_out: tuple[str, ...] = ()
+
+
+class LinearizedSelection:
+    """Sets of unknowns by a linearization.
+
+    Args:
+        search: Search of all candidates, linearized at z.
+        z: (p,) unknowns.
+        kept: Indices of unknowns that all sets contain.
+    """
+
+    def __init__(self, search: LevenbergMarquardt, z: Array, kept: Sequence[int]):
+        J, self._search, self._z = search.jacobian, search, z
+        self._kept, self._count = list(kept), len(search.problem.unknowns)
+        residual = search.residual - J @ z
+        blocks = training_blocks(search.blocks)
+        names = list(search.channel_scales)
+        self._counts = np.bincount(search.channels, minlength=len(names)) / search.redundancy
+        shape = len(np.unique(blocks)), len(names), len(z) + 1, len(z) + 1
+        extended = np.column_stack([J, residual])
+        self._products = np.zeros(shape)  # by block and channel
+        for b in range(shape[0]):
+            for c in range(shape[1]):
+                rows = extended[(blocks == b) & (search.channels == c)]
+                self._products[b, c] = rows.T @ rows
+        self._rows = np.bincount(search.channels, minlength=len(names))
+        self._by_block = self._products.sum(axis=1)
+        self._prior = np.diag(search.prior**2)
+
+    def fit(self, unknowns: Sequence[int], without_block: int | None = None) -> Array:
+        """Unknowns (p,) of a set, the others 0.
+
+        Args:
+            unknowns: Indices of the set.
+            without_block: Block that is left out.
+        """
+        products = self._by_block.sum(axis=0)
+        if without_block is not None:
+            products = products - self._by_block[without_block]
+        i = np.asarray(unknowns, dtype=int)
+        z, search = np.zeros(len(self._z)), self._search
+        z[i] = bounded_step(
+            (products[:-1, :-1] + self._prior)[np.ix_(i, i)], products[i, -1],
+            search.low[i], search.high[i],
+        )  # fmt: skip
+        return z
+
+    def mean_squares(self, unknowns: Sequence[int], left_out: bool) -> Array:
+        """Mean squares (c,) of the weighted residuals, fitted or where blocks are left out."""
+        total = np.zeros(len(self._rows))
+        for b, products in enumerate(self._products):
+            z = np.append(self.fit(unknowns, b if left_out else None), 1.0)
+            total += np.einsum("i,cij,j->c", z, products, z)
+        return np.maximum(total / self._rows, 1e-12)
+
+    def score(self, parameters: Sequence[int]) -> float:
+        """Score of a set of parameters, by blocks left out."""
+        unknowns = self.with_starts(parameters)
+        squares, z = self.mean_squares(unknowns, True), self.fit(unknowns)
+        penalty = float(z @ self._prior @ z) / self._search.redundancy
+        return float(self._counts @ np.log(squares)) + penalty + 2.0 * len(parameters)
+
+    def with_starts(self, parameters: Sequence[int]) -> list[int]:
+        """Parameters and all starts of recordings."""
+        return [*parameters, *range(self._count, len(self._z))]
+
+    def step(self, name: str, is_removal: bool, parameters: Sequence[int]) -> SelectionStep:
+        """Step that leads to a set of parameters."""
+        unknowns = self.with_starts(parameters)
+        fitted, errors = (self.mean_squares(unknowns, x) for x in (False, True))
+        total = float(self._counts.sum())
+        criterion = float(self._counts @ np.log(fitted)) + len(parameters) * np.log(total)
+        sizes = self._search.channel_scales.items()
+        by_name = {c: float(s * np.sqrt(x)) for (c, s), x in zip(sizes, errors, strict=True)}
+        return SelectionStep(name, is_removal, self.score(parameters), criterion, by_name)
+
+    def undetermined(self, parameters: Sequence[int]) -> list[int]:
+        """Parameters of a set that are removed next: prior alone, or correlated pairs."""
+        unknowns = self.with_starts(parameters)
+        hessian = (self._by_block.sum(axis=0)[:-1, :-1] + self._prior)[np.ix_(unknowns, unknowns)]
+        covariance = np.linalg.pinv(hessian, rcond=1e-13, hermitian=True)
+        covariance = covariance[: len(parameters), : len(parameters)]
+        deviations = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+        prior = np.sqrt(np.diag(self._prior))[list(parameters)]
+        loose = deviations * prior > MAX_PRIOR_SHARE
+        correlation = covariance / np.outer(deviations, deviations) - np.eye(len(parameters))
+        loose |= (np.abs(correlation) > MAX_CORRELATION).any(axis=1)
+        return [p for p, x in zip(parameters, loose, strict=True) if x and p not in self._kept]
+
+    def path(self) -> tuple[list[int], list[SelectionStep]]:
+        """Indices of the selected parameters, and the steps that lead there."""
+        unknowns, chosen, steps = self._search.problem.unknowns, list(self._kept), []
+        candidates = [i for i in range(self._count) if i not in chosen]
+        steps.append(self.step("", False, chosen))
+        sets = [list(chosen)]
+        while candidates:
+            best = min(candidates, key=lambda i: self.score([*chosen, i]))
+            candidates.remove(best)
+            chosen.append(best)
+            sets.append(list(chosen))
+            steps.append(self.step(unknowns[best].name, False, chosen))
+        size = min(range(len(steps)), key=lambda i: steps[i].score)
+        chosen, steps = sets[size], steps[: size + 1]
+        while True:
+            removable = self.undetermined(chosen) or [
+                i for i in chosen if i not in self._kept
+                and self.score([x for x in chosen if x != i]) < steps[-1].score
+            ]  # fmt: skip
+            if not removable:
+                return chosen, steps
+            worst = min(removable, key=lambda i: self.score([x for x in chosen if x != i]))
+            chosen.remove(worst)
+            steps.append(self.step(unknowns[worst].name, True, chosen))
+
+
+def training_blocks(times: Array) -> Array:
+    """Numbers (M,) of the blocks of contiguous instants that are left out, one after another.
+
+    Args:
+        times: (M,) time of each row, unique over recordings.
+    """
+    recordings = np.unique(np.floor(times / 1e8 + 0.5), return_inverse=True)[1]
+    numbers, first = np.zeros(len(times), dtype=int), 0
+    for i in range(recordings.max() + 1):
+        rows = recordings == i
+        time = times[rows] - times[rows].min()
+        count = int(np.clip(round(time.max() / BLOCK_DURATION), *_BLOCK_RANGE))
+        numbers[rows] = first + np.minimum(time / (time.max() + 1e-9) * count, count - 1)
+        first += count
+    return numbers
+
+
+def select_parameters(search: LevenbergMarquardt, kept_names: Sequence[str]) -> SelectedModel:
+    """Select parameters, see the module.
+
+    Args:
+        search: Search of all candidates.
+        kept_names: Parameters that are kept in any case.
+
+    Returns:
+        The selected model.
+    """
+    whole, z = search.problem, search.sharpen_friction(smoothed_minimum(search))
+    kept = [i for i, x in enumerate(whole.unknowns) if x.name in kept_names]
+    tried: list[list[int]] = []
+    for _ in range(_MAX_ROUNDS):
+        selection = LinearizedSelection(search, z, kept)
+        chosen, steps = selection.path()
+        unknowns = selection.with_starts(chosen := sorted(chosen))
+        if chosen in tried:
+            break
+        tried.append(chosen)
+        problem = CalibrationProblem(whole.machine, [whole.unknowns[i] for i in chosen],
+                                     whole.cases)  # fmt: skip
+        problem.smooth, problem.slopes = whole.smooth, whole.slopes
+        starts = [z[unknowns], selection.fit(unknowns)[unknowns]]
+        restricted = search.restricted_search(problem, starts[0])
+        start = min(starts, key=restricted.cost)
+        found = restricted.minimize(start, INITIAL_COST_TOLERANCE).z
+        z = np.zeros(len(z))
+        z[unknowns] = found
+        search.channel_scales = search.updated_channel_scales(z)
+        search.linearize(z)
+        search.update_redundancy()
+        whole.simulation_count += problem.simulation_count
+    problem.simulation_count = whole.simulation_count
+    restricted = search.restricted_search(problem, z[unknowns])
+    determined, z = _determined(restricted, restricted.sharpen_friction(z[unknowns]), kept_names)
+    names = {x.name for x in determined.problem.unknowns}
+    left_out = (x.name for x in whole.unknowns if x.name not in names)
+    return SelectedModel(determined, z, tuple(steps), tuple(left_out))
+
+
+def _determined(
+    search: LevenbergMarquardt, z: Array, kept_names: Sequence[str]
+) -> tuple[LevenbergMarquardt, Array]:
+    """Search and minimum of the parameters that the recordings determine.
+
+    Args:
+        search: Search at its minimum.
+        z: (p,) minimum.
+        kept_names: Parameters that are kept in any case.
+    """
+    while True:
+        problem = search.problem
+        parameters = problem.unknowns
+        kept = [i for i, x in enumerate(parameters) if x.name in kept_names]
+        selection = LinearizedSelection(search, z, kept)
+        everything = list(range(len(parameters)))
+        removable = selection.undetermined(everything) or [
+            i for i in everything if parameters[i].prior and z[i] == 0.0 and i not in kept
+        ]
+        if not removable:
+            return search, z
+        rests = {i: [x for x in everything if x != i] for i in removable}
+        rest = min(rests.values(), key=selection.score)
+        smaller = CalibrationProblem(problem.machine, [parameters[i] for i in rest], problem.cases)
+        smaller.simulation_count = problem.simulation_count
+        unknowns = selection.with_starts(rest)
+        search = search.restricted_search(smaller, z[unknowns])
+        z = search.nearest_minimum(z[unknowns])
+
+
+def block_errors(search: LevenbergMarquardt, z: Array) -> dict[str, tuple[float, float]]:
+    """RMS errors of each channel in blocks that are left out of the fit: of all, and of the worst.
+
+    Args:
+        search: Search at its minimum, linearized there.
+        z: (p,) minimum.
+    """
+    problem, squares = search.problem, dict[str, list[tuple[int, float]]]()
+    numbers, row = training_blocks(search.blocks), 0
+    for k, case in enumerate(search.training_cases):
+        count = int(case.train_mask.sum()) * len(case.sensors)
+        blocks = np.full(len(case.train_mask), -1)
+        blocks[case.train_mask] = numbers[row : row + count : len(case.sensors)]
+        row += count
+        for b in np.unique(blocks[case.train_mask]):
+            cases = list(search.training_cases)
+            cases[k] = replace(case, train_mask=case.train_mask & (blocks != b))
+            part = CalibrationProblem(problem.machine, problem.unknowns, cases)
+            part.smooth, part.slopes = problem.smooth, problem.slopes
+            part.derivative_tolerance = problem.derivative_tolerance
+            found = search.restricted_search(part, z).minimize(
+                z, INITIAL_COST_TOLERANCE, max_iterations=_BLOCK_ITERATIONS
+            )
+            problem.simulation_count += part.simulation_count
+            residual = part.residuals(part.cases[k], found.z)[blocks == b]
+            for name, x in zip(case.sensors, residual.T, strict=True):
+                squares.setdefault(name, []).append((len(x), float(x @ x)))
+    return {
+        name: (
+            float(np.sqrt(sum(x for _, x in parts) / sum(n for n, _ in parts))),
+            float(np.sqrt(max(x / n for n, x in parts))),
+        )
+        for name, parts in squares.items()
+    }

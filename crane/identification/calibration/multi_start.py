@@ -1,0 +1,129 @@
+"""Multi-start search: a calibration from several starts, of which the better ones go on.
+
+Over a whole motion, one oscillation more or less is a local minimum, and so is a crane that never
+lifts. Therefore the search starts from the machine, from a fit to short parts of the recordings
+(multiple shooting), and from the best of many points of a Sobol sequence, which are simulated
+only. In three rounds the better half of the searches goes on. A search from the machine that
+leaves nothing but noise needs no others.
+"""
+
+import warnings
+
+import numpy as np
+
+from crane.common.samples import Array
+from crane.identification.calibration.calibration_problem import CalibrationProblem
+from crane.identification.calibration.levenberg_marquardt import (
+    INITIAL_COST_TOLERANCE,
+    LevenbergMarquardt,
+    SearchState,
+)
+from crane.identification.calibration.unknowns import Unknown
+
+_CAUTIOUS_DAMPING = 1.0
+_PART_DURATION = 2.0  # [s] of the parts of a recording
+_POINT_COUNT = 128  # points of the Sobol sequence
+_ROUNDS = ((7, 3), (3, 4), (2, 40))  # searches and iterations of each round
+_SAMPLE_DEVIATIONS = 2.0  # of a prior, within which points lie
+_SAMPLE_FACTOR = 3.0  # of a start without a prior, likewise
+_PRIOR_SHARE = 0.98  # of the normal distribution
+
+
+def minimize_from_starts(search: LevenbergMarquardt) -> Array:
+    """Minimum (p,) of a search, which goes on from its initial guess if it has one."""
+    z = smoothed_minimum(search) if search.initial_guess is None else search.initial_guess
+    return search.sharpen_friction(z)
+
+
+def smoothed_minimum(search: LevenbergMarquardt) -> Array:
+    """Lowest minimum (p,) found with smoothed friction, and the linearization there."""
+    search.start_with_smoothed_friction()
+    start = np.zeros(search.problem.unknown_count)
+    first = search.minimize(start, INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING, _ROUNDS[0][1])
+    is_good = search.leaves_noise(first.z)
+    search.minima = [first] if is_good else _race(search, first)
+    z = search.minima[0].z
+    search.channel_scales = search.updated_channel_scales(z)
+    z = search.minimize(z, INITIAL_COST_TOLERANCE).z
+    search.linearize(z)
+    search.update_redundancy()
+    return z
+
+
+def _race(search: LevenbergMarquardt, first: SearchState) -> list[SearchState]:
+    """Minima of the searches that were finished, the lowest first.
+
+    Args:
+        search: The search.
+        first: State of the search from the machine after the first round.
+    """
+    starts = [*_part_minimum(search), *_sampled_points(search)]
+    points = [SearchState(z, search.cost(z), _CAUTIOUS_DAMPING) for z in starts]
+    states = sorted((x for x in points if np.isfinite(x.cost)), key=lambda x: x.cost)
+    others = [first]
+    for count, iterations in _ROUNDS:
+        states = [
+            search.minimize(x.z, INITIAL_COST_TOLERANCE, x.damping, iterations)
+            for x in states[:count]
+        ]
+        states = sorted([*others, *states], key=lambda x: x.cost)
+        others = []
+    return states
+
+
+def _part_minimum(search: LevenbergMarquardt) -> list[Array]:
+    """Unknowns of a fit to short parts of the recordings, if they are long enough."""
+    problem, count = search.problem, len(search.problem.unknowns)
+    with warnings.catch_warnings(action="ignore"):
+        parts = [
+            x
+            for case in search.training_cases
+            for x in case.split_training(problem.machine, _PART_DURATION)
+        ]
+    if not parts:
+        return []
+    part_problem = CalibrationProblem(problem.machine, problem.unknowns, parts)
+    part_problem.smooth = problem.smooth
+    part_problem.derivative_tolerance = problem.derivative_tolerance
+    start = np.zeros(part_problem.unknown_count)
+    part_search = search.restricted_search(part_problem, start)
+    z = np.zeros(problem.unknown_count)
+    z[:count] = part_search.minimize(start, INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING).z[:count]
+    problem.simulation_count += part_problem.simulation_count
+    return [z]
+
+
+def _sampled_points(search: LevenbergMarquardt) -> list[Array]:
+    """Points of a Sobol sequence of the machine parameters; sensors are linear and start at 0."""
+    from scipy.stats import qmc
+
+    unknowns = search.problem.unknowns
+    varied = [i for i, x in enumerate(unknowns) if not x.sensor]
+    if not varied:
+        return []
+    points = []
+    for shares in qmc.Sobol(len(varied), seed=0).random(_POINT_COUNT):
+        z = np.zeros(search.problem.unknown_count)
+        z[varied] = [sample(unknowns[i], x) for i, x in zip(varied, shares, strict=True)]
+        points.append(np.clip(z, search.low, search.high))
+    return points
+
+
+def sample(unknown: Unknown, share: float) -> float:
+    """Scaled value of an unknown where its distribution reaches a share.
+
+    The distribution is that of its prior. Without a prior, it is uniform in the logarithm for
+    positive parameters, else uniform.
+    """
+    from scipy.stats import norm
+
+    if unknown.prior:
+        return float(norm.ppf(0.5 + (share - 0.5) * _PRIOR_SHARE)) / unknown.prior
+    start = unknown.start
+    if start > 0 and unknown.low >= 0 and unknown.scale == start:
+        value = start * _SAMPLE_FACTOR ** (2.0 * share - 1.0)
+    elif np.isfinite(unknown.high - unknown.low):
+        value = unknown.low + share * (unknown.high - unknown.low)
+    else:
+        value = start + _SAMPLE_DEVIATIONS * unknown.scale * (2.0 * share - 1.0)
+    return (value - start) / unknown.scale

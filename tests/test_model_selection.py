@@ -1,0 +1,114 @@
+"""Selection of parameters by blocks left out, several starts, and payloads by statics."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from crane.identification.calibration.levenberg_marquardt import bounded_step
+from crane.identification.calibration.model_selection import (
+    LinearizedSelection,
+    training_blocks,
+)
+from crane.identification.calibration.multi_start import sample
+from crane.identification.calibration.plausibility import StaticPayload, implausible_values
+from crane.identification.calibration.unknowns import Unknown
+
+NAMES = ["gain", "offset", "nothing", "twin", "weak"]
+
+
+def linear_search(seed=0, noise=0.1, count=1200):
+    """A linear model of two channels: two parameters, one without effect, a twin, noise alone."""
+    random, time = np.random.default_rng(seed), np.linspace(0.0, 12.0, count)
+    gain, offset = np.sin(time), np.ones(count)
+    columns = np.column_stack([gain, offset, 0 * time, gain + 1e-4 * offset, np.cos(9 * time)])
+    J = np.repeat(columns, 2, axis=0) * np.tile([1.0, 0.5], count)[:, None]
+    residual = J @ np.array([-2.0, 1.0, 0.0, 0.0, 0.0]) + noise * random.normal(size=2 * count)
+    unknowns = [Unknown(x, 0.0, -9.0, 9.0, 1.0, prior=1.0) for x in NAMES]
+    return SimpleNamespace(
+        jacobian=J, residual=residual, blocks=np.repeat(time, 2), redundancy=1.0,
+        channels=np.tile([0, 1], count), channel_scales={"x": 0.5, "y": 2.0},
+        prior=np.ones(5), low=np.full(5, -9.0), high=np.full(5, 9.0),
+        problem=SimpleNamespace(unknowns=unknowns),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_the_data_need_is_selected(seed):
+    """Neither a column of zeros, nor one of a pair, nor what fits noise."""
+    search = linear_search(seed)
+    chosen, steps = LinearizedSelection(search, np.zeros(5), []).path()
+    assert sorted(chosen) in ([0, 1], [1, 3])
+    assert [step.name for step in steps[1:3]] in (["gain", "offset"], ["twin", "offset"])
+    assert steps[2].score < steps[1].score < steps[0].score
+    # where they are left out, noise alone remains, in the units of the channels
+    assert steps[2].errors["x"] == pytest.approx(0.5 * 0.1, rel=0.1)
+    assert steps[2].errors["y"] == pytest.approx(2.0 * 0.1, rel=0.1)
+
+
+def test_errors_in_blocks_are_those_of_fits_without_them():
+    """The normal equations give what least squares over the other rows gives."""
+    search = linear_search()
+    z = np.array([0.5, -0.2, 0.0, 0.1, 0.0])
+    selection, both = LinearizedSelection(search, z, [4]), [0, 1]
+    blocks = training_blocks(search.blocks)
+    assert len(np.unique(blocks)) == 4
+    squares = np.zeros(2)
+    J, r = search.jacobian[:, both], search.residual - search.jacobian @ z
+    for b in range(4):
+        rest = blocks != b
+        fitted = np.linalg.lstsq(np.vstack([J[rest], np.eye(2)]), -np.append(r[rest], [0.0, 0.0]))[
+            0
+        ]
+        np.testing.assert_allclose(selection.fit(both, b)[both], fitted, rtol=1e-9)
+        error = (r + J @ fitted)[~rest]
+        squares += np.bincount(search.channels[~rest], error**2) / 1200
+    np.testing.assert_allclose(selection.mean_squares(both, True), squares, rtol=1e-9)
+    assert selection.path()[0][0] == 4  # what is named by hand stays
+
+
+def test_steps_stay_within_bounds():
+    """The step to the corner of a quadratic is that of scipy's bounded least squares."""
+    from scipy.optimize import lsq_linear
+
+    random = np.random.default_rng(3)
+    for _ in range(20):
+        A, b = random.normal(size=(30, 4)), random.normal(size=30)
+        low, high = np.full(4, -0.05), np.full(4, 0.1)
+        step = bounded_step(A.T @ A, A.T @ b, low, high)
+        best = lsq_linear(A, -b, (low, high)).x
+        assert np.all((step >= low) & (step <= high))
+        costs = [float(np.sum((A @ x + b) ** 2)) for x in (step, best)]
+        assert costs[0] <= 1.02 * costs[1]
+
+
+def test_samples_of_starts():
+    """A prior's quantiles; a factor of a positive value; the range between bounds."""
+    known = Unknown("a", 2.0, 0.0, 9.0, 0.5, prior=1.0)
+    assert sample(known, 0.5) == pytest.approx(0.0, abs=1e-12)
+    assert sample(known, 1.0) == -sample(known, 0.0) == pytest.approx(2.33, abs=0.01)
+    positive = Unknown("b", 4.0, 4e-3, np.inf, 4.0)
+    assert [4.0 + 4.0 * sample(positive, x) for x in (0, 1)] == pytest.approx([4 / 3, 12.0])
+    bounded = Unknown("c", 0.0, -1.0, 3.0, 4.0)
+    assert [4.0 * sample(bounded, x) for x in (0, 0.5, 1)] == pytest.approx([-1.0, 1.0, 3.0])
+
+
+def test_what_is_not_believable_is_said():
+    unknowns = [
+        Unknown("sensor.p.zero", 0.0, -9e9, 9e9, 2e5, prior=1.0), Unknown("a", 1.0, 0.0, 2.0, 1.0)
+    ]  # fmt: skip
+    problem = SimpleNamespace(unknowns=unknowns)
+    assert implausible_values(problem, np.array([2.9, 0.5, 0.0])) == []
+    zero, bound = implausible_values(problem, np.array([18.0, 1.0, 0.0]))
+    assert "sensor.p.zero = 3.6e+06 is not believable, 18 deviations from 0" in zero
+    assert bound == "a = 2 is on its bound."
+
+
+def test_a_payload_that_the_file_lacks_is_a_candidate():
+    weighed = StaticPayload(210.0, 6.0)
+    (found,) = weighed.candidates(0.0)
+    assert (found.start, found.scale, found.prior) == (210.0, 6.0, 1.0)
+    assert "carry 210 kg at the tip, the machine file has payload.mass 0" in weighed.finding(0.0)
+    assert weighed.finding(200.0) == "" and StaticPayload(5.0, 6.0).candidates(0.0) == []
+    (known,) = weighed.candidates(150.0)
+    assert (known.start, known.scale) == (150.0, 60.0)
