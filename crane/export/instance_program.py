@@ -21,12 +21,12 @@ from crane.codegen import (
 from crane.codegen.linked_functions import LinkedFunction, link_functions
 from crane.common.errors import CraneWarning, InputError
 from crane.common.samples import Array
+from crane.control.force_inputs import ForceInputs
 from crane.control.valve_commands import ValveSignals
 from crane.control.valve_drive import ValveDrive
 from crane.description.external_forces import Wrench
 from crane.dynamics.compiled_dynamics import DERIVATIVES_OF, build_quantity
 from crane.dynamics.dynamics import Dynamics
-from crane.control.force_inputs import ForceInputs
 from crane.export.instance_routines import INNER_ROUTINES, InstanceRoutines
 from crane.export.parameter_names import parameter_names
 from crane.machine.machine import Machine

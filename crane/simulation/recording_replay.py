@@ -164,6 +164,7 @@ def replay(
     try:
         schedule = ParameterSchedule.from_notes(table.notes)
         drive: ValveDrive | ForceInputs
+        initial: tuple[Array, Array] | None
         if machine.hydraulics is None:
             time, drive, initial = _force_inputs(machine, table)
         else:

@@ -25,14 +25,10 @@ from crane.export.instance_routines import STATUS_TEXTS
 from crane.hydraulics.circuit_elements import MAIN_PUMP
 from crane.hydraulics.circuit_states import BALANCE_UNITS
 from crane.machine.machine import Machine
-from crane.recordings.recording import (
-    COORDINATES_NOTE,
-    FORCE_UNITS,
-    KEPT_COORDINATES,
-    VELOCITY_UNITS,
-)
+from crane.recordings.recording import FORCE_UNITS, VELOCITY_UNITS
 from crane.recordings.recording_summary import DISPLAY_UNITS, result_title
-from crane.simulation.integration.chart_switching import KEPT_CHART_RELAXATION
+from crane.simulation.integration.charts import KEPT_CHART_RELAXATION
+from crane.simulation.parameter_schedule import COORDINATES_NOTE, KEPT_COORDINATES
 from crane.view.page.drive_conditions import DriveConditions
 from crane.view.page.drive_goals import goal_data
 from crane.view.page.drive_levers import INTERVAL, lever_data
@@ -128,14 +124,14 @@ def _drive_data(conditions: DriveConditions) -> dict[str, Any]:
         "joints": list(_joints(program, order)),
         "energy": _energy(program, order),
         "loads": [
-            {"name": force.name, "frame": frame_data(machine, force.frame), "column": order[header]}
-            for force in machine.external_forces
-            if (header := f"load_{force.name}_force_x [N]") in order
+            {"name": x.name, "frame": frame_data(machine, x.frame), "column": order[header]}
+            for x in machine.external_forces
+            if (header := f"load_{x.name}_force_x [N]") in order
         ],
         "statuses": dict(STATUS_TEXTS),
         "notes": [
-            "crane recording", f"machine name: {machine.name}", "task: drive", "controller: levers",
-            "sensors: ideal", f"{COORDINATES_NOTE}: {KEPT_COORDINATES}",
+            "crane recording", f"machine name: {machine.name}", "task: drive",
+            "controller: levers", "sensors: ideal", f"{COORDINATES_NOTE}: {KEPT_COORDINATES}",
             *([f"free: {', '.join(machine.free)}"] if machine.free else []),
         ],
         "expression": [machine.load_name, machine.load_options],
