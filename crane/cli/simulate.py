@@ -183,8 +183,8 @@ def simulate(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="A recording whose valve signals are replayed, and whose other columns are "
-            "compared with the simulation.",
+            help="A recording whose valve signals, or forces of a machine without valves, are "
+            "replayed, and whose other columns are compared with the simulation.",
         ),
     ] = None,
     load: Annotated[
