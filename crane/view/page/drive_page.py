@@ -26,15 +26,10 @@ from crane.export.instance_routines import STATUS_TEXTS
 from crane.hydraulics.circuit_elements import MAIN_PUMP
 from crane.hydraulics.circuit_states import BALANCE_UNITS
 from crane.machine.machine import Machine
-from crane.recordings.recording import (
-    COORDINATES_NOTE,
-    FORCE_UNITS,
-    KEPT_COORDINATES,
-    REFERENCE_PREFIX,
-    VELOCITY_UNITS,
-)
+from crane.recordings.recording import FORCE_UNITS, REFERENCE_PREFIX, VELOCITY_UNITS
 from crane.recordings.recording_summary import DISPLAY_UNITS, result_title
-from crane.simulation.integration.chart_switching import KEPT_CHART_RELAXATION
+from crane.simulation.integration.charts import KEPT_CHART_RELAXATION
+from crane.simulation.parameter_schedule import COORDINATES_NOTE, KEPT_COORDINATES
 from crane.view.page.drive_conditions import DriveConditions
 from crane.view.page.drive_goals import goal_data
 from crane.view.page.drive_hand import pull_data, target_data
@@ -136,10 +131,9 @@ def _drive_data(conditions: DriveConditions, controller: str | None) -> dict[str
         "joints": list(_joints(program, order)),
         "energy": _energy(program, order),
         "loads": [
-            {"name": force.name, "frame": frame_data(machine, force.frame), "column": order[header]}
-            for force in machine.external_forces
-            if (header := f"load_{force.name}_force_x [N]") in order
-            and force.name != TIP_WRENCH_NAME
+            {"name": x.name, "frame": frame_data(machine, x.frame), "column": order[header]}
+            for x in machine.external_forces
+            if (header := f"load_{x.name}_force_x [N]") in order and x.name != TIP_WRENCH_NAME
         ],
         "statuses": dict(STATUS_TEXTS),
         "notes": [

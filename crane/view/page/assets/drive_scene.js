@@ -102,6 +102,7 @@ class DriveSpace extends Space {
     }
 
     show(state) {
+        if (!state.q.every(Number.isFinite)) return; // after a step that failed
         const poses = this.tree.poses(state.q);
         this.place(this.groups, poses);
         this.showGoal(state.goal);
