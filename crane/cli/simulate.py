@@ -74,7 +74,10 @@ Step = Annotated[float, number_option("s", "Step of the recorded samples.")]
 
 @command()
 def demo(output: OutputFolder) -> None:
-    """Simulate and show all tasks of two bundled machines, and write pages to drive three."""
+    """Simulate two bundled machines; pages to drive three.
+
+    The tasks of the machines are simulated and shown.
+    """
     from crane.view.result_files import FIGURE, PAGE
 
     with progress_bar("simulating") as progress, replace_folder(output.out, output.force) as part:
