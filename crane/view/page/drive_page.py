@@ -156,12 +156,13 @@ def _columns(program: InstanceProgram) -> Iterator[tuple[str, int]]:
     active = machine.closure.active.tolist()
     for joint, column in zip(machine.active, active, strict=True):
         yield f"{joint} [{machine.unit(joint)}]", start("q") + column
-    for part, suffix, units in (
-        ("v_a", "velocity", VELOCITY_UNITS), ("tau", "force", FORCE_UNITS),
-    ):  # fmt: skip
-        for i, joint in enumerate(machine.active):
-            if part != "tau" or joint not in machine.free:
-                yield f"{joint}_{suffix} [{units[machine.unit(joint)]}]", start(part) + i
+    for part, suffix, units, joints in (
+        ("v_a", "velocity", VELOCITY_UNITS, machine.active),
+        ("tau", "force", FORCE_UNITS, machine.driven_joints),
+    ):
+        for joint in joints:
+            index = start(part) + machine.active.index(joint)
+            yield f"{joint}_{suffix} [{units[machine.unit(joint)]}]", index
     for column, joint in enumerate(machine.joints):
         if column not in active:
             yield f"{joint} [{machine.unit(joint)}]", start("q") + column
