@@ -17,7 +17,7 @@ export PYTHONDONTWRITEBYTECODE :=
 
 help:
 	@echo "make setup   create .venv and install the package with its extras and development tools"
-	@echo "make demo    simulate the mini forwarder; results in demo-output/"
+	@echo "make demo    simulate two machines, write pages to drive three; results in demo-output/"
 	@echo "make test    fast tests"
 	@echo "make slow    slow tests: browser, MuJoCo, long simulations"
 	@echo "make long    more of the same for an hour, before a release"

@@ -533,7 +533,8 @@ def test_demo(tmp_path):
     assert result.returncode == 0, result.stderr
     names = {path.name for path in (tmp_path / "demo").iterdir()}
     tasks = {"loading", "return", "lift", "dig", "load_truck", "grade"}
-    assert names == tasks | {"summary.md", "notes.txt"}
+    pages = {f"{name}_drive.html" for name in ("excavator", "mini_forwarder", "patu655")}
+    assert names == tasks | pages | {"summary.md", "notes.txt"}
     assert (tmp_path / "demo" / "lift" / "view.html").stat().st_size > 1000
     for task in tasks:
         names = {path.name for path in (tmp_path / "demo" / task).iterdir()}

@@ -1,6 +1,8 @@
 """The page on which a machine is driven, in a browser: its numbers are the library's."""
 
+import json
 import shutil
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -9,6 +11,11 @@ from warned import quiet
 
 import crane
 from crane.common.errors import InputError
+from crane.motion.kinematics import Kinematics
+from crane.recordings.measured_recordings import recorded_machine
+from crane.view.page.drive_conditions import DriveConditions
+from crane.view.page.drive_goals import goal_data
+from crane.view.page.drive_levers import lever_data
 from crane.view.page.drive_page import drive_html
 
 WEBGL = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -31,6 +38,7 @@ def opened(browser, path, **options):
     page = browser.new_page(**options)
     page.faults = []
     page.on("pageerror", lambda error: page.faults.append(str(error)))
+    page.on("console", lambda one: one.type == "error" and page.faults.append(one.text))
     page.on("request", lambda one: one.url.startswith("http") and page.faults.append(one.url))
     page.goto(path.as_uri())
     page.wait_for_function("window.crane && window.crane.state", timeout=30_000)
@@ -49,72 +57,173 @@ def dragged(page, x, y):
     for share in (0.3, 0.6, 1.0):
         page.mouse.move(left + share * x, top + share * y)
         page.wait_for_timeout(100)
-    page.wait_for_timeout(400)
+    until = page.evaluate("window.crane.state.time") + 0.4
+    page.wait_for_function(f"window.crane.state.time > {until}", timeout=20_000)
     label, hand = page.text_content("output.pull"), page.evaluate("window.crane.state.hand")
     page.mouse.up()
     return np.array(hand["force"]), label
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["patu655", "excavator"])
-def test_a_drive_by_keys_is_repeated_by_the_library(browser, tmp_path, name):
-    done = typed("view", name, "--drive", "--no-open", "--out", tmp_path / "drive.html")
-    assert done.returncode == 0
-    assert (tmp_path / "drive.html").stat().st_size < 3e6
-    page = opened(browser, tmp_path / "drive.html", viewport={"width": 1280, "height": 760})
-    for key in "wd":
-        page.keyboard.down(key)
-        page.wait_for_timeout(700)
-        page.keyboard.up(key)
-    dragged(page, 20, -40)
-    page.wait_for_timeout(500)
-    page.keyboard.press("Space")
-    assert page.evaluate("window.crane.state.status") == 1
-    assert page.evaluate("window.crane.frames") > 3
+def saved(page, path):
+    """The recording that the page saves."""
     with page.expect_download() as download:
         page.click("#save")
-    path = tmp_path / "drive.csv"
     download.value.save_as(path)
     assert not page.faults
     page.close()
-    machine = crane.load(name)
-    recorded = quiet(crane.Recording.from_csv, path)
+    return quiet(crane.Recording.from_csv, path)
+
+
+def assert_replayed(machine, recorded, path):
+    """The library moves as the page."""
     replayed, _ = quiet(crane.replay, machine, path, 0.01)
-    moved = np.ptp(recorded.q, axis=0)
-    assert moved.max() > 0.05
     np.testing.assert_allclose(recorded.q, replayed.q, rtol=0, atol=1e-9)
-    assert np.ptp(recorded.channels["load_tip_force_z"]) > 100.0
-    for channel in ("tip_z", "pressure_supply", "work"):
-        scale = np.abs(replayed.channels[channel]).max()
-        difference = recorded.channels[channel] - replayed.channels[channel]
-        assert np.abs(difference).max() < 1e-9 * scale
+    for channel in ("tip_z", "pressure_supply", "work", "static_stability", "stability"):
+        if channel in recorded.channels:
+            scale = np.abs(replayed.channels[channel]).max()
+            difference = recorded.channels[channel] - replayed.channels[channel]
+            assert np.abs(difference).max() < 1e-8 * scale, channel
+    assert recorded.channels.keys() <= replayed.channels.keys()
 
 
 @pytest.mark.slow
-def test_a_gamepad_moves_the_levers_and_a_stop_is_told(browser, tmp_path):
+def test_a_drive_with_another_load_and_slope_is_repeated_by_the_library(browser, tmp_path):
+    done = typed("view", "excavator", "--drive", "--no-open", "--out", tmp_path / "drive.html")
+    assert done.returncode == 0
+    assert (tmp_path / "drive.html").stat().st_size < 3e6
+    page = opened(browser, tmp_path / "drive.html", viewport={"width": 1280, "height": 760})
+    page.locator("#conditions input").first.fill("2")  # before the first step
+    for key, conditions in (("k", "payload: 5"), ("d", "pitch: 4, roll: -3"), ("w", "payload: 0")):
+        page.keyboard.down(key)
+        page.wait_for_timeout(400)
+        page.keyboard.up(key)
+        page.evaluate(f"crane.worker.postMessage({{ conditions: {{ {conditions} }} }})")
+        page.wait_for_timeout(200)
+    dragged(page, 20, -40)
+    page.keyboard.press("Space")
+    page.wait_for_function("!crane.state.running")
+    assert page.evaluate("crane.state.status") == 1
+    assert page.evaluate("crane.frames") > 3
+    recorded = saved(page, tmp_path / "drive.csv")
+    changes = json.loads(recorded.changes)
+    assert [set(values) for _, values in changes] == [
+        {"payload.mass"}, {"gravity.x", "gravity.y", "gravity.z"}, {"payload.mass"},
+    ]  # fmt: skip
+    machine = recorded_machine(tmp_path / "drive.csv", recorded.machine)
+    assert machine.parameter_changes["payload.mass"] > 0
+    assert np.ptp(recorded.q, axis=0).max() > 0.05
+    assert np.ptp(recorded.channels["load_tip_force_z"]) > 100.0
+    assert_replayed(machine, recorded, tmp_path / "drive.csv")
+
+
+@pytest.mark.slow
+def test_a_gamepad_does_a_cycle(browser, tmp_path):
+    machine, path = crane.load("patu655"), tmp_path / "drive.html"
+    path.write_text(drive_html(machine), encoding="utf-8")
+    page = opened(browser, path, viewport={"width": 640, "height": 480})
+    page.select_option("#goal", label="lift the load")
+    page.evaluate("navigator.getGamepads = () => [{ axes: window.axes, buttons: [] }]")
+    goal, levers, first = page.evaluate("[drive.goals[0], drive.levers, drive.columns.length]")
+    joints = page.evaluate("drive.joints.map(({ column }) => column)")
+    ranges, kinematics = machine.upper - machine.lower, Kinematics(machine)
+    axes = {"slew": (0, 1.0), "stick": (1, -1.0), "tool": (2, 1.0), "boom": (3, -1.0)}
+    for _ in range(1000):
+        state, row = page.evaluate("[crane.state.goal, crane.state.row]")
+        if state["isDone"]:
+            break
+        way = np.array(goal["points"][state["next"]]) - row[first : first + 3]
+        jacobian = kinematics.jacobian([row[i] for i in joints]) * ranges / 10
+        square = jacobian.T @ jacobian
+        lever = 1.5 * np.linalg.solve(
+            square + 1e-3 * np.trace(square) * np.eye(4), jacobian.T @ way
+        )
+        lever /= max(1.0, np.abs(lever).max())
+        given = [0.0, 0.0, 0.0, 0.0]
+        for one, x in zip(levers, lever, strict=True):
+            axis, sign = axes[one["role"]]
+            given[axis] = float(sign * one["sign"] * (0.88 * x + 0.12 * np.sign(x)))
+        page.evaluate(f"window.axes = {given}")
+        page.wait_for_timeout(30)
+    result = page.evaluate("crane.state.results[0]")
+    assert (result["goal"], len(page.evaluate("crane.state.changes"))) == ("lift the load", 2)
+    page.evaluate("window.axes = [0, 0, 0, 0]")
+    recorded = saved(page, tmp_path / "drive.csv")
+    assert_replayed(machine, recorded, tmp_path / "drive.csv")
+    end = np.searchsorted(recorded.time, result["time"])
+    pumped = recorded.channels["pump_work"]
+    assert result["energy"] == pytest.approx(pumped[end] - pumped[0], rel=0.02)
+    assert f'"goal":"{result["goal"]}"' in (tmp_path / "drive.csv").read_text()
+
+
+@pytest.mark.slow
+def test_sticks_by_touch_in_both_patterns(browser, tmp_path):
     path = tmp_path / "drive.html"
-    path.write_text(drive_html(crane.load("patu655")), encoding="utf-8")
-    page = opened(browser, path, viewport={"width": 390, "height": 800})
-    pad = "{ axes: [0, -1, 0, 0], buttons: [], connected: true }"
-    page.evaluate(f"navigator.getGamepads = () => [{pad}]")
-    page.click("#run")
-    page.wait_for_function("window.crane.state.time > 0.5", timeout=20_000)
-    levers = page.evaluate("window.crane.state.levers")
-    assert levers[1] == 1.0
-    assert levers[0] == levers[2] == levers[3] == 0.0
+    path.write_text(drive_html(crane.load("mini_forwarder")), encoding="utf-8")
+    page = opened(browser, path, viewport={"width": 390, "height": 844}, has_touch=True)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    moved = {}
+    for pattern in ("ISO", "SAE"):
+        page.click("#summary summary")
+        page.select_option("#pattern", pattern)
+        page.click("#summary summary")
+        box = page.locator(".stick.left .pad").bounding_box()
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        page.mouse.down()
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 2)
+        page.wait_for_function("crane.state.levers.some((x) => Math.abs(x) === 1)")
+        levers = page.evaluate("crane.state.levers")
+        moved[pattern] = [name for name, x in zip(("q1", "X1", "X2"), levers, strict=True) if x]
+        page.mouse.up()
+        page.wait_for_function("crane.state.levers.every((x) => x === 0)")
+    assert moved == {"ISO": ["X2"], "SAE": ["X1"]}
     page.click("#reset")
-    page.wait_for_function("window.crane.state.time === 0", timeout=20_000)
-    width = page.evaluate("document.documentElement.scrollWidth")
-    assert width <= 390
+    page.wait_for_function("crane.state.time === 0")
+    page.reload()
+    page.wait_for_function("window.crane && window.crane.state")
+    assert page.evaluate("crane.levers.pattern") == "SAE"
     assert not page.faults
     page.close()
 
 
-def test_what_cannot_be_driven_is_told():
-    machine = crane.load("tx40")
-    machine.model.effortLimit[:] = 0.0
-    with pytest.raises(InputError, match="give joints an effort limit"):
+def test_what_nothing_drives_is_told():
+    machine = crane.load("mini_forwarder", active=[], free=["q1", "X1", "X2"])
+    with pytest.raises(InputError, match="nothing drives 'mini_forwarder'"):
         drive_html(machine)
+
+
+def test_levers_move_the_tip_as_they_say():
+    machine = crane.load("patu655")
+    levers = lever_data(DriveConditions(machine).program)
+    assert [lever["role"] for lever in levers] == ["slew", "boom", "stick", "tool"]
+    kinematics, home = Kinematics(machine), machine.home[machine.closure.active]
+    tip = kinematics.position(home)
+    for lever, (axis, sign) in zip(levers, ((1, -1), (2, -1), (0, 1), (0, 1)), strict=True):
+        column = machine.active.index(lever["joint"])
+        ahead = kinematics.position(home + 1e-3 * lever["sign"] * np.eye(4)[column])
+        assert sign * (ahead - tip)[axis] > 0  # right, down, out, out
+
+
+def test_goals_are_in_reach():
+    machine = crane.load("mini_forwarder")
+    goals = goal_data(machine, [0.0, 0.1, 0.2, 0.3], -10.0)
+    assert {"lift the load", "grade a line", "reach three points", *machine.tasks} == {
+        goal["name"] for goal in goals
+    }
+    kinematics = Kinematics(machine)
+    for goal in goals:
+        path = kinematics.inverse(np.array(goal["points"][:1]))
+        assert machine.check_limits(path[0], "goal").shape == (3,)
+    grade = np.array(next(x["points"] for x in goals if x["name"] == "grade a line"))
+    assert np.ptp(grade[:, 2]) < 1e-12
+    assert all(np.hypot(*b) < np.hypot(*a) for a, b in pairwise(grade[:, :2]))
+
+
+def test_instances_with_other_payloads_are_those_of_other_machines():
+    conditions = DriveConditions(crane.load("mini_forwarder"))
+    mass = conditions.masses[7]
+    other = crane.export.InstanceProgram(crane.load("mini_forwarder", {"payload.mass": mass}), ())
+    np.testing.assert_array_equal(conditions.program.variant_defaults[7], other.defaults)
+    assert conditions.data()["payload"]["start"] == 0
 
 
 @pytest.mark.slow

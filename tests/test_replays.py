@@ -220,7 +220,7 @@ def test_one_sample_and_other_machines_are_refused(tmp_path, measured):
     one = write(tmp_path / "one.csv", {k: v[:1] for k, v in columns.items()}, units)
     with pytest.raises(RecordingError, match=r"one\.csv: has one sample, give at least two"):
         replay(machine, one)
-    with pytest.raises(CraneError, match="columns are missing: 'q1_force'"):
+    with pytest.raises(CraneError, match="columns are missing: 'q1_force', 'X1_force'"):
         replay(crane.load("mini_forwarder"), one)
 
 

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     Control = crane.control.Controller | crane.control.ValveCommand
 
 DEMO_MACHINES = "mini_forwarder", "excavator"
+DRIVEN_MACHINES = "excavator", "mini_forwarder", "patu655"
 _SIMULATED_SHARE = 0.3  # of the time of a task of the demonstration; drawing takes the rest
 
 ControllerName = Annotated[
@@ -73,7 +74,10 @@ Step = Annotated[float, number_option("s", "Step of the recorded samples.")]
 
 @command()
 def demo(output: OutputFolder) -> None:
-    """Simulate and show all tasks of two bundled machines."""
+    """Simulate two bundled machines; pages to drive three.
+
+    The tasks of the machines are simulated and shown.
+    """
     from crane.view.result_files import FIGURE, PAGE
 
     with progress_bar("simulating") as progress, replace_folder(output.out, output.force) as part:
@@ -81,10 +85,13 @@ def demo(output: OutputFolder) -> None:
     folder = output.out
     print(f"{text}\nfigures:    {folder}/*/{FIGURE}")
     print(f"animations: {folder}/*/{PAGE} (open them in a browser)")
+    print(f"to drive:   {folder}/*_drive.html (levers by keys, touch and gamepad)")
 
 
 def write_demo(folder: Path, progress: Callable[[float], None]) -> str:
     """Simulate the tasks of the demonstration, and write a folder of each into a folder.
+
+    Pages on which machines are driven are beside them.
 
     Returns:
         The summaries of all tasks, Markdown.
@@ -105,6 +112,8 @@ def write_demo(folder: Path, progress: Callable[[float], None]) -> str:
             add_task_loads(machine, task), control, label=task, progress=report
         )
         texts.append(recording.write(folder / task, views=True))
+    for name in DRIVEN_MACHINES:
+        crane.view.drive_page(crane.load(name), folder / f"{name}_drive.html")
     progress(1.0)
     text = "\n".join(texts)
     (folder / SUMMARY).write_text(text, encoding="utf-8", errors="backslashreplace")
@@ -186,8 +195,9 @@ def simulate(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="A recording whose valve signals are replayed, or with --controller whose "
-            "references are followed; its other columns are compared with the simulation.",
+            help="A recording whose valve signals, or forces of a machine without valves, are "
+            "replayed, or with --controller whose references are followed; its other columns are "
+            "compared with the simulation.",
         ),
     ] = None,
     load: Annotated[

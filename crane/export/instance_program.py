@@ -222,6 +222,8 @@ class InstanceProgram:
         at.inputs[: len(references)] = at.inputs_start[: len(references)] = references
         if at.delays.size:
             at.delays[:] = chart.control.delays
+            nodes = at.history.reshape(-1, 1 + at.delays.size)
+            nodes[1:, 0], nodes[0, 1:] = np.inf, references
         return values
 
     @cached_property

@@ -56,11 +56,9 @@ REFERENCE_PREFIX = "reference_"
 SENSORS_NOTE, IDEAL_SENSORS = "sensors", "ideal"  # note of ideal quantities
 FREE_JOINTS_NOTE = "free"  # note of free joints
 MACHINE_NAME_NOTE = "machine name"  # note of a name that is not that of the file
-START = "start"  # note of a run that does not start at home
-CHANGES_NOTE = "changes"  # note of parameters that change during a run
-# note of a run in the active coordinates throughout, also near their dead centres
-COORDINATES_NOTE, KEPT_COORDINATES = "coordinates", "kept"
-STOPPED = "stopped"  # note of a run that ended early
+# of a run that does not start at home, ended early, whose parameters change
+START, STOPPED, CHANGES_NOTE = "start", "stopped", "changes"
+_TEXTS = ("machine", "task", "controller", START, STOPPED, CHANGES_NOTE)  # attributes, too
 _ACCELERATION_SUFFIX = "_acceleration"
 
 
@@ -90,8 +88,7 @@ class Recording(Result):
         machine_name: Name of the machine, "" if unknown.
         stopped: Time and reason of an early end, "at t = 1.2 s: ..."; "" if there is none.
         start: Description of a start other than that of the machine file, else "".
-        changes: Parameters that change during the run, "" if none do; see
-            `crane.simulation.parameter_schedule`.
+        changes: Parameters that change, see `crane.simulation.parameter_schedule`; else "".
     """
 
     time: Array
@@ -156,15 +153,7 @@ class Recording(Result):
             )
         for name, unit in self.column_units().items():
             timeseries.check_column_name(name, unit)
-        for name in (
-            "machine",
-            "task",
-            "controller",
-            "machine_name",
-            "stopped",
-            "start",
-            "changes",
-        ):
+        for name in (*_TEXTS, "machine_name"):
             text = getattr(self, name)
             if text != text.strip() or not is_one_line(text):
                 raise RecordingError(f"{name} {text!r} is not one line of text, give one")
@@ -243,11 +232,7 @@ class Recording(Result):
 
     def columns(self) -> dict[str, Array]:
         """All columns (N,) by name, in the order of a file; views, not copies."""
-        forces = (
-            x
-            for x, joint in zip(self.tau.T, self.joints, strict=True)
-            if joint in self._driven_joints
-        )
+        forces = (x for x, y in zip(self.tau.T, self.joints, strict=True) if y not in self.free)
         columns = [self.time, *self.q.T, *self.v.T, *forces, *self.channels.values()]
         return dict(zip(self._column_names(), columns, strict=True))
 
@@ -453,14 +438,9 @@ class Recording(Result):
             units={x: units[x] for x in joints},
             channels=channels,
             channel_units={x: units[x] for x in channels},
-            machine=table.notes.get("machine", ""),
-            task=table.notes.get("task", ""),
-            controller=table.notes.get("controller", ""),
             ideal=table.notes.get(SENSORS_NOTE) == IDEAL_SENSORS,
             free=free,
             machine_name=table.notes.get(MACHINE_NAME_NOTE, ""),
-            stopped=table.notes.get(STOPPED, ""),
-            start=table.notes.get(START, ""),
-            changes=table.notes.get(CHANGES_NOTE, ""),
+            **{name: table.notes.get(name, "") for name in _TEXTS},
             copy=False,
         )

@@ -13,16 +13,13 @@ from crane.control.control_law import ControlLaw
 from crane.dynamics.dynamics import Dynamics
 from crane.formats.machine_loading import MachineVariants
 from crane.machine.machine import Machine
-from crane.recordings.recording import (
-    CHANGES_NOTE,
-    COORDINATES_NOTE,
-    KEPT_COORDINATES,
-    Recording,
-)
+from crane.recordings.recording import CHANGES_NOTE, Recording
 from crane.simulation.recorded_run import IntegrationResult, record_run, stop_with_recording
 from crane.simulation.simulation_run import Progress, integrate
 from crane.simulation.simulation_setup import machine_under_control
 
+# note of a run in the active coordinates throughout, also near their dead centres
+COORDINATES_NOTE, KEPT_COORDINATES = "coordinates", "kept"
 _INSTANT_TOLERANCE = 1e-6  # of a step
 
 
@@ -35,7 +32,7 @@ class ParameterSchedule:
 
     Attributes:
         changes: Times [s], increasing, and new values by name, see `crane.description.parameters`.
-        keeps_chart: See `crane.simulation.integration.chart_switching`.
+        keeps_chart: See `crane.simulation.simulation_run.integrate`.
     """
 
     changes: Sequence[tuple[float, Mapping[str, float]]]

@@ -37,7 +37,7 @@ from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import tipping_message
 from crane.simulation.integration.chart_switching import ChartSwitchingIntegrator
-from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.charts import KEPT_CHART_RELAXATION, Chart
 from crane.simulation.integration.error_controlled_stepper import (
     DormandPrinceStepper,
     ErrorControlledStepper,
@@ -222,7 +222,7 @@ def integrate(
         records_transitions: Whether the stick-slip modes of the chart record their transitions.
         ends_with_command: Whether the run ends with the command of the valves.
         earlier: A run of a variant of the machine, whose last state is the initial one.
-        keeps_chart: See `ChartSwitchingIntegrator`.
+        keeps_chart: Whether the active coordinates are kept, also near their dead centres.
 
     Returns:
         The run; it is shorter where it was stopped, or where the command ended.
@@ -243,9 +243,9 @@ def integrate(
     chart = Chart.from_dynamics(dynamics, control, controller_states)
     if records_transitions:
         chart.stick_slip.transitions = []
-    integrator = ChartSwitchingIntegrator(
-        chart, integrator_factory(chart, method, tolerance), keeps_chart
-    )
+    if keeps_chart:
+        chart.chart_limits[:] *= KEPT_CHART_RELAXATION
+    integrator = ChartSwitchingIntegrator(chart, integrator_factory(chart, method, tolerance))
     times = step * np.arange(first, first + step_count + 1, dtype=np.float64)
     # stored by columns, so that channels are views
     rows = scratch_arrays.empty_array(step_count + 1, chart.row_layout.size)

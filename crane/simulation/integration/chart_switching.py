@@ -31,8 +31,6 @@ from crane.simulation.integration.python_stepper import IntegrationHaltError, St
 
 _NEARLY_SINGULAR_MARGIN = 1e5  # on the inertia that counts as none, of what explains a halt
 _LIMIT_RELAXATION = np.array([2.0, 0.1])  # factors of the limits where no chart is better
-# factors of the limits of a chart that is kept, also near its dead centres
-KEPT_CHART_RELAXATION = np.array([2.0**12, 1e-12])
 _MAX_RECENT_STATES = 500
 _MAX_LISTED = 4  # times in a note
 _MOTION_BACK = 1e-3  # of the fastest joint, coordinate units: difference of determinants
@@ -77,25 +75,16 @@ class ChartSwitchingIntegrator:
     Args:
         chart: The machine in the coordinates of the user.
         make_integrator: Creates the integrator of a chart.
-        keeps_chart: Whether the coordinates of the user are kept near their dead centres.
 
     Attributes:
         done: Number of instants with a row, after a run or a halt.
         notes: Notes for the user about the motion.
     """
 
-    def __init__(
-        self,
-        chart: Chart,
-        make_integrator: Callable[[Chart], StickSlipIntegrator],
-        keeps_chart: bool = False,
-    ):
+    def __init__(self, chart: Chart, make_integrator: Callable[[Chart], StickSlipIntegrator]):
         self._make_integrator = make_integrator
         self._chart, self._integrator = chart, make_integrator(chart)
         self._chart_limits = chart.chart_limits
-        if keeps_chart:
-            self._chart_limits = chart.chart_limits * KEPT_CHART_RELAXATION
-            self._integrator.set_chart_limits(self._chart_limits)
         self._known_integrators = [(chart, self._integrator)]
         self._row_layout = chart.row_layout
         self._segment_start = self.done = 0

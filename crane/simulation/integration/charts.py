@@ -45,6 +45,8 @@ from crane.simulation.integration.stick_slip_modes import StickSlipModes
 
 MAX_GAMMA_ENTRY = 5.0  # entry of gamma in coordinate units from which another chart is sought
 MIN_IMPROVEMENT = 3.0  # least ratio of the condition numbers of the present and a new chart
+# factors of the limits of a chart that is kept, also near its dead centres
+KEPT_CHART_RELAXATION = np.array([2.0**12, 1e-12])
 _SINGULAR_DETERMINANT_SHARE = 1e-2  # share of the determinant at home near the end of a branch
 _RANK_TOLERANCE = 1e-12  # share of the largest singular value that counts as zero
 

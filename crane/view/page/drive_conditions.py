@@ -78,7 +78,10 @@ class DriveConditions:
             }  # fmt: skip
         names, gravity = program.names, None
         if self.slopes:
-            gravity = {"index": names.index("gravity_x"), "value": -float(self._machine.gravity[2])}
+            gravity = {
+                "index": names.index("gravity_x"),
+                "value": -float(self._machine.gravity[2]),
+            }
         return {"payload": payload, "gravity": gravity, "stability": self._stability()}
 
     def _stability(self) -> dict[str, Any] | None:
@@ -104,10 +107,8 @@ class DriveConditions:
 
 
 def _bodies(machine: Machine) -> list[list[float]]:
-    """Mass, lever and inertia about the COM (xx, xy, yy, xz, yz, zz) of all bodies, fixed first."""
-    return [
-        [x.mass, *x.lever, *x.inertia[np.tril_indices(3)]] for x in machine.model.inertias
-    ]
+    """Mass, lever, inertia about the COM (xx, xy, yy, xz, yz, zz) of all bodies, fixed first."""
+    return [[x.mass, *x.lever, *x.inertia[np.tril_indices(3)]] for x in machine.model.inertias]
 
 
 def _gravity(z: float, pitch: float, roll: float) -> dict[str, float]:

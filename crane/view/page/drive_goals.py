@@ -69,7 +69,10 @@ def _reachable(machine: Machine, kinematics: Kinematics) -> Iterator[Array]:
     slewing = find_slewing_joint(machine, kinematics.frame)
     if slewing is not None:
         i = slewing[0]
-        low[i], high[i] = max(low[i], home[i] - _LARGEST_SLEW), min(high[i], home[i] + _LARGEST_SLEW)
+        low[i], high[i] = (
+            max(low[i], home[i] - _LARGEST_SLEW),
+            min(high[i], home[i] + _LARGEST_SLEW),
+        )
     for share in np.random.default_rng(_SEED).random((_SAMPLES, len(home))):
         with suppress(CraneError):
             yield kinematics.position(low + share * (high - low))

@@ -31,9 +31,8 @@ def lever_data(program: InstanceProgram) -> list[dict[str, Any]]:
 
     A lever moves a target of a controller, or a spool, else the force of a drive. Its `role` and
     `sign` say where it is on the sticks, its `words` what it does in both directions: boom and
-    stick along y, which is forwards, slew and tool along x, to the right. Forwards
-    the boom goes down and the stick out, to the right the machine slews clockwise and the tool
-    goes out.
+    stick along y, which is forwards, slew and tool along x, to the right. Forwards the boom goes
+    down and the stick out, to the right the machine slews clockwise and the tool goes out.
 
     Raises:
         InputError: Nothing drives the machine.
@@ -43,7 +42,9 @@ def lever_data(program: InstanceProgram) -> list[dict[str, Any]]:
         is_valve_drive = isinstance(program.control, ValveDrive)
         levers = list(_valves(program) if is_valve_drive else _forces(program))
     if not levers:
-        raise InputError(f"nothing drives '{program.machine.name}', name active joints by --active")
+        raise InputError(
+            f"nothing drives '{program.machine.name}', name active joints by --active"
+        )
     for lever, (role, sign, words) in zip(levers, _roles(program.machine, levers), strict=True):
         lever |= {"role": role, "sign": sign, "words": words}
     return levers

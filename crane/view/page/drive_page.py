@@ -26,15 +26,10 @@ from crane.export.instance_routines import STATUS_TEXTS
 from crane.hydraulics.circuit_elements import MAIN_PUMP
 from crane.hydraulics.circuit_states import BALANCE_UNITS
 from crane.machine.machine import Machine
-from crane.recordings.recording import (
-    COORDINATES_NOTE,
-    FORCE_UNITS,
-    KEPT_COORDINATES,
-    REFERENCE_PREFIX,
-    VELOCITY_UNITS,
-)
+from crane.recordings.recording import FORCE_UNITS, REFERENCE_PREFIX, VELOCITY_UNITS
 from crane.recordings.recording_summary import DISPLAY_UNITS, result_title
-from crane.simulation.integration.chart_switching import KEPT_CHART_RELAXATION
+from crane.simulation.integration.charts import KEPT_CHART_RELAXATION
+from crane.simulation.parameter_schedule import COORDINATES_NOTE, KEPT_COORDINATES
 from crane.view.page.drive_conditions import DriveConditions
 from crane.view.page.drive_goals import goal_data
 from crane.view.page.drive_hand import pull_data, target_data
@@ -136,10 +131,9 @@ def _drive_data(conditions: DriveConditions, controller: str | None) -> dict[str
         "joints": list(_joints(program, order)),
         "energy": _energy(program, order),
         "loads": [
-            {"name": force.name, "frame": frame_data(machine, force.frame), "column": order[header]}
-            for force in machine.external_forces
-            if (header := f"load_{force.name}_force_x [N]") in order
-            and force.name != TIP_WRENCH_NAME
+            {"name": x.name, "frame": frame_data(machine, x.frame), "column": order[header]}
+            for x in machine.external_forces
+            if (header := f"load_{x.name}_force_x [N]") in order and x.name != TIP_WRENCH_NAME
         ],
         "statuses": dict(STATUS_TEXTS),
         "notes": [
@@ -162,12 +156,13 @@ def _columns(program: InstanceProgram) -> Iterator[tuple[str, int]]:
     active = machine.closure.active.tolist()
     for joint, column in zip(machine.active, active, strict=True):
         yield f"{joint} [{machine.unit(joint)}]", start("q") + column
-    for part, suffix, units in (
-        ("v_a", "velocity", VELOCITY_UNITS), ("tau", "force", FORCE_UNITS),
-    ):  # fmt: skip
-        for i, joint in enumerate(machine.active):
-            if part != "tau" or joint not in machine.free:
-                yield f"{joint}_{suffix} [{units[machine.unit(joint)]}]", start(part) + i
+    for part, suffix, units, joints in (
+        ("v_a", "velocity", VELOCITY_UNITS, machine.active),
+        ("tau", "force", FORCE_UNITS, machine.driven_joints),
+    ):
+        for joint in joints:
+            index = start(part) + machine.active.index(joint)
+            yield f"{joint}_{suffix} [{units[machine.unit(joint)]}]", index
     for column, joint in enumerate(machine.joints):
         if column not in active:
             yield f"{joint} [{machine.unit(joint)}]", start("q") + column
@@ -187,8 +182,11 @@ def _columns(program: InstanceProgram) -> Iterator[tuple[str, int]]:
             yield f"{name} [{unit}]" if unit else name, first
             first += 1
     if isinstance(program.control, ValveDrive):
-        for i, (name, unit) in enumerate(program.control.channels):
-            yield f"{name} [{unit}]" if unit else name, start("channels") + i
+        spools = list(program.control.circuit.hydraulics.spools)[: program.layout.parts["delays"]]
+        commanded = {f"voltage_{name}": start("inputs") + i for i, name in enumerate(spools)}
+        for i, (name, unit) in enumerate(program.control.channels):  # signals before dead times
+            index = commanded.get(name, start("channels") + i)
+            yield f"{name} [{unit}]" if unit else name, index
         balances = start("controller") + program.control.circuit.state_count - len(BALANCE_UNITS)
         for i, (name, unit) in enumerate(BALANCE_UNITS.items()):
             yield f"{name} [{unit}]", balances + i

@@ -14,7 +14,7 @@ function addDial(dial) {
     const value = make("b"), arc = svg("circle", { ...turn, class: "value" });
     const back = svg("circle", { ...turn, class: "back", "stroke-dasharray": `${LENGTH} 999` });
     const face = svg("svg", { viewBox: "4 4 92 84" }, back, arc);
-    element("dials").append(make("div", { className: "dial", title: dial.name }, face, value, make("small", { textContent: dial.unit }), make("span", { textContent: dial.name })));
+    element("dials").append(make("div", { className: "dial", title: dial.name }, make("div", {}, face, value, make("small", { textContent: dial.unit })), make("span", { textContent: dial.name })));
     return { ...dial, value, arc };
 }
 

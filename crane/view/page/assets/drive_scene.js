@@ -65,8 +65,9 @@ class DriveSpace extends Space {
 
     // The machine is above the sticks where there is little room beside them.
     free() {
-        const room = element("pane").clientWidth < 600 ? element("sticks").clientHeight + 6 : 0;
-        return super.free().map(([left, top, right, bottom]) => [left, top, right, bottom - room]);
+        const narrow = element("pane").clientWidth < 600;
+        const [above, below] = narrow ? [20, 0.7 * element("sticks").clientHeight] : [0, 0];
+        return super.free().map(([left, top, right, bottom]) => [left, top + above, right, bottom - below]);
     }
 
     ball(radius, color, opacity) {
@@ -102,6 +103,7 @@ class DriveSpace extends Space {
     }
 
     show(state) {
+        if (!state.q.every(Number.isFinite)) return; // after a step that failed
         const poses = this.tree.poses(state.q);
         this.place(this.groups, poses);
         this.showGoal(state.goal);
