@@ -62,8 +62,8 @@ class RandomVectors(NamedTuple):
     Attributes:
         states: Rows (states, .) of configurations, velocities, and second arguments.
         values: Rows of each quantity by its routine.
-        changes: (states,) of each quantity: its largest change by one rounding of the state, at
-            least the rounding of its largest value.
+        changes: (states,) of each quantity: its largest change by one rounding of the state and
+            of the dynamic parameters, at least the rounding of its largest value.
     """
 
     states: dict[str, Array]
@@ -84,12 +84,15 @@ def random_vectors(program: InstanceProgram) -> RandomVectors:
     def evaluate(*arrays: Array) -> dict[str, Array]:
         return {x: dynamics.evaluate_closed(DYNAMICS_ROUTINES[x], *arrays) for x in names}
 
+    def round_off(x: Array) -> Array:
+        return x * (1.0 + random.choice([-1, 1], x.shape) * _ROUNDING)
+
     values = evaluate(*states)
     changes = {x: _ROUNDING * np.abs(row).max(axis=1) for x, row in values.items()}
+    constants = dynamics.formula_constants.copy()
     for _ in range(_ROUNDED_STATES):
-        rounded = evaluate(
-            *(x * (1.0 + random.choice([-1, 1], x.shape) * _ROUNDING) for x in states)
-        )
+        dynamics.formula_constants[:] = round_off(constants)
+        rounded = evaluate(*map(round_off, states))
         for name, row in values.items():
             change = np.abs(rounded[name] - row).max(axis=1)
             changes[name] = np.maximum(changes[name], change)
