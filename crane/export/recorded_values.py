@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crane.common.errors import CraneWarning
+from crane.common.errors import ClosureError, CraneWarning
 from crane.common.samples import Array
 from crane.control.valve_commands import ValveSignals
 from crane.control.valve_drive import ValveDrive
@@ -15,6 +15,7 @@ from crane.simulation.simulation_run import simulate
 
 _TEST_STATES, _TEST_STEPS, _TEST_STEP = 20, 50, 0.01
 _ROUNDED_STATES = 8
+_SHARES = 1.0, 0.1, 0.01  # of the random offsets from home
 _ROUNDING = float(np.finfo(float).eps)
 
 
@@ -33,7 +34,10 @@ class RecordedMotion(NamedTuple):
 
 
 def recorded_motion(program: InstanceProgram) -> RecordedMotion:
-    """A motion by `simulate`: valves open slowly, or the machine moves without forces."""
+    """A motion by `simulate`: valves open slowly, or the machine moves without forces.
+
+    It ends before a dead centre, which exported programs do not pass.
+    """
     machine, control = program.machine, program.control
     times = _TEST_STEP * np.arange(_TEST_STEPS + 1)
     start = program.layout.view(program.defaults).inputs
@@ -53,7 +57,15 @@ def recorded_motion(program: InstanceProgram) -> RecordedMotion:
         else recording.channels[joint]
         for joint in machine.joints
     ]
-    return RecordedMotion(_TEST_STEP, inputs[1:], np.column_stack(columns)[1:])
+    q, chart = np.column_stack(columns), program.chart
+    determinant = machine.closure.compiled_closure.least_determinant
+    beyond = [
+        chart.largest_gamma_entry(x) > chart.chart_limits[0]
+        or determinant(x) < chart.chart_limits[1]
+        for x in q
+    ]
+    end = beyond.index(True) - 1 if any(beyond) else len(q)
+    return RecordedMotion(_TEST_STEP, inputs[1:end], q[1:end])
 
 
 class RandomVectors(NamedTuple):
@@ -77,7 +89,14 @@ def random_vectors(program: InstanceProgram) -> RandomVectors:
     dynamics, n = Dynamics(machine), len(machine.active)
     units = machine.closure.units[machine.closure.active]
     offsets = 0.01 * units * random.uniform(-1, 1, (_TEST_STATES, n))
-    q = machine.closure.solve(machine.home[machine.closure.active] + offsets)
+    q = machine.home[None]
+    for share in _SHARES:
+        try:
+            q = machine.closure.solve(machine.home[machine.closure.active] + share * offsets)
+            break
+        except ClosureError:  # home is near the end of a branch
+            continue
+    q = np.broadcast_to(q, (_TEST_STATES, machine.model.nv))
     states = (q, *random.normal(size=(2, _TEST_STATES, n)))
     names = [name for name in program.entries if name in DYNAMICS_ROUTINES]
 
