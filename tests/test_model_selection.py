@@ -98,7 +98,7 @@ def test_what_is_not_believable_is_said():
         Unknown("sensor.p.zero", 0.0, -9e9, 9e9, 2e5, prior=1.0), Unknown("a", 1.0, 0.0, 2.0, 1.0)
     ]  # fmt: skip
     problem = SimpleNamespace(unknowns=unknowns)
-    assert implausible_values(problem, np.array([2.9, 0.5, 0.0])) == []
+    assert list(implausible_values(problem, np.array([2.9, 0.5, 0.0]))) == []
     zero, bound = implausible_values(problem, np.array([18.0, 1.0, 0.0]))
     assert "sensor.p.zero = 3.6e+06 is not believable, 18 deviations from 0" in zero
     assert bound == "a = 2 is on its bound."

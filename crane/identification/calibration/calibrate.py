@@ -173,11 +173,10 @@ def calibrate(
     kept = [x.name for x in unknowns] + [PAYLOAD_MASS] * (not known_mass)
     with open_checkpoint(checkpoint, dependencies, LOG_COLUMNS, 1) as table:
         first = LevenbergMarquardt(problem, progress, SearchLog(table))
-        selected = (
-            select_parameters(first, kept)
-            if automatic
-            else SelectedModel(first, minimize_from_starts(first))
-        )
+        if automatic:
+            selected = select_parameters(first, kept)
+        else:
+            selected = SelectedModel(first, minimize_from_starts(first))
         search = selected.search
         problem = search.problem
         estimate = estimate_with_profiles(search, len(problem.unknowns), selected.minimum)
