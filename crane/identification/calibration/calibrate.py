@@ -177,8 +177,7 @@ def calibrate(
             selected = select_parameters(first, kept)
         else:
             selected = SelectedModel(first, minimize_from_starts(first))
-        search = selected.search
-        problem = search.problem
+        search, problem = selected.search, selected.search.problem
         estimate = estimate_with_profiles(search, len(problem.unknowns), selected.minimum)
         errors = block_errors(search, estimate.z) if automatic else {}
     applicable = [x for x in extras if dict(x.members).get(x.name, x.start) == x.start]

@@ -234,7 +234,7 @@ def select_parameters(search: LevenbergMarquardt, kept_names: Sequence[str]) -> 
     """
     whole, z = search.problem, search.sharpen_friction(smoothed_minimum(search))
     search.linearize_for_covariance(z)
-    best: tuple[float, Sequence[SelectionStep], list[int], Array] | None = None
+    best: tuple[float, list[SelectionStep], list[int], Array] | None = None
     kept = [i for i, x in enumerate(whole.unknowns) if x.name in kept_names]
     before: list[int] | None = None
     for _ in range(_MAX_ROUNDS):

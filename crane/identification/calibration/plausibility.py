@@ -126,11 +126,12 @@ def _friction_terms(
         per_mass = (with_load[:, i] - weight[:, i]) / _TEST_MASS
         speed = np.gradient(uniform_filter1d(q[:, i], max(len(q) // _SMOOTHING_SHARE, 1)))
         moves = np.abs(speed) > _MOVING_SHARE * np.abs(speed).max()
-        parts = [(force[0], per_mass[0]), (-force[0], -per_mass[0])]
+        frictions, levers = [force[0], -force[0]], [per_mass[0], -per_mass[0]]
         if np.ptp(q[:, i]) > _MIN_MOTION * (empty.upper[i] - empty.lower[i]):
             sign = np.sign(speed[moves])
-            parts.append((np.mean(force[moves] * sign), np.mean(per_mass[moves] * sign)))
-        yield tuple(np.array(x) for x in zip(*parts, strict=True))
+            frictions.append(np.mean(force[moves] * sign))
+            levers.append(np.mean(per_mass[moves] * sign))
+        yield np.array(frictions), np.array(levers)
 
 
 def implausible_values(problem: CalibrationProblem, z: Array) -> Iterator[str]:
