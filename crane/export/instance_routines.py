@@ -1,7 +1,6 @@
 """Routines of an instance of a machine, see `crane.export.instance_program`."""
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import combinations_with_replacement
 from types import MappingProxyType
 
 import numpy as np
@@ -20,13 +19,8 @@ from crane.codegen import (
 from crane.codegen.routine_statements import as_value
 from crane.codegen.symbolic import (
     add_vectors,
-    dot,
-    matmul,
-    matvec,
-    maximum,
     scale_vector,
     subtract_vectors,
-    transpose,
 )
 from crane.codegen.vector_layout import Formula
 from crane.common.samples import Array
@@ -43,6 +37,7 @@ from crane.export.kinematics_program import (
     TOO_MANY_EVENTS,
     KinematicsRoutines,
 )
+from crane.export.laden_inertia import laden_inertia
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.error_controlled_stepper import ErrorControlledStepper
 from crane.simulation.integration.machine_code_stepper import HELD_INDEX
@@ -62,7 +57,6 @@ STATUS_TEXTS = MappingProxyType(
 _FIRST_STEP_SHARE, _LONGEST_FIRST_STEP = 0.01, 5e-4  # as `ErrorControlledStepper.run`
 _STEP_REDUCTION_AFTER_EVENT = 0.2
 _TIME_TOLERANCE = 1e-9  # of a step
-_LEAST_MASS = 1e-30  # by which moments are divided [kg]
 INNER_ROUTINES = (
     "find_modes", "orthogonalize", "least_squares", "transposed_least_squares",
     "bounded_least_squares", *DEAD_TIME_ROUTINES,
@@ -440,42 +434,3 @@ class InstanceRoutines(KinematicsRoutines):
                 geometry, dynamics = (self._part(r.instance, x) for x in ("geometry", "dynamics"))
                 r.call(f"{name}_formula", geometry, dynamics, r.q, inputs, r.result)
                 r.return_value(DONE)
-
-
-def laden_inertia(
-    unladen: Sequence[Scalar], payload: Sequence[Scalar], frame: pin.SE3
-) -> list[Scalar]:
-    """Inertia of a body with a payload on one of its frames.
-
-    With masses m_i, centres c_i and inertias I_i about them, d = c_2 - c_1 and
-    mu = m_1 m_2 / (m_1 + m_2),
-
-        m = m_1 + m_2,    c = c_1 + m_2 / m d,    I = I_1 + I_2 + mu (d.d 1 - d d^T).
-
-    Args:
-        unladen: (10,) mass, centre of mass (3), inertia about it (xx, xy, xz, yy, yz, zz) in the
-            axes of the body.
-        payload: (10,) the same in the frame.
-        frame: The frame in the body.
-
-    Returns:
-        (10,) like `unladen`.
-    """
-    turn = frame.rotation.tolist()
-    mass = unladen[0] + payload[0]
-    share = payload[0] / maximum(mass, _LEAST_MASS)
-    centre = add_vectors(matvec(turn, payload[1:4]), frame.translation.tolist())
-    distance = subtract_vectors(centre, unladen[1:4])
-    xx, xy, xz, yy, yz, zz = payload[4:]
-    tensor = matmul(matmul(turn, [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), transpose(turn))
-    square, reduced = dot(distance, distance), unladen[0] * share
-    moments = [
-        inertia
-        + tensor[i][k]
-        + reduced * ((square if i == k else 0.0) - distance[i] * distance[k])
-        for inertia, (i, k) in zip(
-            unladen[4:], combinations_with_replacement(range(3), 2), strict=True
-        )
-    ]
-    moved = add_vectors(unladen[1:4], scale_vector(share, distance))
-    return [mass, *moved, *moments]
