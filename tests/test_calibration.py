@@ -104,7 +104,7 @@ def test_channels_count_by_what_is_left_of_them_in_the_end(tmp_path, monkeypatch
     path = recorded(machine, tmp_path / "run.csv", 1, truth)
     monkeypatch.setattr(
         "crane.identification.calibration.calibrate.estimate_with_profiles",
-        lambda search, count: searches.append(search) or estimate_with_profiles(search, count),
+        lambda search, *where: searches.append(search) or estimate_with_profiles(search, *where),
     )
     near = crane.load(machine.path, changes=truth | {friction: 2400.0})
     found = quiet(crane.calibrate, near, path, [friction], train=(0.0, 3.0))

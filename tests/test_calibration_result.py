@@ -147,7 +147,7 @@ def test_the_search_goes_on_where_the_cost_is_lower():
         return (0.0 if start is None else start[0], -4.0)
 
     search = Fake(left, minima)
-    found = estimate_with_profiles(search, 2)
+    found = estimate_with_profiles(search, 2, search.run())
     assert isinstance(found, CalibrationEstimate) and len(search.starts) > 1
     cost = [0.5 * np.sum(left(z) ** 2) for z in (np.array([0.0, -4.0]), found.z)]
     assert cost[1] < 0.5 * cost[0]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from warned import quiet
 
 import crane
 from crane.common.errors import InputError
@@ -80,3 +81,22 @@ def test_errors(mini, path):
         crane.ComputedTorque(mini, path, bandwidth=0)
     with pytest.raises(InputError, match="integral has the shape"):
         crane.PI(mini, path, integral=[0, 0])
+
+
+def test_a_sampled_program_gives_forces_to_a_machine_without_a_circuit():
+    machine, period = crane.load("mini_forwarder"), 0.01
+    weight = crane.Dynamics(machine).gravity(machine.home[machine.closure.active])
+    seen = []
+
+    def control_unit(time, q_a, v_a, pressures):
+        seen.append((time, pressures.shape))
+        return weight * (1.02 if time < 0.045 else 1.0)
+
+    program = crane.control.SampledCommand(control_unit, machine, period)
+    run = quiet(crane.simulate, machine, program, duration=0.1, step=period)
+    assert [time for time, _ in seen] == pytest.approx(period * np.arange(10))
+    assert {shape for _, shape in seen} == {(0, 2)}
+    before = run.time < 0.045
+    assert run.tau[before] == pytest.approx(np.tile(1.02 * weight, (before.sum(), 1)))
+    with pytest.raises(InputError, match="'rk4' does not call the sampled program"):
+        crane.simulate(machine, program, duration=0.1, step=period, method="rk4")

@@ -109,7 +109,7 @@ def test_a_law_is_asked_each_millisecond_and_held(tmp_path):
     two = crane.simulate(machine, program, duration=0.4)
     np.testing.assert_allclose(one.q, two.q, atol=1e-9)
     np.testing.assert_allclose(one.channels["voltage_x"], two.channels["voltage_x"], atol=1e-6)
-    with pytest.raises(CraneError, match="period 0.001 s of the valves' program is no whole num"):
+    with pytest.raises(CraneError, match="period 0.001 s of the sampled program is no whole num"):
         crane.simulate(machine, crane.ValvePD(machine, reference), step=2e-3)
 
 

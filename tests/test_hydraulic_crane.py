@@ -208,7 +208,7 @@ def test_a_program_starts_anew_in_each_simulation(patu):
 @pytest.mark.parametrize("method", ["rk4", "BDF"])
 def test_methods_that_call_no_program_are_refused(patu, method):
     program = SampledCommand(lambda *_: [5.8, 5.0, 5.8, 5.8], patu)
-    with pytest.raises(crane.CraneError, match=f"'{method}' does not call the valves' program"):
+    with pytest.raises(crane.CraneError, match=f"'{method}' does not call the sampled program"):
         crane.simulate(patu, program, duration=0.1, method=method)
 
 

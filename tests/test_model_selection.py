@@ -5,14 +5,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import crane
+from crane.formats.machine_loading import MachineVariants
 from crane.identification.calibration.levenberg_marquardt import bounded_step
 from crane.identification.calibration.model_selection import (
     LinearizedSelection,
     training_blocks,
 )
 from crane.identification.calibration.multi_start import sample
-from crane.identification.calibration.plausibility import StaticPayload, implausible_values
+from crane.identification.calibration.plausibility import (
+    StaticPayload,
+    implausible_values,
+    static_payload,
+)
 from crane.identification.calibration.unknowns import Unknown
+from crane.recordings.timeseries import Table
 
 NAMES = ["gain", "offset", "nothing", "twin", "weak"]
 
@@ -98,7 +105,7 @@ def test_what_is_not_believable_is_said():
         Unknown("sensor.p.zero", 0.0, -9e9, 9e9, 2e5, prior=1.0), Unknown("a", 1.0, 0.0, 2.0, 1.0)
     ]  # fmt: skip
     problem = SimpleNamespace(unknowns=unknowns)
-    assert implausible_values(problem, np.array([2.9, 0.5, 0.0])) == []
+    assert list(implausible_values(problem, np.array([2.9, 0.5, 0.0]))) == []
     zero, bound = implausible_values(problem, np.array([18.0, 1.0, 0.0]))
     assert "sensor.p.zero = 3.6e+06 is not believable, 18 deviations from 0" in zero
     assert bound == "a = 2 is on its bound."
@@ -112,3 +119,30 @@ def test_a_payload_that_the_file_lacks_is_a_candidate():
     assert weighed.finding(200.0) == "" and StaticPayload(5.0, 6.0).candidates(0.0) == []
     (known,) = weighed.candidates(150.0)
     assert (known.start, known.scale) == (150.0, 60.0)
+
+
+def test_a_load_is_weighed_through_friction():
+    """Standing on its friction, then rising against it: the mean of both is the weight."""
+    machine = crane.load("patu655", lock={"slew": 0.0, "X_ext": 0.0})
+    loaded = crane.load(machine.path, lock=machine.locked_joints, changes={"payload.mass": 180.0})
+    time = np.linspace(0.0, 10.0, 501)
+    stroke = 0.12 + 0.014 * np.maximum(time - 2.0, 0.0)
+    q = np.column_stack([stroke, np.full(501, 0.23)])
+    friction = 3000.0 * np.where(time < 2.0, -1.0, 1.0)
+    force = crane.Dynamics(loaded).gravity(q)
+    force[:, 0] += friction
+    units, columns = {"X_lift": "m", "X_tilt": "m"}, [*q.T]
+    pressures = {}
+    for joint, F in zip(machine.active, force.T, strict=True):
+        cylinder = machine.hydraulics.cylinders[joint]
+        low = 3e5 + np.maximum(-F, 0.0) / cylinder.area_b
+        high = (F + cylinder.area_b * low) / cylinder.area_a
+        columns += [high, low]
+        units |= {f"pressure_{joint}_{side}": "Pa" for side in "ab"}
+        pressures[joint] = high[0], low[0]
+    inputs = SimpleNamespace(initial=(q[0], np.zeros(2)), pressures=pressures)
+    case = SimpleNamespace(inputs=inputs, table=Table(units, np.column_stack(columns), {}))
+    found = static_payload(MachineVariants(machine), {}, [case])
+    assert found.mass == pytest.approx(180.0, abs=1.0)
+    moving = SimpleNamespace(inputs=SimpleNamespace(initial=(q[0], np.ones(2))), table=case.table)
+    assert static_payload(MachineVariants(machine), {}, [moving]) is None

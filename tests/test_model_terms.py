@@ -390,6 +390,17 @@ def test_options_that_are_wrong_are_one_line(tmp_path, crank, arguments, message
     assert not (tmp_path / "out").exists()
 
 
+def test_settings_are_selected_on_the_command_line(tmp_path, crank):
+    done = typed("identify", *crank, "--prior", "bodies=auto", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    (title,) = [
+        x for x in done.stdout.splitlines() if x.startswith("settings by cross-validation")
+    ]
+    assert "errors of 5 blocks of time that are left out, all rows in motion" in title
+    done = typed("identify", *crank, "--prior", "bodies=automatic", "--out", tmp_path / "no")
+    assert done.returncode == 2 and "--prior is 'bodies=automatic', write" in done.stderr
+
+
 def test_a_window_is_trained_on_and_the_rest_judges(tmp_path, crank):
     done = typed(
         "identify", *crank, "--train", "0:5", "--prior", "0.3", "--term", "crank.rotor_inertia",

@@ -1,6 +1,9 @@
 """Commands on files: convert for machines, import for recordings, schema for editors."""
 
+import tempfile
 import warnings
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +20,7 @@ from crane.cli.options import (
     RequiredOutputFile,
 )
 from crane.cli.simulate import ExportedController
+from crane.cli.terminal import status
 from crane.common.atomic_output import (
     check_file_is_writable,
     check_folder_is_writable,
@@ -24,8 +28,17 @@ from crane.common.atomic_output import (
 )
 from crane.common.errors import CraneError, CraneWarning, InputError, check_name
 
+
+@dataclass(frozen=True, kw_only=True)
+class OutputPath(OutputFolder):
+    """The folder or file that a machine is written to; the command checks it."""
+
+    def check(self) -> None:
+        """Check nothing."""
+
+
 _FORMATS = ("urdf+", "urdf", "mjcf", "machine")
-_TARGETS = ("c", "ros2_control")
+_TARGETS = ("c", "fmu", "ros2_control")
 _SUFFIXES = {".urdf": "urdf+", ".xml": "mjcf", ".mjcf": "mjcf"}
 
 
@@ -69,19 +82,29 @@ def convert(
 def export(
     machine: MachineName,
     options: MachineOptions,
-    output: OutputFolder,
+    output: OutputPath,
     to: Annotated[
         str,
-        typer.Option(metavar="TARGET", help="c: C99 sources; ros2_control: a transmission."),
+        typer.Option(
+            metavar="TARGET",
+            help="c: C99 sources; fmu: a file for FMI; ros2_control: a transmission.",
+        ),
     ] = "c",
     controller: ExportedController = None,
     name: Annotated[
         str,
         typer.Option(metavar="NAME", help="Prefix of all names; that of the machine by default."),
     ] = "",
+    fmi: Annotated[int, typer.Option(metavar="VERSION", help="Version of FMI, 3 or 2.")] = 3,
 ) -> None:
     """Write a machine as a program for another environment."""
     check_name(to, _TARGETS, f"--to is '{to}'")
+    if to == "fmu":
+        others = {"--name": name or None, "--controller": controller}
+        refuse_options(others, "is for --to c, leave it out")
+        _write_fmu(options.load(machine), output, fmi)
+        return
+    refuse_options({"--fmi": fmi != 3 or None}, "is for --to fmu, leave it out")
     check_folder_is_writable(output.out, output.force)
     loaded = options.load(machine)
     if to == "c":
@@ -95,6 +118,23 @@ def export(
         write = crane.export.write_ros2_control
         written = write(loaded, output.out, name=name, overwrite=output.force)
         print(f"written to {written}: a package for colcon build")
+
+
+def _write_fmu(machine: crane.Machine, output: OutputPath, fmi: int) -> None:
+    """Write a machine as an FMU, with its sketch as icon and its facts as documentation."""
+    from crane.view.notebook import to_html
+
+    out = output.out
+    path = out if out.suffix == ".fmu" else out.with_name(f"{out.name}.fmu")
+    check_file_is_writable(path, output.force)
+    icon = b""
+    with tempfile.TemporaryDirectory() as folder, suppress(CraneError):
+        crane.sketch(machine, Path(folder) / "icon.png")
+        icon = (Path(folder) / "icon.png").read_bytes()
+    about = to_html(machine) or ""
+    with status("compiling the machine"):
+        crane.export.write_fmu(machine, path, fmi, icon=icon, about=about)
+    print(f"written to {path}: an FMU of FMI {fmi} for model exchange and co-simulation")
 
 
 def _output_format(out: Path, to: str | None) -> str:

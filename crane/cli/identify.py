@@ -186,7 +186,9 @@ class ModelOptions(OptionBlock):
         typer.Option(
             metavar="[NAME=]STD",
             help="Prior standard deviation: one relative value for all parameters, e.g. 0.3, or "
-            "by name, e.g. bodies=10%, q1.viscous=200+-50 (value +- std); none: no prior.",
+            "by name, e.g. bodies=10%, q1.viscous=200+-50 (value +- std); none: no prior; "
+            "bodies=auto selects it, and the bandwidth and --min-speed that are not given, by "
+            "cross-validation on the training data.",
         ),
     ] = None
     feasible: Annotated[

@@ -309,7 +309,8 @@ def parse_priors(
             raise InputError(f"--prior is '{text}', write {_PRIOR_FORM}") from None
         if name in priors:
             raise InputError(f"--prior says two things of '{name}', give one")
-        priors[name] = prior if equals else dataclasses.replace(prior, relative=True, text="")
+        is_whole = bool(equals) or prior.is_open
+        priors[name] = prior if is_whole else dataclasses.replace(prior, relative=True, text="")
     return priors
 
 

@@ -32,6 +32,7 @@ C_PRELUDE = """\
 #define MATH1(name, x) (sizeof(real) < 8 ? (real)name##f((float)(x)) : (real)name(x))
 #define MATH2(name, x, y) \\
     (sizeof(real) < 8 ? (real)name##f((float)(x), (float)(y)) : (real)name(x, y))
+#define TOLERANCE(x, single) ((real)(sizeof(real) < 8 ? (single) : (x)))
 
 static inline real maximum_of(real a, real b)
 {
@@ -39,6 +40,10 @@ static inline real maximum_of(real a, real b)
 }
 """  # NaN if one is NaN
 
+_LARGEST_TOLERANCE = 1e-5
+# of the digits of double precision, that single precision has
+_DIGITS_SHARE = math.log(2.0**-23) / math.log(2.0**-52)
+_LEAST_SINGLE = 1e-37
 PIECE_LENGTH = 2000  # operations of a C function; compilers need more than linear time
 _INFIX = {"add": "+", "subtract": "-", "multiply": "*", "divide": "/"}
 _TYPES = {"real": "real", "integer": "int", "truth": "int"}
@@ -52,6 +57,20 @@ def format_c_real(value: float) -> str:
     if math.isinf(value):
         return "INFINITY" if value > 0 else "(-INFINITY)"
     return f"R({value!r})"
+
+
+def single_precision_tolerance(value: float) -> float:
+    """A tolerance t, or 1 - t, with the same share of the digits in single precision.
+
+    t^s with s = log(2^-23) / log(2^-52): rounding becomes rounding, 1e-10 becomes 4e-5. Other
+    numbers stay.
+    """
+    size = abs(value)
+    if 0.0 < size <= _LARGEST_TOLERANCE:
+        size = max(size**_DIGITS_SHARE, _LEAST_SINGLE)
+    elif 0.0 < 1.0 - size <= _LARGEST_TOLERANCE:
+        size = 1.0 - (1.0 - size) ** _DIGITS_SHARE
+    return math.copysign(size, value)
 
 
 def emit_c_function(linked: LinkedFunction) -> str:
@@ -292,7 +311,7 @@ def _value(value: RoutineValue) -> str:
     operands: tuple[Any, ...] = value.operands
     match value.operation:
         case "constant":
-            return format_c_real(operands[0]) if value.kind == "real" else str(operands[0])
+            return _routine_constant(operands[0]) if value.kind == "real" else str(operands[0])
         case "argument" | "variable":
             return str(operands[0])
         case "element":
@@ -304,6 +323,13 @@ def _value(value: RoutineValue) -> str:
             return f"!{_value(operands[0])}"
     a, b = (_value(x) for x in operands)
     return f"({a} {_OPERATORS.get(value.operation, value.operation)} {b})"
+
+
+def _routine_constant(value: float) -> str:
+    """A constant of a routine; those near 0 or 1 are tolerances."""
+    single = single_precision_tolerance(value)
+    same = single == value or math.isnan(value)
+    return format_c_real(value) if same else f"TOLERANCE({value!r}, {single:.8g})"
 
 
 def _has_word(text: str, word: str) -> bool:

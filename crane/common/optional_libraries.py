@@ -11,6 +11,7 @@ _LIBRARIES = {
     "control": ("python-control", "control"),
     "cvxpy": ("CVXPY", "feasible"),
     "distributed": ("Dask", "cluster"),
+    "fmpy": ("FMPy", "fmu"),
     "mujoco": ("MuJoCo", "mjcf"),
     "viser": ("viser", "live"),
 }

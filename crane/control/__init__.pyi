@@ -7,6 +7,7 @@ from .control_law import ZeroForce as ZeroForce
 from .controller_registry import CONTROLLERS as CONTROLLERS
 from .controller_registry import default_controller_name as default_controller_name
 from .controller_registry import make_controller as make_controller
+from .fmu_controller import FmuController as FmuController
 from .levers import LeverPhases as LeverPhases
 from .levers import TipVelocity as TipVelocity
 from .levers import joystick as joystick

@@ -75,6 +75,7 @@ class ControlLaw(OneLineRepr):
         reference: The reference trajectory, or None.
         settings: (s,) parameters that can change without a new compilation. All other constants of
             a law become part of the machine code.
+        period: Time between calls of `update` [s]; 0 for no calls.
         reference_units: Names and units of its `references`, for programs that are exported, as
             those of `settings` and states; empty for numbers as names.
         setting_units: Names and units of `settings`.
@@ -82,6 +83,7 @@ class ControlLaw(OneLineRepr):
     """
 
     reference: Trajectory | None = None
+    period: float = 0.0
     settings: Array = np.zeros(0)
     reference_units: Mapping[str, str] = MappingProxyType({})
     setting_units: Mapping[str, str] = MappingProxyType({})
@@ -99,6 +101,17 @@ class ControlLaw(OneLineRepr):
                 `Dynamics`.
         """
         raise NotImplementedError
+
+    def update(self, time: float, q: Array, v_a: Array, state: Array) -> None:
+        """Set the references of the next period.
+
+        Args:
+            time: [s].
+            q: (nq,) configuration.
+            v_a: (n,) active velocities.
+            state: (k,) states of the controller.
+        """
+        return
 
     def select_driven(self, values: Sequence[Scalar]) -> list[Scalar]:
         """Values of the driven joints, from those of all active joints (n,)."""

@@ -320,14 +320,19 @@ class ValvePD(ValveCommand, OneLineRepr):
 
 
 class SampledCommand(ValveCommand, OneLineRepr):
-    """A Python function that sets the valve signals once per period, as a control unit does.
+    """A Python function that sets valve signals or forces once per period, as a control unit does.
 
     Args:
         function: (t, q_a, v_a, pressures) -> signals, in the order of `machine.hydraulics.spools`
             (its joints where no valve has two spools); t [s], q_a and v_a (n,), pressures (m, 2)
-            of A and B by joint [Pa], signals (s,) [V].
+            of A and B by joint [Pa], signals (s,) [V]. Of a machine without a circuit it returns
+            the forces of the driven joints [N], [N m], and pressures are (0, 2).
         machine: The machine.
         period: Sampling period [s], a whole number of steps of the simulation.
+
+    Attributes:
+        output_names: Spools or driven joints that it sets.
+        neutral: (s,) signals before the first sample.
     """
 
     is_open_loop = True
@@ -341,23 +346,24 @@ class SampledCommand(ValveCommand, OneLineRepr):
         if not callable(function):
             raise InputError(f"{function!r} is no function (t, q_a, v_a, pressures) -> signals")
         self._function = function
-        circuit = require_circuit(machine)
-        self._spool_names = tuple(circuit.spools)
-        self._active_columns = machine.closure.active
+        circuit = machine.hydraulics
+        names = machine.driven_joints if circuit is None else tuple(circuit.spools)
+        self.output_names, self._active_columns = names, machine.closure.active
         self.period = as_number(period, "the period", "s", greater_than=0)
-        neutral = np.array([spool.neutral for spool in circuit.spools.values()])
+        spools = () if circuit is None else circuit.spools.values()
+        self.neutral = np.array([spool.neutral for spool in spools] or [0.0] * len(names))
         # times [s] and signals of all samples; a run is in one thread
-        self._samples = ThreadLocal(lambda: ([0.0], [neutral]))
+        self._samples = ThreadLocal(lambda: ([0.0], [self.neutral]))
 
     def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
         """See `ValveCommand`."""
         signals = self._function(time, q[self._active_columns].copy(), v_a.copy(), pressures)
-        label = f"the signals at t = {time:g} s"
+        label = f"the sample at t = {time:g} s"
         times, samples = self._samples.value
         # later samples are those of an earlier run
         count = bisect_left(times, time - _TIME_TOLERANCE * self.period)
         times[count:] = [time]
-        samples[count:] = [as_sample(signals, len(self._spool_names), label, self._spool_names)]
+        samples[count:] = [as_sample(signals, len(self.output_names), label, self.output_names)]
 
     def references(self, times: Array) -> Array:
         """See `ValveCommand`; all times are between two samples, at which steps end."""

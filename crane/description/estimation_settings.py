@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from crane.common.errors import InputError
 from crane.common.unit_conversions import UnitError, is_quantity, parse_number, parse_quantity
 
+OPEN_PRIOR = "auto"  # text of a prior whose width an identification selects
+_OPEN_STD = 0.01  # relative
 TermValues = tuple[float, ...]
 _MIN_STD = 1e-12  # with a finite weight
 _RELATIVE_STD_RANGE = 1e-7, 1e6
@@ -70,6 +72,11 @@ class ParameterPrior:
     mean: float | None = None
     text: str = field(default="", compare=False)
 
+    @property
+    def is_open(self) -> bool:
+        """Whether an identification selects the standard deviation."""
+        return self.text == OPEN_PRIOR
+
     def __post_init__(self) -> None:
         lower, upper = _RELATIVE_STD_RANGE if self.relative else (_MIN_STD, math.inf)
         if not lower <= self.std < upper:
@@ -80,7 +87,7 @@ class ParameterPrior:
 
     @classmethod
     def parse(cls, text_or_number: object, units: Sequence[str] = ()) -> "ParameterPrior":
-        """Return the prior of a number or a text: "50", "10 %", "609 +- 60", "609 +- 10 %".
+        """Return the prior of a number or a text: "50", "10 %", "609 +- 60", "10 %", "auto".
 
         Both numbers may have a unit; of two, a unit at the end is that of both, as in
         "0.6 +- 0.1 kN".
@@ -94,6 +101,8 @@ class ParameterPrior:
             InputError: The text is malformed, or the standard deviation is too small.
         """
         text = str(text_or_number)
+        if text == OPEN_PRIOR:
+            return cls(_OPEN_STD, True, None, text)
         mean, sign, std = (part.strip() for part in text.rpartition("+-"))
         try:
             is_relative = std.endswith("%")

@@ -35,13 +35,18 @@ _TEMPLATES = (
 _TEXTS = {
     "initialize": "Close the loops from the active coordinates in q, the others as first guess,\n"
     "and start at rest; pressures hold the machine, joints with stiction stick or slip.",
-    "update_modes": "After a change of parameters during a motion: find which joints stick.",
+    "update_modes": "After an event, or a change of parameters during a motion: find which joints "
+    "stick.",
     "advance": "Integrate over `step` with controlled errors. The inputs go linearly from those\n"
     "of the last call to those that are set now.",
     "advance_fixed": "One step of the classical Runge-Kutta method of length `step`. Joints begin "
     "to\nslip and stop at the start of a step only.",
     "update_outputs": "Compute the outputs, from `tau` on, at the state and inputs.",
     "derivatives": "Derivatives of the state, from `q` on, at the state and inputs.",
+    "event_indicators": "Quantities whose change of sign is an event: the margin of stick-slip "
+    "transitions,\nthen distances of end stops, contacts, voids.",
+    "directional_derivatives": "Derivatives of `derivatives` and the outputs along a direction "
+    "(state, inputs).",
     "close_loops": "Newton's method in place: q (nq) closed at its active coordinates, the others "
     "as first guess.",
     "follow_loops": "q (nq) at active coordinates q_a (n), by one step from the last ones.",
@@ -126,7 +131,7 @@ class FunctionSources:
             _number(x) if x == y else f"sizeof({self.name}_real) < 8 ? {_number(y)} : {_number(x)}"
             for x, y in zip(program.defaults, program.single_precision_defaults, strict=True)
         ]
-        self._loads = _instance_loads(program)
+        self._loads = instance_loads(program)
 
     def fill(self, template: str, further: Mapping[str, str] = MappingProxyType({})) -> str:
         """The text of a template with the values of the machine in place of @VALUE@."""
@@ -297,7 +302,7 @@ def _inputs_of(program: InstanceProgram | KinematicsProgram) -> range:
     return range(start, start + program.layout.parts["inputs"])
 
 
-def _instance_loads(program: InstanceProgram | KinematicsProgram) -> frozenset[int]:
+def instance_loads(program: InstanceProgram | KinematicsProgram) -> frozenset[int]:
     """Elements of an instance that formulas read."""
     entries = program.entries.values()
     return frozenset().union(*(x.loads.get("instance", frozenset()) for x in entries))

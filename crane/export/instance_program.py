@@ -7,6 +7,7 @@ any number of them may be used at once. The routines return a status, 1 for succ
 
 import warnings
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from functools import cached_property
 from types import MappingProxyType
 
@@ -16,8 +17,12 @@ from crane.codegen import (
     FormulaTooLongError,
     Layout,
     Program,
+    Scalar,
+    SymbolicExpression,
 )
+from crane.codegen.differentiation import directional_derivative
 from crane.codegen.linked_functions import LinkedFunction
+from crane.codegen.vector_layout import Formula
 from crane.common.errors import CraneWarning, InputError
 from crane.common.samples import Array
 from crane.control.control_law import ControlLaw, Controller
@@ -116,6 +121,8 @@ class InstanceProgram:
             the instance, where numbers such as 0 are else part of the formulas.
         controller: Control law or valve command, as for `simulate`. Its references at time 0 are
             the defaults of the inputs; its settings are parameters, and its states states.
+        has_derivatives: Whether to include directional derivatives of rates and outputs, where
+            they are not too long.
 
     Attributes:
         machine: The machine, with the wrench at its tip.
@@ -141,7 +148,9 @@ class InstanceProgram:
         quantities: Sequence[str] = tuple(DYNAMICS_ROUTINES),
         variants: Sequence[Machine] = (),
         controller: Controller | ValveCommand | None = None,
+        has_derivatives: bool = False,
     ):
+        self._has_derivatives = has_derivatives
         self.chart = _controlled_chart(machine, controller)
         self.machine, self.control = machine, control = self.chart.machine, self.chart.control
         dynamics = self.chart.dynamics
@@ -227,7 +236,8 @@ class InstanceProgram:
         return values
 
     @cached_property
-    def _tip(self) -> CompiledFrame | None:
+    def tip_frame(self) -> CompiledFrame | None:
+        """The tip; None without one."""
         tip = self.machine.tip
         return None if tip is None else CompiledFrame(self.machine, self.machine.frame(tip))
 
@@ -251,22 +261,50 @@ class InstanceProgram:
                 continue
             programs[name] = program
         programs["steps"] = self.stepper.new_program()
-        if self._tip is not None:
-            programs["tip"] = self._tip.new_program()
+        if self._has_derivatives and not self.machine.coordinates.rotation_columns:
+            with suppress(FormulaTooLongError):
+                programs["tangent"] = self._trace_derivatives(programs["steps"])
+        if self.tip_frame is not None:
+            programs["tip"] = self.tip_frame.new_program()
         if not isinstance(self.control, ValveDrive):
             programs["fixed"] = RungeKuttaStepper(self.chart).new_program()
         return programs
+
+    def _trace_derivatives(self, steps: Program) -> Program:
+        """rate(geometry, numbers, settings, refs, state, direction): of rate and outputs.
+
+        The direction has the state, then the references.
+        """
+        program, layout = Program(), self.chart.state_layout
+        for name in [x for x in steps.functions if x.startswith("rate")]:
+            formulas = (steps.functions[x] for x in (name, name.replace("rate", "observe")))
+            sizes = layout.size, self.chart.output_layout.size
+            pairs = zip(formulas, sizes, strict=True)
+            outputs = [x for f, size in pairs if isinstance(f, Formula) for x in f.outputs[:size]]
+            tape = next(x.tape for x in outputs if isinstance(x, SymbolicExpression))
+            places = [(4, i) for i in range(layout.size)]
+            places += [(3, i) for i in range(self.stepper.reference_columns)]
+            seeds: dict[int, Scalar] = {
+                tape.load(*place).index: tape.load(5, i) for i, place in enumerate(places)
+            }
+            program.add_formula(name, 6, directional_derivative(outputs, seeds))
+        return program
+
+    @cached_property
+    def routines(self) -> InstanceRoutines:
+        """The writer of its routines."""
+        offset = None if self.tip_frame is None else self.tip_frame.frame_offset
+        quantities = [name for name in self._quantities if name in self._programs]
+        return InstanceRoutines(
+            self.chart, self.stepper, self.layout, self._programs, quantities, offset
+        )
 
     @cached_property
     def _linked(self) -> Linked:
         parts = {name: dict(program.functions) for name, program in self._programs.items()}
         own = joined_program(parts)
         known = {*own.functions, *INNER_ROUTINES}
-        offset = None if self._tip is None else self._tip.frame_offset
-        InstanceRoutines(
-            self.chart, self.stepper, self.layout, self._programs,
-            [name for name in self._quantities if name in self._programs], offset,
-        ).add_to(own)  # fmt: skip
+        self.routines.add_to(own)
         return link_entries(parts, own, known, self._closure)
 
     @property

@@ -28,6 +28,7 @@ from crane.codegen.symbolic import (
     subtract_vectors,
     transpose,
 )
+from crane.codegen.vector_layout import Formula
 from crane.common.samples import Array
 from crane.control.valve_drive import ValveDrive
 from crane.dynamics.formula_structure import BODY_SIZE
@@ -215,6 +216,12 @@ class InstanceRoutines(KinematicsRoutines):
             r.return_value(DONE)
         with program.add_routine("update_modes", arrays=("instance",)) as r:
             self._store(r, "lengths", 0.0)
+            if self.stepper.has_rotation_vectors:
+                state = self._part(r.instance, "q")
+                wrapped = r.local_array("wrapped", layout.size)
+                r.call("steps_wrap", state, wrapped)
+                r.copy(state, wrapped, self._nq)
+                r.copy(self._part(r.instance, "cursor"), state, self._nq)
             self._write_find_modes(r, self._part(r.instance, "inputs"))
             r.return_value(DONE)
 
@@ -352,15 +359,46 @@ class InstanceRoutines(KinematicsRoutines):
         r.return_value(DONE)
 
     def _add_evaluations(self, program: Program) -> None:
-        """update_outputs(instance); derivatives(instance, rate) of the state."""
-        with program.add_routine("update_outputs", arrays=("instance",)) as r:
-            self._write_evaluation(r, "observe", "outputs", self._part(r.instance, "tau"))
-        with program.add_routine("derivatives", arrays=("instance", "rate")) as r:
-            self._write_evaluation(r, "rate", "rate", r.rate)
+        """update_outputs(instance); derivatives(instance, rate) of the state.
 
-    def _write_evaluation(self, r: Routine, formula: str, part: str, target: ArrayPointer) -> None:
-        """Write the evaluation of a formula of the stepper at the state and inputs."""
-        layout = self._programs["steps"].formula_outputs(formula)
+        event_indicators(instance, indicators); directional_derivatives(instance, direction,
+        result) of rate and outputs.
+        """
+        with program.add_routine("update_outputs", arrays=("instance",)) as r:
+            self._write_evaluation(r, "steps_observe", ["outputs"], self._part(r.instance, "tau"))
+        with program.add_routine("derivatives", arrays=("instance", "rate")) as r:
+            self._write_evaluation(r, "steps_rate", ["rate"], r.rate)
+        if self.event_parts:
+            with program.add_routine("event_indicators", arrays=("instance", "indicators")) as r:
+                self._write_evaluation(r, "steps_rate", [*self.event_parts], r.indicators)
+        if "tangent" in self._programs:
+            arrays = "instance", "direction", "result"
+            with program.add_routine("directional_derivatives", arrays=arrays) as r:
+                self._write_evaluation(r, "tangent_rate", ["all"], r.result, r.direction)
+
+    @property
+    def step_functions(self) -> Mapping[str, Formula | Routine]:
+        """Functions of the stepper by name."""
+        return self._programs["steps"].functions
+
+    @property
+    def event_parts(self) -> dict[str, int]:
+        """Numbers of event indicators by part of the formula `rate`."""
+        parts = self._programs["steps"].formula_outputs("rate").parts
+        events = {"margin": min(self._k, 1), "event_distances": parts["event_distances"]}
+        return {name: count for name, count in events.items() if count}
+
+    def _write_evaluation(
+        self,
+        r: Routine,
+        formula: str,
+        parts: Sequence[str],
+        target: ArrayPointer,
+        *further: ArrayPointer,
+    ) -> None:
+        """Write the evaluation of parts of a formula at the state, the inputs and `further`."""
+        program, own_name = formula.split("_")
+        layout = self._programs[program].formula_outputs(own_name)
         values = r.local_array("values", layout)
         inputs, state = (self._part(r.instance, x) for x in ("inputs", "q"))
         if self._dead_times is not None:
@@ -368,15 +406,16 @@ class InstanceRoutines(KinematicsRoutines):
             r.copy(row, inputs, self.layout.parts["inputs"])
             r.call("delay_signals", r.instance, self._part(r.instance, "time"), row)
             inputs = row
-        arguments = *self._machine_arguments(r.instance), inputs, state, values
+        arguments = *self._machine_arguments(r.instance), inputs, state, *further, values
         if self._k:
             with r.if_then(self._element(r.instance, "bounds", HELD_INDEX) > 0.5):
-                r.call(f"steps_{formula}{AT_REST_SUFFIX}", *arguments)
+                r.call(formula + AT_REST_SUFFIX, *arguments)
             with r.if_else():
-                r.call(f"steps_{formula}", *arguments)
+                r.call(formula, *arguments)
         else:
-            r.call(f"steps_{formula}", *arguments)
-        r.copy(target, values.element_pointer(part), layout.parts[part])
+            r.call(formula, *arguments)
+        count = sum(layout.parts[part] for part in parts)
+        r.copy(target, values.element_pointer(parts[0]), count)
         r.return_value(DONE)
 
     def _add_tip(self, program: Program) -> None:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crane.common.errors import CraneWarning
+from crane.common.errors import ClosureError, CraneWarning
 from crane.common.samples import Array
 from crane.control.control_law import ControlLaw
 from crane.control.reference_samples import interpolate_references
@@ -18,6 +18,7 @@ from crane.simulation.simulation_run import simulate
 _TEST_STATES, _TEST_STEPS, _TEST_STEP = 20, 50, 0.01
 _FOLLOWED = 0.01  # displacement of references [m], [rad]
 _ROUNDED_STATES = 8
+_SHARES = 1.0, 0.1, 0.01  # of the random offsets from home
 _ROUNDING = float(np.finfo(float).eps)
 
 
@@ -36,7 +37,10 @@ class RecordedMotion(NamedTuple):
 
 
 def recorded_motion(program: InstanceProgram) -> RecordedMotion:
-    """A motion by `simulate`: valves open slowly, or the machine follows or moves freely."""
+    """A motion by `simulate`: valves open slowly, or the machine follows or moves freely.
+
+    It ends before a dead centre, which exported programs do not pass.
+    """
     machine, control = program.machine, program.control
     times = np.linspace(0.0, _TEST_STEP * _TEST_STEPS, _TEST_STEPS + 1)
     start = program.layout.view(program.defaults).inputs
@@ -64,7 +68,15 @@ def recorded_motion(program: InstanceProgram) -> RecordedMotion:
         else recording.channels[joint]
         for joint in machine.joints
     ]
-    return RecordedMotion(_TEST_STEP, inputs[1:], np.column_stack(columns)[1:])
+    q, chart = np.column_stack(columns), program.chart
+    determinant = machine.closure.compiled_closure.least_determinant
+    beyond = [
+        chart.largest_gamma_entry(x) > chart.chart_limits[0]
+        or determinant(x) < chart.chart_limits[1]
+        for x in q
+    ]
+    end = beyond.index(True) - 1 if any(beyond) else len(q)
+    return RecordedMotion(_TEST_STEP, inputs[1:end], q[1:end])
 
 
 class RandomVectors(NamedTuple):
@@ -73,8 +85,8 @@ class RandomVectors(NamedTuple):
     Attributes:
         states: Rows (states, .) of configurations, velocities, and second arguments.
         values: Rows of each quantity by its routine.
-        changes: (states,) of each quantity: its largest change by one rounding of the state, at
-            least the rounding of its largest value.
+        changes: (states,) of each quantity: its largest change by one rounding of the state and
+            of the dynamic parameters, at least the rounding of its largest value.
     """
 
     states: dict[str, Array]
@@ -88,19 +100,29 @@ def random_vectors(program: InstanceProgram) -> RandomVectors:
     dynamics, n = Dynamics(machine), len(machine.active)
     units = machine.closure.units[machine.closure.active]
     offsets = 0.01 * units * random.uniform(-1, 1, (_TEST_STATES, n))
-    q = machine.closure.solve(machine.home[machine.closure.active] + offsets)
+    q = machine.home[None]
+    for share in _SHARES:
+        try:
+            q = machine.closure.solve(machine.home[machine.closure.active] + share * offsets)
+            break
+        except ClosureError:  # home is near the end of a branch
+            continue
+    q = np.broadcast_to(q, (_TEST_STATES, machine.model.nv))
     states = (q, *random.normal(size=(2, _TEST_STATES, n)))
     names = [name for name in program.entries if name in DYNAMICS_ROUTINES]
 
     def evaluate(*arrays: Array) -> dict[str, Array]:
         return {x: dynamics.evaluate_closed(DYNAMICS_ROUTINES[x], *arrays) for x in names}
 
+    def round_off(x: Array) -> Array:
+        return x * (1.0 + random.choice([-1, 1], x.shape) * _ROUNDING)
+
     values = evaluate(*states)
     changes = {x: _ROUNDING * np.abs(row).max(axis=1) for x, row in values.items()}
+    constants = dynamics.formula_constants.copy()
     for _ in range(_ROUNDED_STATES):
-        rounded = evaluate(
-            *(x * (1.0 + random.choice([-1, 1], x.shape) * _ROUNDING) for x in states)
-        )
+        dynamics.formula_constants[:] = round_off(constants)
+        rounded = evaluate(*map(round_off, states))
         for name, row in values.items():
             change = np.abs(rounded[name] - row).max(axis=1)
             changes[name] = np.maximum(changes[name], change)

@@ -348,9 +348,10 @@ def integrator_factory(
     drive = control if isinstance(control, ValveDrive) else None
     method = requested_method or _default_method(dynamics, control)
     check_name(method, ("rk4", "rosenbrock", *SCIPY_METHODS), f"method '{method}' is unknown")
-    if drive is not None and drive.period and method != "rosenbrock":
+    period = control.period if isinstance(control, ControlLaw) else 0.0
+    if period and method not in (("rosenbrock",) if drive is not None else _COMPILED_METHODS):
         raise InputError(
-            f"method '{method}' does not call the valves' program, leave the method out"
+            f"method '{method}' does not call the sampled program, leave the method out"
         )
     if method == "Radau" and state_count(dynamics.machine.external_forces):
         raise InputError(
@@ -378,7 +379,7 @@ def integrator_factory(
         if compiled and stepper_factory is not None and isinstance(control, ControlLaw):
             with suppress(FormulaTooLongError):
                 return ErrorControlledIntegrator(chart, partial(stepper_factory, **options))
-        if drive is not None and drive.period:
+        if period:
             raise InputError("a program with a period runs on the compiled backend alone")
         if requested_method is None and drive is None:
             return FixedStepIntegrator(chart)

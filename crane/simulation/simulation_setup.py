@@ -18,7 +18,8 @@ from crane.control.control_law import (
     ZeroForce,
     controller_reference,
 )
-from crane.control.valve_commands import ValveCommand, ValveSignals
+from crane.control.force_inputs import ForceInputs
+from crane.control.valve_commands import SampledCommand, ValveCommand, ValveSignals
 from crane.control.valve_drive import ValveDrive
 from crane.description.ground_contact import Contact
 from crane.dynamics.dynamics import Dynamics
@@ -60,6 +61,8 @@ def resolve_controller(
             neutral.title = "neutral valves"
             return ValveDrive(machine, neutral)
         return ZeroForce(machine)
+    if isinstance(controller, SampledCommand) and machine.hydraulics is None:
+        return ForceInputs(machine, controller)
     if isinstance(controller, ValveCommand):
         return ValveDrive(machine, controller)
     if hasattr(controller, "start"):

@@ -45,6 +45,7 @@ from crane.identification.calibration.model_selection import (
     block_errors,
     select_parameters,
 )
+from crane.identification.calibration.multi_start import minimize_from_starts
 from crane.identification.calibration.plausibility import (
     PAYLOAD_MASS,
     implausible_values,
@@ -135,8 +136,6 @@ def calibrate(
     if not isinstance(machine, Machine):
         machine = load(machine)
     paths = [recordings] if isinstance(recordings, str | Path) else list(recordings)
-    if not paths:
-        raise InputError("no recording is given, name at least one")
     cases = _read_cases(machine, paths, validation, columns, train, span, sensors)
     requested = dict(fit) if isinstance(fit, Mapping) else dict.fromkeys(fit)
     automatic = AUTO in requested
@@ -145,43 +144,40 @@ def calibrate(
     _check_readings(requested, (*paths, *validation), cases)
     variants = MachineVariants(machine)
     parameters = variants.values | sensor_parameters(cases[0].known_sensors)
-    units = {
-        name: case.table.units[name]
-        for case in cases
-        for name in (*case.sensors, *(VALVE_SIGNAL_PREFIX + x for x in case.inputs.signals))
-    }
+    units = _sensor_units(cases)
 
     def unknowns_for(which: Mapping[str, object] | Sequence[str]) -> list[Unknown]:
         return build_unknowns(which, variants.spec, parameters, units)
 
     unknowns = [] if automatic and not requested else unknowns_for(requested)
-    used_names = {name for x in unknowns for name in (x.name, *dict(x.members))}
     known_mass = parameters.get(PAYLOAD_MASS, 0.0)
     pins = {k: v for case in cases for k, v in displaced_pins(machine, case.table).items()}
     statics = static_payload(variants, pins, cases) if PAYLOAD_MASS in parameters else None
-    proposed = {x.name: x for x in candidate_parameters(machine, cases, parameters, pins)}
+    candidates = candidate_parameters(machine, cases, parameters, pins)
     if statics is not None:
-        proposed |= {x.name: x for x in statics.candidates(known_mass)}
-    extras = [
-        replace(x, scale=proposed[x.name].scale, prior=1.0)
-        for x in unknowns_for({x.name: (x.start, x.low, x.high) for x in proposed.values()})
-        if not used_names & {x.name, *dict(x.members)}
-    ]
+        others = [x for x in candidates if x.name != PAYLOAD_MASS]
+        candidates = [*others, *statics.candidates(known_mass)]
+    complete = unknowns_for({x.name: (x.start, x.low, x.high) for x in candidates})
+    extras = _other_unknowns(unknowns, complete, candidates)
     problem = CalibrationProblem(machine, unknowns, cases)
-    start = np.zeros(problem.unknown_count)
-    initial_residuals = [problem.residuals(case, start) for case in problem.cases]
+    initial_residuals = [
+        problem.residuals(x, np.zeros(problem.unknown_count)) for x in problem.cases
+    ]
     dependencies = {
         "machine data": (variants.spec, machine.locked_joints),
-        "recordings": [x.contents for x in cases], "settings": (unknowns, extras, automatic),
-    }  # fmt: skip
+        "recordings": [x.contents for x in cases],
+        "settings": (unknowns, extras, automatic),
+    }
     if automatic:
         problem = CalibrationProblem(machine, [*unknowns, *extras], cases)
     kept = [x.name for x in unknowns] + [PAYLOAD_MASS] * (not known_mass)
     with open_checkpoint(checkpoint, dependencies, LOG_COLUMNS, 1) as table:
         first = LevenbergMarquardt(problem, progress, SearchLog(table))
-        selected = select_parameters(first, kept) if automatic else SelectedModel(first)
-        search = selected.search
-        problem = search.problem
+        if automatic:
+            selected = select_parameters(first, kept)
+        else:
+            selected = SelectedModel(first, minimize_from_starts(first))
+        search, problem = selected.search, selected.search.problem
         estimate = estimate_with_profiles(search, len(problem.unknowns), selected.minimum)
         errors = block_errors(search, estimate.z) if automatic else {}
     applicable = [x for x in extras if dict(x.members).get(x.name, x.start) == x.start]
@@ -189,11 +185,6 @@ def calibrate(
         fitted = variants.machine(problem.changes(estimate.z))
     found = _calibration_result(problem, fitted, search, estimate, initial_residuals, units)
     known = dict(machine.sensors) | dict(cases[0].known_sensors)
-    findings = [
-        statics.finding(known_mass) if statics is not None else "",
-        *implausible_values(problem, estimate.z),
-        *near_minima(first.problem, first.minima),
-    ]  # fmt: skip
     return replace(
         found,
         machine=_machine_with_sensors(fitted, known, columns, found.changes),
@@ -202,8 +193,33 @@ def calibrate(
         unselected_parameters=selected.left_out,
         block_errors=errors,
         minima=tuple(x.cost / first.minima[0].cost for x in first.minima),
-        findings=tuple(filter(None, findings)),
+        findings=(
+            *filter(None, [statics.finding(known_mass) if statics is not None else ""]),
+            *implausible_values(problem, estimate.z),
+            *near_minima(first.problem, first.minima),
+        ),
     )
+
+
+def _sensor_units(cases: Sequence[RecordingCase]) -> dict[str, str]:
+    """Units of the compared columns and of the valve signals."""
+    return {
+        name: case.table.units[name]
+        for case in cases
+        for name in (*case.sensors, *(VALVE_SIGNAL_PREFIX + x for x in case.inputs.signals))
+    }
+
+
+def _other_unknowns(
+    unknowns: Sequence[Unknown], complete: Sequence[Unknown], candidates: Sequence[Unknown]
+) -> list[Unknown]:
+    """Candidates that change other parameters than some unknowns, with their priors."""
+    used_names = {name for x in unknowns for name in (x.name, *dict(x.members))}
+    return [
+        replace(x, scale=candidate.scale, prior=1.0)
+        for x, candidate in zip(complete, candidates, strict=True)
+        if not used_names & {x.name, *dict(x.members)}
+    ]
 
 
 def _check_readings(
@@ -230,6 +246,8 @@ def _read_cases(
     sensors: Sequence[str] | None,
 ) -> list[RecordingCase]:
     """Read the recordings of a calibration, those of the validation last; see `calibrate`."""
+    if not paths:
+        raise InputError("no recording is given, name at least one")
     if not train[0] < train[1]:
         raise InputError(f"the window from {train[0]:g} to {train[1]:g} s is empty")
     if train[0] < span[0] and train[0] > -np.inf or train[1] > span[1] and train[1] < np.inf:

@@ -288,14 +288,12 @@ class Calibration(Result):
             lines.append(f"| {name} | {unit} | {' | '.join(words)} |")
         lines += ["", f"RMS of simulated less measured; {self.simulation_count} simulations."]
         if len(self.minima) > 1:
-            lines += ["", f"Searches from several starts ended at {self._minima_text()} times the "
+            minima = ", ".join(f"{x:.3g}" for x in self.minima)
+            lines += ["", f"Searches from several starts ended at {minima} times the "
                       "lowest sum of squares."]  # fmt: skip
         if self.changes:
             lines += ["", f"    {self.command_line_options}"]
         return "\n".join(lines)
-
-    def _minima_text(self) -> str:
-        return ", ".join(f"{x:.3g}" for x in self.minima)
 
     def _selection_lines(self) -> list[str]:
         """Path of the selection, and errors in the blocks that were left out, in Markdown."""

@@ -22,7 +22,6 @@ from crane.common.errors import CraneError
 from crane.common.samples import Array
 from crane.identification.calibration.calibration_problem import CalibrationProblem
 from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt
-from crane.identification.calibration.multi_start import minimize_from_starts
 from crane.identification.calibration.unknowns import Unknown
 
 _LOWER_MINIMUM_SHARE = 5e-2  # relative difference of the cost of a lower minimum
@@ -88,18 +87,18 @@ class CalibrationEstimate:
 
 
 def estimate_with_profiles(
-    search: LevenbergMarquardt, parameter_count: int, minimum: Array | None = None
+    search: LevenbergMarquardt, parameter_count: int, minimum: Array
 ) -> CalibrationEstimate:
-    """Minimize, evaluate the ends of the intervals, and continue from lower minima.
+    """Evaluate the ends of the intervals at a minimum, and continue from lower minima.
 
     Args:
         search: The minimization.
         parameter_count: Number of parameters, which are the first unknowns.
-        minimum: (p,) minimum at which the search is linearized; None to search it.
+        minimum: (p,) minimum at which the search is linearized.
     """
     from scipy.stats import t as student
 
-    z = minimize_from_starts(search) if minimum is None else minimum
+    z = minimum
     for last in [False] * _MAX_RESTARTS + [True]:
         covariance, blocks = search.covariance(z)
         factor = float(student.ppf(0.975, max(blocks - 1, 1)))

@@ -173,14 +173,14 @@ class LevenbergMarquardt:
         problem.derivative_tolerance = _COARSE_DERIVATIVE_TOLERANCE
 
     def sharpen_friction(self, z: Array) -> Array:
-        """Follow the minimum of smoothed friction to that of the friction model."""
+        """Follow the minimum of smoothed friction near to that of the friction model."""
         problem = self.problem
         problem.derivative_tolerance = DERIVATIVE_TOLERANCE
         # residuals with smoothed friction do not give the final scales: they are updated
         for problem.smooth, problem.slopes in _SMOOTHING_SCHEDULE if self._has_stiction else ():
             z = self.minimize(z, INITIAL_COST_TOLERANCE).z
             self.channel_scales = self.updated_channel_scales(z)
-        return self.nearest_minimum(z)
+        return z
 
     def nearest_minimum(self, z: Array) -> Array:
         """Nearest minimum to some unknowns, with updated channel scales."""
@@ -194,11 +194,15 @@ class LevenbergMarquardt:
                 for name, x in self.channel_scales.items()
             ):
                 break
-        problem.slopes = _COVARIANCE_SMOOTHING
-        self.linearize(z)
-        self.update_redundancy()
+        self.linearize_for_covariance(z)
         self._progress(1.0)
         return z
+
+    def linearize_for_covariance(self, z: Array) -> None:
+        """Linearize with derivatives that hold over an interval, and update the redundancy."""
+        self.problem.slopes = _COVARIANCE_SMOOTHING
+        self.linearize(z)
+        self.update_redundancy()
 
     def training_errors(self, z: Array) -> dict[str, float]:
         """RMS residual of each channel over the training data."""

@@ -35,6 +35,7 @@ MAX_PRIOR_SHARE = 0.7  # of the deviation of a prior, up to which recordings det
 BLOCK_DURATION = 3.0  # [s] of a block that is left out
 _BLOCK_RANGE = 3, 8  # number of blocks of a recording
 _MAX_ROUNDS = 3  # linearizations
+_MAX_COST = 20.0  # of the score, of a parameter that the recordings do not determine
 _BLOCK_ITERATIONS = 3  # of the fits without a block
 
 
@@ -64,13 +65,13 @@ class SelectedModel:
 
     Attributes:
         search: Search of the selected parameters.
-        minimum: (p,) its minimum, where it is linearized; None if it was not searched.
+        minimum: (p,) its minimum, where it is linearized.
         steps: Steps of the selection.
         left_out: Names of the parameters that were left out.
     """
 
     search: LevenbergMarquardt
-    minimum: Array | None = None
+    minimum: Array
     steps: tuple[SelectionStep, ...] = ()
     left_out: tuple[str, ...] = ()
 
@@ -135,6 +136,14 @@ class LinearizedSelection:
         penalty = float(z @ self._prior @ z) / self._search.redundancy
         return float(self._counts @ np.log(squares)) + penalty + 2.0 * len(parameters)
 
+    def simulated_criterion(self, z: Array, count: int) -> float:
+        """Score of simulated unknowns (p,) with some parameters, without blocks left out."""
+        errors = np.array(list(self._search.training_errors(z).values()))
+        return (
+            2.0 * float(self._counts @ np.log(errors) + count)
+            + float(z @ self._prior @ z) / self._search.redundancy
+        )
+
     def with_starts(self, parameters: Sequence[int]) -> list[int]:
         """Parameters and all starts of recordings."""
         return [*parameters, *range(self._count, len(self._z))]
@@ -150,7 +159,7 @@ class LinearizedSelection:
         return SelectionStep(name, is_removal, self.score(parameters), criterion, by_name)
 
     def undetermined(self, parameters: Sequence[int]) -> list[int]:
-        """Parameters of a set that are removed next: prior alone, or correlated pairs."""
+        """Parameters of a set that are known by their prior alone, or correlate with others."""
         unknowns = self.with_starts(parameters)
         hessian = (self._by_block.sum(axis=0)[:-1, :-1] + self._prior)[np.ix_(unknowns, unknowns)]
         covariance = np.linalg.pinv(hessian, rcond=1e-13, hermitian=True)
@@ -160,7 +169,7 @@ class LinearizedSelection:
         loose = deviations * prior > MAX_PRIOR_SHARE
         correlation = covariance / np.outer(deviations, deviations) - np.eye(len(parameters))
         loose |= (np.abs(correlation) > MAX_CORRELATION).any(axis=1)
-        return [p for p, x in zip(parameters, loose, strict=True) if x and p not in self._kept]
+        return [p for p, x in zip(parameters, loose, strict=True) if x]
 
     def path(self) -> tuple[list[int], list[SelectionStep]]:
         """Indices of the selected parameters, and the steps that lead there."""
@@ -176,16 +185,24 @@ class LinearizedSelection:
             steps.append(self.step(unknowns[best].name, False, chosen))
         size = min(range(len(steps)), key=lambda i: steps[i].score)
         chosen, steps = sets[size], steps[: size + 1]
-        while True:
-            removable = self.undetermined(chosen) or [
-                i for i in chosen if i not in self._kept
-                and self.score([x for x in chosen if x != i]) < steps[-1].score
-            ]  # fmt: skip
-            if not removable:
-                return chosen, steps
-            worst = min(removable, key=lambda i: self.score([x for x in chosen if x != i]))
+        while (worst := self.dispensable(chosen)) is not None:
             chosen.remove(worst)
             steps.append(self.step(unknowns[worst].name, True, chosen))
+        return chosen, steps
+
+    def dispensable(self, parameters: Sequence[int]) -> int | None:
+        """Parameter to remove next from a set, None if there is none.
+
+        One that the recordings do not determine may cost a little of the score, others nothing.
+        """
+        score, undetermined = self.score(parameters), self.undetermined(parameters)
+        costs = {
+            i: self.score([x for x in parameters if x != i])
+            - score - _MAX_COST * (i in undetermined)
+            for i in parameters if i not in self._kept
+        }  # fmt: skip
+        worst = min(costs, key=costs.__getitem__, default=None)
+        return worst if worst is not None and costs[worst] < 0.0 else None
 
 
 def training_blocks(times: Array) -> Array:
@@ -216,34 +233,48 @@ def select_parameters(search: LevenbergMarquardt, kept_names: Sequence[str]) -> 
         The selected model.
     """
     whole, z = search.problem, search.sharpen_friction(smoothed_minimum(search))
+    search.linearize_for_covariance(z)
+    best: tuple[float, list[SelectionStep], list[int], Array] | None = None
     kept = [i for i, x in enumerate(whole.unknowns) if x.name in kept_names]
-    tried: list[list[int]] = []
+    before: list[int] | None = None
     for _ in range(_MAX_ROUNDS):
         selection = LinearizedSelection(search, z, kept)
         chosen, steps = selection.path()
         unknowns = selection.with_starts(chosen := sorted(chosen))
-        if chosen in tried:
+        if chosen == before:
             break
-        tried.append(chosen)
-        problem = CalibrationProblem(whole.machine, [whole.unknowns[i] for i in chosen],
-                                     whole.cases)  # fmt: skip
-        problem.smooth, problem.slopes = whole.smooth, whole.slopes
+        before = chosen
+        problem = _subset(whole, chosen)
         starts = [z[unknowns], selection.fit(unknowns)[unknowns]]
         restricted = search.restricted_search(problem, starts[0])
         start = min(starts, key=restricted.cost)
-        found = restricted.minimize(start, INITIAL_COST_TOLERANCE).z
         z = np.zeros(len(z))
-        z[unknowns] = found
+        z[unknowns] = restricted.minimize(start, INITIAL_COST_TOLERANCE).z
         search.channel_scales = search.updated_channel_scales(z)
-        search.linearize(z)
-        search.update_redundancy()
-        whole.simulation_count += problem.simulation_count
-    problem.simulation_count = whole.simulation_count
-    restricted = search.restricted_search(problem, z[unknowns])
-    determined, z = _determined(restricted, restricted.sharpen_friction(z[unknowns]), kept_names)
+        search.linearize_for_covariance(z)
+        whole.simulation_count = max(whole.simulation_count, problem.simulation_count)
+        criterion = selection.simulated_criterion(z, len(chosen))
+        if best is None or criterion < best[0]:
+            best = criterion, steps, chosen, z
+    assert best is not None
+    _, steps, chosen, z = best
+    unknowns = selection.with_starts(chosen)
+    search.channel_scales = search.updated_channel_scales(z)
+    restricted = search.restricted_search(_subset(whole, chosen), z[unknowns])
+    determined, z = _determined(restricted, restricted.nearest_minimum(z[unknowns]), kept_names)
     names = {x.name for x in determined.problem.unknowns}
     left_out = (x.name for x in whole.unknowns if x.name not in names)
     return SelectedModel(determined, z, tuple(steps), tuple(left_out))
+
+
+def _subset(problem: CalibrationProblem, chosen: Sequence[int]) -> CalibrationProblem:
+    """Problem of some of the parameters, with the same smoothing."""
+    smaller = CalibrationProblem(
+        problem.machine, [problem.unknowns[i] for i in chosen], problem.cases
+    )
+    smaller.smooth, smaller.slopes = problem.smooth, problem.slopes
+    smaller.simulation_count = problem.simulation_count
+    return smaller
 
 
 def _determined(
@@ -262,17 +293,12 @@ def _determined(
         kept = [i for i, x in enumerate(parameters) if x.name in kept_names]
         selection = LinearizedSelection(search, z, kept)
         everything = list(range(len(parameters)))
-        removable = selection.undetermined(everything) or [
-            i for i in everything if parameters[i].prior and z[i] == 0.0 and i not in kept
-        ]
-        if not removable:
+        worst = selection.dispensable(everything)
+        if worst is None:
             return search, z
-        rests = {i: [x for x in everything if x != i] for i in removable}
-        rest = min(rests.values(), key=selection.score)
-        smaller = CalibrationProblem(problem.machine, [parameters[i] for i in rest], problem.cases)
-        smaller.simulation_count = problem.simulation_count
+        rest = [x for x in everything if x != worst]
         unknowns = selection.with_starts(rest)
-        search = search.restricted_search(smaller, z[unknowns])
+        search = search.restricted_search(_subset(problem, rest), z[unknowns])
         z = search.nearest_minimum(z[unknowns])
 
 

@@ -1,18 +1,14 @@
 """Multi-start search: a calibration from several starts, of which the better ones go on.
 
 Over a whole motion, one oscillation more or less is a local minimum, and so is a crane that never
-lifts. Therefore the search starts from the machine, from a fit to short parts of the recordings
-(multiple shooting), and from the best of many points of a Sobol sequence, which are simulated
-only. In three rounds the better half of the searches goes on. A search from the machine that
-leaves nothing but noise needs no others.
+lifts. Therefore the search starts from the machine, and from the best of many points of a Sobol
+sequence, which are simulated only. In three rounds the better half of the searches goes on. A
+search from the machine that leaves nothing but noise needs no others.
 """
-
-import warnings
 
 import numpy as np
 
 from crane.common.samples import Array
-from crane.identification.calibration.calibration_problem import CalibrationProblem
 from crane.identification.calibration.levenberg_marquardt import (
     INITIAL_COST_TOLERANCE,
     LevenbergMarquardt,
@@ -21,7 +17,6 @@ from crane.identification.calibration.levenberg_marquardt import (
 from crane.identification.calibration.unknowns import Unknown
 
 _CAUTIOUS_DAMPING = 1.0
-_PART_DURATION = 2.0  # [s] of the parts of a recording
 _POINT_COUNT = 128  # points of the Sobol sequence
 _ROUNDS = ((7, 3), (3, 4), (2, 40))  # searches and iterations of each round
 _SAMPLE_DEVIATIONS = 2.0  # of a prior, within which points lie
@@ -32,7 +27,7 @@ _PRIOR_SHARE = 0.98  # of the normal distribution
 def minimize_from_starts(search: LevenbergMarquardt) -> Array:
     """Minimum (p,) of a search, which goes on from its initial guess if it has one."""
     z = smoothed_minimum(search) if search.initial_guess is None else search.initial_guess
-    return search.sharpen_friction(z)
+    return search.nearest_minimum(search.sharpen_friction(z))
 
 
 def smoothed_minimum(search: LevenbergMarquardt) -> Array:
@@ -57,7 +52,7 @@ def _race(search: LevenbergMarquardt, first: SearchState) -> list[SearchState]:
         search: The search.
         first: State of the search from the machine after the first round.
     """
-    starts = [*_part_minimum(search), *_sampled_points(search)]
+    starts = _sampled_points(search)
     points = [SearchState(z, search.cost(z), _CAUTIOUS_DAMPING) for z in starts]
     states = sorted((x for x in points if np.isfinite(x.cost)), key=lambda x: x.cost)
     others = [first]
@@ -69,28 +64,6 @@ def _race(search: LevenbergMarquardt, first: SearchState) -> list[SearchState]:
         states = sorted([*others, *states], key=lambda x: x.cost)
         others = []
     return states
-
-
-def _part_minimum(search: LevenbergMarquardt) -> list[Array]:
-    """Unknowns of a fit to short parts of the recordings, if they are long enough."""
-    problem, count = search.problem, len(search.problem.unknowns)
-    with warnings.catch_warnings(action="ignore"):
-        parts = [
-            x
-            for case in search.training_cases
-            for x in case.split_training(problem.machine, _PART_DURATION)
-        ]
-    if not parts:
-        return []
-    part_problem = CalibrationProblem(problem.machine, problem.unknowns, parts)
-    part_problem.smooth = problem.smooth
-    part_problem.derivative_tolerance = problem.derivative_tolerance
-    start = np.zeros(part_problem.unknown_count)
-    part_search = search.restricted_search(part_problem, start)
-    z = np.zeros(problem.unknown_count)
-    z[:count] = part_search.minimize(start, INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING).z[:count]
-    problem.simulation_count += part_problem.simulation_count
-    return [z]
 
 
 def _sampled_points(search: LevenbergMarquardt) -> list[Array]:

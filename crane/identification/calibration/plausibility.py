@@ -33,7 +33,7 @@ _SAMPLE_COUNT = 300  # samples of a recording
 _SMOOTHING_SHARE = 30  # samples of a recording per window of a speed
 _MOVING_SHARE = 0.5  # of the largest speed
 _MIN_MOTION = 0.02  # of a stroke
-_GEOMETRY_STD = 0.03  # relative deviation, of zeros of pressures and of levers
+_GEOMETRY_STD = 0.05 / 3.0  # relative deviation, of zeros of pressures and of levers
 
 
 class StaticPayload(NamedTuple):
@@ -126,45 +126,41 @@ def _friction_terms(
         per_mass = (with_load[:, i] - weight[:, i]) / _TEST_MASS
         speed = np.gradient(uniform_filter1d(q[:, i], max(len(q) // _SMOOTHING_SHARE, 1)))
         moves = np.abs(speed) > _MOVING_SHARE * np.abs(speed).max()
-        parts = [(force[0], per_mass[0]), (-force[0], -per_mass[0])]
+        frictions, levers = [force[0], -force[0]], [per_mass[0], -per_mass[0]]
         if np.ptp(q[:, i]) > _MIN_MOTION * (empty.upper[i] - empty.lower[i]):
             sign = np.sign(speed[moves])
-            parts.append((np.mean(force[moves] * sign), np.mean(per_mass[moves] * sign)))
-        yield tuple(np.array(x) for x in zip(*parts, strict=True))
+            frictions.append(np.mean(force[moves] * sign))
+            levers.append(np.mean(per_mass[moves] * sign))
+        yield np.array(frictions), np.array(levers)
 
 
-def implausible_values(problem: CalibrationProblem, z: Array) -> list[str]:
+def implausible_values(problem: CalibrationProblem, z: Array) -> Iterator[str]:
     """Texts about parameters that are far from what is usual, and about those on a bound."""
-    texts = []
     for unknown, x in zip(problem.unknowns, z, strict=False):
         value = unknown.start + unknown.scale * x
-        if unknown.prior * abs(x) > _MAX_DEVIATIONS:
-            texts.append(
-                f"{unknown.name} = {value:.4g} is not believable, {unknown.prior * abs(x):.0f} "
+        if unknown.prior * abs(x) > _MAX_DEVIATIONS - 1e-6:
+            yield (
+                f"{unknown.name} = {value:.4g} is not believable, {unknown.prior * abs(x):.3g} "
                 f"deviations from {unknown.start:.4g}: the model lacks something, a load or "
                 "another effect."
             )
         elif not unknown.low < value < unknown.high:
-            texts.append(f"{unknown.name} = {value:.4g} is on its bound.")
-    return texts
+            yield f"{unknown.name} = {value:.4g} is on its bound."
 
 
-def near_minima(problem: CalibrationProblem, minima: Sequence[SearchState]) -> list[str]:
+def near_minima(problem: CalibrationProblem, minima: Sequence[SearchState]) -> Iterator[str]:
     """Texts about other minima that are about as low.
 
     Args:
         problem: Problem of the search from several starts.
         minima: Its minima, the lowest first.
     """
-    texts = []
     for other in minima[1:]:
-        difference = np.abs(other.z - minima[0].z)[: len(problem.unknowns)]
-        if other.cost > _NEAR_MINIMUM * minima[0].cost or not (difference > 1.0).any():
-            continue
         values = problem.values(other.z)
-        names = [x.name for x, d in zip(problem.unknowns, difference, strict=True) if d > 1.0]
-        texts.append(
-            f"Another minimum has {100 * (other.cost / minima[0].cost - 1):.1f} % more squares: "
-            + ", ".join(f"{name} = {values[name]:.4g}" for name in names)
-        )
-    return texts
+        far = np.abs(other.z - minima[0].z) > 1.0
+        names = [x.name for x, is_far in zip(problem.unknowns, far, strict=False) if is_far]
+        if other.cost < _NEAR_MINIMUM * minima[0].cost and names:
+            yield (
+                f"Another minimum has {100 * (other.cost / minima[0].cost - 1):.1f} % more "
+                f"squares: {', '.join(f'{name} = {values[name]:.4g}' for name in names)}"
+            )

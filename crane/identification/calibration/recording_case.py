@@ -10,7 +10,7 @@ from crane.common.errors import InputError
 from crane.common.samples import Array, root_mean_square
 from crane.description.sensors import VALVE_SIGNAL_PREFIX, Sensor
 from crane.machine.machine import Machine
-from crane.recordings.recording_reader import FULL_TIME_SPAN, TimeSpan, correct_readings
+from crane.recordings.recording_reader import TimeSpan, correct_readings
 from crane.recordings.timeseries import TIME, Table, table_column
 from crane.simulation.recording_replay import ReplayInputs, replay_inputs
 
@@ -55,31 +55,6 @@ class RecordingCase:
         """What its residuals depend on besides the machine."""
         table = self.table
         return table.units, table.values, self.sensors, self.train_mask, self.known_sensors
-
-    def split_training(self, machine: Machine, part_duration: float) -> list["RecordingCase"]:
-        """Split the training data into parts of a duration [s] that start at measured states.
-
-        This is multiple shooting (Bock 1981) without weights on the gaps, for a search far from
-        its end.
-        """
-        time = self.inputs.time
-        train_indices = np.flatnonzero(self.train_mask)
-        span = time[train_indices[-1]] - time[train_indices[0]]
-        count = int(min(span / part_duration, len(train_indices) / MIN_SAMPLES))
-        if count < 2:
-            return []
-        cases = []
-        for indices in np.array_split(train_indices, count):
-            table = Table(self.table.units, self.table.values[indices], self.table.notes)
-            part = recording_case(
-                machine, self.name, table, self.known_sensors, self.sensors, FULL_TIME_SPAN
-            )
-            # delayed signals began before the part
-            inputs = replace(
-                part.inputs, signals=self.inputs.signals, signal_times=time - time[indices[0]]
-            )
-            cases.append(replace(part, inputs=inputs))
-        return cases
 
 
 def recording_case(

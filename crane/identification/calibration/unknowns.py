@@ -28,10 +28,11 @@ _SIGNED_PARAMETERS = (
     "lower", "upper", "coulomb_offset", "viscous_offset",
 )  # fmt: skip
 _MIN_SPOOL_STROKE = 0.05  # of the stroke of a spool, from which a valve counts as open
-_MIN_BANDWIDTH, _MAX_BANDWIDTH = 5.0, 200.0  # bandwidths of spools [1/s]
+_MIN_BANDWIDTH, _MAX_BANDWIDTH = 2.0, 200.0  # bandwidths of spools [1/s]
 _DELAY_STD, _MAX_DELAY = 0.1, 0.6  # standard deviation and largest value of delays [s]
 _STROKE_DELAY_STD = 0.02  # standard deviation of delays of length sensors [s]
 _ANGLE_ZERO_STD = 0.05  # standard deviation of zeros of angle sensors [rad]
+_MAX_ZERO_DEVIATIONS = 3.0  # standard deviations up to which a zero is believed
 _PIN_STD, _MAX_PIN_ERROR = 0.01, 0.05  # standard deviation and largest error of a pin [m]
 _PRESSURE_ZERO_STD = 2e5  # standard deviation of pressure sensor zeros [Pa]
 # pressure [Pa] whose share of the mean pressure is the share of gas in the volume of a chamber:
@@ -224,12 +225,6 @@ def _candidate(
     return Unknown(name, start, low, high, std, prior=1.0)
 
 
-def _zero_candidate(name: str, parameters: Mapping[str, float], std: float) -> Unknown:
-    """Candidate of the zero of a sensor, which is not believed beyond three deviations."""
-    start = parameters.get(name, 0.0)
-    return _candidate(name, start, std, start - 3.0 * std, start + 3.0 * std)
-
-
 def _positive_candidate(name: str, start: float, relative_std: float, factor: float) -> Unknown:
     """Positive candidate with a relative standard deviation, bounded by a factor."""
     return _candidate(name, start, relative_std * start, start / factor, start * factor)
@@ -258,13 +253,17 @@ def _sensor_candidates(
     zero, delay = (f"{SENSOR_PREFIX}{name}.{what}" for what in ("zero", "delay"))
     is_passive = name in machine.joints and name not in machine.active
     is_angle = is_passive and machine.unit(name) == "rad"
-    if name.startswith("pressure_"):  # pressure sensors have little delay
-        yield _zero_candidate(zero, parameters, _PRESSURE_ZERO_STD)
-        return
-    if is_angle or name.startswith(INCLINATION_PREFIX):
-        yield _zero_candidate(zero, parameters, _ANGLE_ZERO_STD)
-    std = _STROKE_DELAY_STD if name in machine.joints and not is_angle else _DELAY_STD
-    yield _candidate(delay, parameters.get(delay, 0.0), std, 0.0, _MAX_DELAY)
+    is_pressure = name.startswith(PRESSURE_PREFIX)
+    if is_pressure or is_angle or name.startswith(INCLINATION_PREFIX):
+        std, start = (
+            _PRESSURE_ZERO_STD if is_pressure else _ANGLE_ZERO_STD,
+            parameters.get(zero, 0.0),
+        )
+        most = _MAX_ZERO_DEVIATIONS * std
+        yield _candidate(zero, start, std, start - most, start + most)
+    if not is_pressure:  # pressure sensors have little delay
+        std = _STROKE_DELAY_STD if name in machine.joints and not is_angle else _DELAY_STD
+        yield _candidate(delay, parameters.get(delay, 0.0), std, 0.0, _MAX_DELAY)
 
 
 def _spool_candidates(

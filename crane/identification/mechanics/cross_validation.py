@@ -12,6 +12,7 @@ from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.common.progress import Progress, progress_reporter
 from crane.common.samples import Array, as_number, root_mean_square
 from crane.common.units import format_table
+from crane.identification.mechanics.base_parameters import base_parameters
 from crane.identification.mechanics.feasible_parameters import load_convex_solver
 from crane.identification.mechanics.identifiability import prior_from_names, read_priors
 from crane.identification.mechanics.identification_model import IdentificationModel
@@ -189,15 +190,19 @@ def _held_out_error(
         trial = identify_options(machine, settings, options)
         # checks are not reliable on folds; the complete recordings were checked
         identification = identify(machine, training, **trial | {"trust": True})
+        base, values = identification.base, identification.values
+        if identification.parameters is not None:  # they predict better than identifiable ones
+            base = base_parameters(identification.model)
+            values = base.values(identification.parameters)
         held_out_equations = RegressionEquations(
             identification.model,
-            identification.base,
+            base,
             held_out,
             bandwidth or identification.bandwidth,
             identification.min_speed,
         )
         return (
-            held_out_equations.compare(identification.values).overall_relative_error
+            held_out_equations.compare(values).overall_relative_error
             if held_out_equations.is_moving.any()
             else np.nan
         )

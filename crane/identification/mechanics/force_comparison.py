@@ -4,7 +4,7 @@ import itertools
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,6 +40,8 @@ class ForceComparison(OneLineRepr):
         modelled: (M, n) modelled forces.
         is_moving: (M, n) mask of the rows away from standstill.
         joints: (n,) names.
+        in_motion: (M, n) mask of all rows with a speed above the least, also within the reach of
+            the filter from standstill; None: those of `is_moving`.
     """
 
     time: Array
@@ -47,6 +49,14 @@ class ForceComparison(OneLineRepr):
     modelled: Array
     is_moving: np.ndarray
     joints: tuple[str, ...]
+    in_motion: np.ndarray | None = None
+
+    @property
+    def motion_error(self) -> Array:
+        """Relative error (n,) of all rows in motion, nan of a free joint."""
+        if self.in_motion is None:
+            return self.relative_error
+        return replace(self, is_moving=self.in_motion, in_motion=None).relative_error
 
     @property
     def residuals(self) -> Array:

@@ -18,6 +18,7 @@ from crane.identification.mechanics.force_comparison import ForceComparison
 from crane.identification.mechanics.force_delays import ForceDelays
 from crane.identification.mechanics.identifiability import weak_directions
 from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.settings_selection import SettingsSelection
 from crane.machine.machine import Machine
 
 _IMPOSSIBLE_FACTOR = 10.0  # times the magnitude, above which a parameter is impossible
@@ -47,6 +48,7 @@ class Identification(EstimatedValues, Result):
         min_speed: (n,) standstill velocities, below which rows were omitted [m/s], [rad/s].
         validation: Comparison of forces on held-out data, None without them.
         delays: Delays of the forces, one object per recording.
+        selection: Settings that were selected within the training data, None if all are given.
     """
 
     model: IdentificationModel
@@ -64,6 +66,7 @@ class Identification(EstimatedValues, Result):
     min_speed: Array
     validation: ForceComparison | None = None
     delays: tuple[ForceDelays, ...] = ()
+    selection: SettingsSelection | None = None
 
     def _one_line(self) -> str:
         """Machine, number of parameters, method, and errors."""
@@ -178,6 +181,10 @@ class Identification(EstimatedValues, Result):
 
     def to_text(self) -> str:
         """Tables of the errors and of the parameters."""
+
+        def percent(share: float) -> str:
+            return "-" if math.isnan(share) else f"{100 * share:.2f} %"
+
         lines = [
             f"{self.described_machine.name}: {self.base.rank} base parameters of "
             f"{len(self.base.names)}, {self.method}{', feasible' if self.feasible else ''}; "
@@ -188,21 +195,27 @@ class Identification(EstimatedValues, Result):
         for title, fit in (("training", self.training), ("validation", self.validation)):
             if fit is None:
                 continue
-            rows = [["force", "RMS error", "", "relative error"]]
+            rows = [["force", "RMS error", "", "relative error", "all rows in motion"]]
             for i, joint in enumerate(fit.joints):
                 unit = "N" if self.described_machine.unit(joint) == "m" else "N m"
                 share = f"{100 * fit.relative_error[i]:.2f} %"
                 if joint in self.described_machine.free:
                     share = "free"
-                row = [joint, f"{fit.rmse[i]:.4g}", unit, share]
-                rows.append(row if fit.is_moving[:, i].any() else [joint, "-", "", "-"])
+                row = [joint, f"{fit.rmse[i]:.4g}", unit, share, percent(fit.motion_error[i])]
+                rows.append(row if fit.is_moving[:, i].any() else [joint, "-", "", "-", "-"])
             if not np.isnan(fit.overall_relative_error):
-                mean = f"{100 * np.nanmean(fit.relative_error):.2f} %"
-                overall = f"{100 * fit.overall_relative_error:.2f} %"
-                rows.append(["mean of the joints", "", "", mean])
-                rows.append(["all joints together", "", "", overall])
-            heading = f"{title}, samples near standstill excluded"
+                errors = fit.relative_error, fit.motion_error
+                means = [percent(float(np.nanmean(x))) for x in errors]
+                overall = percent(fit.overall_relative_error)
+                rows.append(["mean of the joints", "", "", *means])
+                rows.append(["all joints together", "", "", overall, ""])
+            heading = (
+                f"{title}, samples near standstill excluded, last column: all with the joint's "
+                f"speed above its least; both sides below {self.bandwidth:.3g} Hz (zero phase)"
+            )
             lines += [heading, *format_table(rows, (0, 2)), ""]
+        if self.selection is not None:
+            lines += [self.selection.to_text(), ""]
         rows = [["parameter", "value", "std", "rel. std", "description", ""]]
         for name, value, std, before, mark in zip(
             self.names, self.values, self.std, self.nominal, self.marks, strict=True

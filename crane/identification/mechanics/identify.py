@@ -1,6 +1,5 @@
 """Identification of base parameters from recordings."""
 
-import fnmatch
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -8,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.errors import CraneWarning, InputError, RecordingError, check_name, suggest_names
+from crane.common.errors import CraneWarning, InputError, RecordingError, check_name
 from crane.common.progress import Progress, ignore_progress, progress_reporter
-from crane.common.samples import Array, as_number, as_sample
+from crane.common.samples import Array, as_number
 from crane.common.threads import with_single_threaded_blas
+from crane.description.estimation_settings import ParameterPrior
 from crane.identification.estimation.estimators import (
     Prior,
     condition_numbers,
@@ -47,27 +47,20 @@ from crane.identification.mechanics.regression_equations import (
     RegressionEquations,
     is_long_enough,
 )
+from crane.identification.mechanics.settings_selection import (
+    default_bandwidth,
+    select_settings,
+    standstill_velocities,
+)
 from crane.identification.mechanics.smoothed_motion import smoothed_motion
 from crane.identification.signals.signal_processing import Motion
-from crane.identification.signals.signal_quality import (
-    reject_unless_trusted,
-    spectral_edge_frequency,
-)
+from crane.identification.signals.signal_quality import reject_unless_trusted
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 
 METHODS = {"ols": least_squares, "wls": weighted_least_squares, "huber": huber}
 _MIN_COMPARED_ROWS = 50  # least number of rows for a comparison of forces with the model
 RecordingOrMotion = Recording | Motion
-_SLOW_SPEED_SHARE = 0.02  # of a joint's largest velocity, below which its rows are omitted
-# [rad/s], [m/s] default end of stiction
-_DEFAULT_STICTION_SPEED = {"rad": 1e-2, "m": 1e-3}
-_SMOOTHING_FACTOR = 4.0  # times the smoothing velocity, tanh 4 = 0.9993
-_MAX_SLOW_SHARE = 0.5  # of a joint's largest velocity, above which rows are always used
-_PASSBAND_SHARE = 0.75  # of the passband of a smoother: there it passes 91 %
-_MIN_BANDWIDTH_FACTOR = 3.0  # least bandwidth, times the spectral edge frequency of the velocities
-_POWER_SHARE = 0.99
-_MAX_BANDWIDTH_FACTOR = 40.0  # times the spectral edge frequency of the accelerations
 _PASS_SHARE = 0.3  # of the remaining progress, per pass over a recording
 
 
@@ -101,9 +94,11 @@ def identify(
             or has no motion.
         method: "ols", "wls" (rows of each joint weighted by its noise) or "huber" (robust).
         prior: Prior that regularizes the estimate: by name, such as {"bodies": "10 %",
-            "q1.viscous": "200 +- 50"}, see `prior_from_names`; a relative standard deviation of
-            the whole description; or means and standard deviations (p,) of all parameters. With a
-            prior all parameters are estimated, not only the base parameters.
+            "q1.viscous": "200 +- 50"}, see `prior_from_names`; "auto" as the width of some selects
+            it, and the bandwidth and standstill velocities that are not given, by
+            cross-validation within the training data, see `select_settings`; a relative standard
+            deviation of the whole description; or means and standard deviations (p,) of all
+            parameters. With a prior all parameters are estimated, not only the base parameters.
         feasible: Whether to constrain bodies to be physically feasible and friction to be
             nonnegative; all parameters are estimated then.
         terms: Terms of the model; or changes of the default terms by name, such as
@@ -134,13 +129,18 @@ def identify(
     final_progress, progress = progress, multi_pass_progress(progress)
     check_shared_samples(as_list(recording), as_list(validation), trust)
     motions = prepare_motions(machine, recording, trust, progress)
+    priors, settings = _merged_prior(machine, prior), None
+    if isinstance(priors, Mapping) and any(what.is_open for what in priors.values()):
+        settings = select_settings(model, motions, priors, bandwidth, min_speed, progress)
+        bandwidth, min_speed = settings.best.bandwidth, settings.min_speed
+        priors = settings.priors
     equations, identifiable = build_equations(model, motions, bandwidth, min_speed, progress)
     delays = _check_forces(model, motions, equations, trust) if model.bodies else ()
     selection = equations.column_selection(identifiable)
     columns = CombinedRegressor(equations, selection)
     factors = columns.triangular_factors(equations.y, equations.groups)
     parameter_sizes = parameter_magnitudes(model, identifiable, factors)
-    known_prior = _build_prior(model, prior, equations, parameter_sizes, feasible)
+    known_prior = _build_prior(model, priors, equations, parameter_sizes, feasible)
     estimator_prior, T = (None, selection) if feasible else (known_prior, selection)
     if known_prior is not None and not feasible:
         T = equations.base.grouping
@@ -178,7 +178,7 @@ def identify(
     magnitudes = np.sqrt(identifiable.grouping**2 @ parameter_sizes**2)
     identification = Identification(
         model, identifiable, values, covariance, parameters, estimate, method, feasible, training,
-        magnitudes, advice, bandwidth, min_speeds, validation_comparison, delays,
+        magnitudes, advice, bandwidth, min_speeds, validation_comparison, delays, settings,
     )  # fmt: skip
     if all(mark == "not determined" for mark in identification.marks):
         reject_unless_trusted(identification.warning, trust)
@@ -216,9 +216,22 @@ def _compare_held_out(
     return comparison
 
 
+def _merged_prior(
+    machine: Machine, given: float | Mapping[str, object] | Prior | None
+) -> Mapping[str, ParameterPrior] | Prior:
+    """Priors by name, given ones in place of those of the machine file; or a given prior."""
+    known = dict(machine.estimation.prior)
+    if given is None:
+        return known
+    if not isinstance(given, Mapping | int | float):
+        return given
+    given_priors = read_priors(given, machine)
+    return {name: what for name, what in known.items() if name not in given_priors} | given_priors
+
+
 def _build_prior(
     model: IdentificationModel,
-    given: float | Mapping[str, object] | Prior | None,
+    known: Mapping[str, ParameterPrior] | Prior,
     equations: RegressionEquations,
     parameter_sizes: Array,
     feasible: bool,
@@ -230,14 +243,8 @@ def _build_prior(
         RecordingError: Without a prior nothing determines the scale of masses, as all forces are
             zero.
     """
-    known = dict(model.machine.estimation.prior)
-    if given is not None:
-        if not isinstance(given, Mapping | int | float):
-            return check_prior(model, equations.base, given, feasible)
-        given_priors = read_priors(given, model.machine)  # takes precedence over the machine file
-        known = {
-            name: what for name, what in known.items() if name not in given_priors
-        } | given_priors
+    if not isinstance(known, Mapping):
+        return check_prior(model, equations.base, known, feasible)
     if known:
         return prior_from_names(model, known, parameter_sizes)
     if model.machine.free and not equations.y.any():
@@ -282,10 +289,10 @@ def build_equations(
     Arguments and errors as for `identify`.
     """
     if bandwidth is None:
-        bandwidth = model.machine.estimation.bandwidth or min(map(_default_bandwidth, motions))
+        bandwidth = model.machine.estimation.bandwidth or min(map(default_bandwidth, motions))
     bandwidth = as_number(bandwidth, "the bandwidth", "Hz", greater_than=0)
     fastest = np.max([np.abs(motion.v).max(axis=0) for motion in motions], axis=0)
-    min_speeds = _min_speeds(model.machine, min_speed, fastest)
+    min_speeds = standstill_velocities(model.machine, min_speed, fastest)
     equations = RegressionEquations(
         model, base_parameters(model), motions, bandwidth, min_speeds, progress
     )
@@ -354,53 +361,3 @@ def multi_pass_progress(progress: Progress) -> Progress:
             done = now
 
     return report
-
-
-def _min_speeds(
-    machine: Machine, min_speed: Mapping[str, float] | ArrayLike | None, fastest: Array
-) -> Array:
-    """Standstill velocities (n,), below which rows are omitted.
-
-    The default is a share of the largest velocity, or the velocity at which the described friction
-    is fully developed.
-    """
-    out = _SLOW_SPEED_SHARE * fastest
-    for i, joint in enumerate(machine.active):
-        law = machine.friction.get(joint)
-        if law is not None:
-            smoothing_speed = law.smoothing or (
-                _DEFAULT_STICTION_SPEED[machine.unit(joint)] if law.has_stick_slip else 0.0
-            )
-            stiction_speed = _SMOOTHING_FACTOR * (
-                max(law.stribeck, law.smoothing) if law.stiction else smoothing_speed
-            )
-            out[i] = max(out[i], min(stiction_speed, _MAX_SLOW_SHARE * fastest[i]))
-    if min_speed is not None and not isinstance(min_speed, Mapping):
-        each = np.full(out.shape, min_speed) if np.ndim(min_speed) == 0 else min_speed
-        each = as_sample(each, len(out), "min_speed", machine.active)
-        min_speed = dict(zip(machine.active, each.tolist(), strict=True))
-    for name, value in (*machine.estimation.min_speed.items(), *(min_speed or {}).items()):
-        joints = fnmatch.filter(machine.active, name)
-        if not joints and name not in machine.locked_joints:
-            raise InputError(f"min_speed is for '{name}', {suggest_names(machine.active, name)}")
-        if (limit := as_number(value, f"min_speed of '{name}'", "")) < 0:
-            raise InputError(f"min_speed of '{name}' is {limit:g}, it must not be negative")
-        out[[machine.active.index(joint) for joint in joints]] = limit
-    return out
-
-
-def _default_bandwidth(motion: Motion) -> float:
-    """Default bandwidth [Hz] of the low-pass, far above the frequencies of the motion.
-
-    The band above the motion contains the noise to be estimated. But smoothing removes parts of
-    the accelerations from the regressor, not from the forces, mostly at reversals, where friction
-    jumps: so the bandwidth is at most the passband of smoothing, unless that is close to the
-    motion.
-    """
-    step = float(motion.time[1] - motion.time[0])
-    highest = max(
-        _PASSBAND_SHARE * motion.passband,
-        _MIN_BANDWIDTH_FACTOR * spectral_edge_frequency(motion.v, step, _POWER_SHARE),
-    )
-    fastest = _MAX_BANDWIDTH_FACTOR * spectral_edge_frequency(motion.a, step, _POWER_SHARE)
-    return min(fastest, highest, 0.24 / step)

@@ -27,7 +27,7 @@ from crane.identification.signals.signal_processing import (
     filter_rows,
 )
 
-_MIN_PERIODS = 5.0  # least duration of a recording in periods of the cutoff
+MIN_PERIODS = 5.0  # least duration of a recording in periods of the cutoff
 _BLOCK_BYTES = 1 << 25  # bytes of an unfiltered regressor per block
 # bytes of cached filtered blocks; others are computed again
 _CACHE_BYTES = 3 << 27
@@ -45,9 +45,10 @@ class _FilteredMotion:
         thinning: Decimation factor.
         filter_reach: Reach of the filter to each side in samples, a multiple of the factor.
         is_moving: (M, n) mask of the decimated rows that are used.
+        in_motion: (M, n) mask of the decimated rows that are not at standstill.
     """
 
-    def __init__(self, motion: Motion, bandwidth: float, min_speed: Array):
+    def __init__(self, motion: Motion, bandwidth: float, min_speed: Array, near_rest: bool):
         from scipy.ndimage import maximum_filter1d
 
         self.motion, self.step = motion, float(motion.time[1] - motion.time[0])
@@ -55,7 +56,7 @@ class _FilteredMotion:
         if not is_long_enough(motion, bandwidth):
             raise InputError(
                 f"a bandwidth of {bandwidth:g} Hz leaves nothing of {duration:g} s, give at least "
-                f"{_MIN_PERIODS / duration:.2g} Hz"
+                f"{MIN_PERIODS / duration:.2g} Hz"
             )
         self.thinning, kernel_reach = 1, 0
         if bandwidth * self.step < 0.25:
@@ -67,7 +68,8 @@ class _FilteredMotion:
         is_near_rest = maximum_filter1d(
             is_resting.view(np.uint8), 2 * kernel_reach + 1, axis=0, mode="constant"
         )
-        self.is_moving = is_near_rest[:: self.thinning] == 0
+        self.in_motion = ~is_resting[:: self.thinning]
+        self.is_moving = self.in_motion if near_rest else is_near_rest[:: self.thinning] == 0
 
 
 @dataclasses.dataclass
@@ -101,12 +103,14 @@ class RegressionEquations:
         min_speed: (n,) standstill velocities, below which rows are omitted.
         progress: Called with the finished share of each pass over the motions.
         values: (r,) parameters at which rows of free joints are evaluated, see `_free_joint_rows`.
+        near_rest: Whether rows within the reach of the filter from standstill are used.
 
     Attributes:
         time: (M,) decimated instants of all motions, one after the other [s].
         forces: (M, n) measured, filtered forces.
         offset: (M, n) known forces, available when all blocks have been read.
         is_moving: (M, n) mask of the rows that are used.
+        in_motion: (M, n) mask of all rows that are not at standstill.
         samples: (m,) instants of the used rows.
         groups: (m,) groups of the used rows: joints 0, 1, ... without those that have no rows.
         base, bandwidth, min_speed: See above.
@@ -124,14 +128,18 @@ class RegressionEquations:
         min_speed: Array,
         progress: Progress = ignore_progress,
         values: Array | None = None,
+        near_rest: bool = False,
     ):
         self.base, self.bandwidth, self.min_speed = base, bandwidth, min_speed
         self._model, self._progress, self._values = model, progress, values
         self._motions = motions
         self._filtered_motions = [
-            _FilteredMotion(motion, bandwidth, min_speed) for motion in motions
+            _FilteredMotion(motion, bandwidth, min_speed, near_rest) for motion in motions
         ]
-        self.is_moving = np.concatenate([part.is_moving for part in self._filtered_motions])
+        self.is_moving, self.in_motion = (
+            np.concatenate([getattr(part, name) for part in self._filtered_motions])
+            for name in ("is_moving", "in_motion")
+        )
         instant, joint = np.nonzero(self.is_moving)
         self.samples = instant.astype(np.int32)
         used_joints = np.cumsum(self.is_moving.any(axis=0)) - 1
@@ -281,7 +289,12 @@ class RegressionEquations:
         """Measured and modelled forces for parameters (r,)."""
         modelled = self.modelled_forces(values) + self.offset
         return ForceComparison(
-            self.time, self.forces, modelled, self.is_moving, self._model.machine.active
+            self.time,
+            self.forces,
+            modelled,
+            self.is_moving,
+            self._model.machine.active,
+            self.in_motion,
         )
 
     @cached_property
@@ -363,7 +376,7 @@ class RegressionEquations:
 
 def is_long_enough(motion: Motion, bandwidth: float) -> bool:
     """Whether a motion is long enough for a low-pass [Hz]."""
-    return bandwidth * float(motion.time[-1] - motion.time[0]) >= _MIN_PERIODS
+    return bandwidth * float(motion.time[-1] - motion.time[0]) >= MIN_PERIODS
 
 
 class CombinedRegressor(Regressor):

@@ -154,7 +154,7 @@ class ErrorControlledStepper(MachineCodeStepper):
             next_time = now + segment_start + difference
             breaks, following = self._break_times, np.searchsorted(self._break_times, next_time)
             time_to_break = breaks[following] - now
-            may_jump = isinstance(self._control, ValveDrive) and bool(self._control.period)
+            may_jump = bool(self._control.period)
             if isinstance(self._control, ValveDrive) and may_jump:
                 time_to_break = min(
                     time_to_break, self._control.next_delayed_jump(next_time) - now

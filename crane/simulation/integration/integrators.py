@@ -348,7 +348,7 @@ _INSTANTS_PER_REPORT = 1000  # between reports of progress
 
 
 class ErrorControlledIntegrator(StickSlipIntegrator):
-    """Compiled method with step-size control, with a sampled valve command where there is one.
+    """Compiled method with step-size control, with a sampled control law where there is one.
 
     Args:
         chart: The machine in a chart.
@@ -361,8 +361,8 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
     def __init__(self, chart: Chart, stepper_factory: Callable[[Chart], ErrorControlledStepper]):
         self._stepper = stepper_factory(chart)
         super().__init__(chart, self._stepper)
-        self._chart, self._period_in_steps, drive = chart, 0, chart.control
-        self._sampled_drive = drive if isinstance(drive, ValveDrive) and drive.period else None
+        self._chart, self._period_in_steps, self._last_sample = chart, 0, -np.inf
+        self._sampled_law = chart.control if chart.control.period else None
 
     def run(
         self,
@@ -375,17 +375,18 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
         """See `StickSlipIntegrator.run`.
 
         Raises:
-            InputError: The period of the valve command is no whole number of steps.
+            InputError: The period of the control law is no whole number of steps.
             IntegrationHaltError: A step fails.
         """
-        if self._sampled_drive is not None:
-            period_time = self._sampled_drive.period
+        if self._sampled_law is not None:
+            period_time = self._sampled_law.period
             self._period_in_steps = round(period_time / step)
             if abs(self._period_in_steps * step - period_time) > _TIME_TOLERANCE * period_time:
                 raise InputError(
-                    f"the period {period_time:g} s of the valves' program is no whole number of "
+                    f"the period {period_time:g} s of the sampled program is no whole number of "
                     f"steps of {step:g} s, change one"
                 )
+        self._last_sample = -np.inf
         self._stepper.restart()
         return super().run(times, state, step, rows, progress)
 
@@ -400,14 +401,15 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
     ) -> bool:
         now = first + step * self.done
         chunk = rows[self.done : min(self.done + _INSTANTS_PER_REPORT, len(times))]
-        if self._sampled_drive is not None:
+        if self._sampled_law is not None:
             since = round(now / step) % self._period_in_steps
             chunk = chunk[: 0 if self.offset < 0 else self._period_in_steps - since]
             at = self.python_stepper.state_layout.view(state)
             try:
-                if not since and not self.offset < 0:
+                if not since and not self.offset < 0 and now > self._last_sample:
+                    self._last_sample = now
                     v_a = self._chart.user_velocities(at.q, at.v_a)
-                    self._sampled_drive.update(now, at.q, v_a, at.controller)
+                    self._sampled_law.update(now, at.q, v_a, at.controller)
             except ClosureError as error:
                 raise IntegrationHaltError(
                     now, self.python_stepper.user_coordinates(state), f": {error}"
