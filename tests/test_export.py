@@ -61,9 +61,9 @@ class Library:
     def __init__(self, machine, folder, *flags, controller=None, quantities=None):
         quantities = DYNAMICS_ROUTINES if quantities is None else quantities
         self.program = InstanceProgram(machine, quantities, controller=controller)
-        texts = CSources(self.program, "m").files()
-        for name in ("m.h", "m.c"):
-            (folder / name).write_text(texts[name])
+        sources = CSources(self.program, "m")
+        (folder / "m.h").write_text(sources.header())
+        (folder / "m.c").write_text(sources.source())
         command = [COMPILERS[0], *STRICT, *(flags or ("-O1",)), "-shared", "-fPIC", "m.c", "-lm"]
         subprocess.run([*command, "-o", "m.so"], cwd=folder, check=True, timeout=300)
         self._library = ctypes.CDLL(str(folder / "m.so"))
