@@ -109,8 +109,8 @@ class Conditions {
         if (this.box) this.box.checked = holds;
         if (this.payload) this.payload(payload, spoken(drive.payload.masses[payload], 4));
         if (!this.pitch) return;
-        this.pitch(pitch, spoken(pitch));
-        this.roll(roll, spoken(roll));
+        this.pitch(pitch, String(pitch).replace("-", "\u2212"));
+        this.roll(roll, String(roll).replace("-", "\u2212"));
     }
 }
 

@@ -137,7 +137,8 @@ class DriveSpace extends Space {
             const wished = this.interval > SMOOTH ? Math.max(0.6, 0.8 * this.ratio) : this.interval < 18 ? Math.min(most, 1.1 * this.ratio) : this.ratio;
             if (Math.abs(wished - this.ratio) > 0.02) {
                 this.ratio = wished;
-                viewer.renderer.setPixelRatio(wished);
+                viewer.renderer.setPixelRatio(wished); // which clears the canvas
+                viewer.set_dirty();
             }
         }
         if (viewer.needs_render) viewer.render();
