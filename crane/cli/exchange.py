@@ -120,7 +120,7 @@ def export(
         print(f"written to {written}: a package for colcon build")
 
 
-def _write_fmu(machine: crane.Machine, output: OutputPath, fmi: int) -> None:
+def _write_fmu(machine: "crane.Machine", output: OutputPath, fmi: int) -> None:
     """Write a machine as an FMU, with its sketch as icon and its facts as documentation."""
     from crane.view.notebook import to_html
 

@@ -93,8 +93,8 @@ def write_fmu(
     program = InstanceProgram(loaded, (), has_derivatives=True)
     if program.layout.parts["delays"]:
         raise InputError(
-            f"valves of '{loaded.name}' have a dead time, which an FMU has not: set delay to 0, or "
-            "delay the signals before"
+            f"valves of '{loaded.name}' have a dead time, which an FMU has not: set delay to 0 "
+            "or delay the signals before"
         )
     files = FmuFiles(program, fmi)
     members = files.texts(about) | files.icon_members(icon)

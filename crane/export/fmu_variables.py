@@ -227,12 +227,11 @@ def _formula_loads(formula: Formula, size: int) -> list[set[tuple[int, int]]]:
     places: list[tuple[int, int]] = []
     masks: list[int] = []  # sets as bits, one for each element
     for kind, *operands in tape.operations:
-        mask = 0
-        if kind == "load" and operands[0] in (3, 4):
+        is_load = kind == "load"
+        mask = reduce(or_, (masks[x] for x in operands if type(x) is int and not is_load), 0)
+        if is_load and operands[0] in (3, 4):
             mask = 1 << len(places)
             places.append((operands[0], operands[1]))
-        elif kind != "load":
-            mask = reduce(or_, (masks[x] for x in operands if type(x) is int), 0)
         masks.append(mask)
     found = [masks[x.index] if isinstance(x, SymbolicExpression) else 0 for x in outputs]
     return [{place for i, place in enumerate(places) if mask >> i & 1} for mask in found]

@@ -22,12 +22,12 @@ from crane.codegen.symbolic import (
     scale_vector,
     subtract_vectors,
 )
-from crane.codegen.vector_layout import Formula
 from crane.common.samples import Array
 from crane.control.valve_drive import ValveDrive
 from crane.dynamics.formula_structure import BODY_SIZE
 from crane.dynamics.frame_jacobians import frame_placement
-from crane.export.dead_times import DEAD_TIME_ROUTINES, DeadTimes
+from crane.export.dead_times import DEAD_TIME_ROUTINES
+from crane.export.evaluation_routines import EvaluationRoutines
 from crane.export.kinematics_program import (
     BEYOND_CHART,
     DONE,
@@ -35,13 +35,11 @@ from crane.export.kinematics_program import (
     NOT_CLOSED,
     TOO_MANY_CALLS,
     TOO_MANY_EVENTS,
-    KinematicsRoutines,
 )
 from crane.export.laden_inertia import laden_inertia
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.error_controlled_stepper import ErrorControlledStepper
 from crane.simulation.integration.machine_code_stepper import HELD_INDEX
-from crane.simulation.integration.machine_formulas import AT_REST_SUFFIX
 from crane.simulation.integration.stick_slip_routine import add_stick_slip_routines
 
 STATUS_TEXTS = MappingProxyType(
@@ -63,7 +61,7 @@ INNER_ROUTINES = (
 )  # fmt: skip
 
 
-class InstanceRoutines(KinematicsRoutines):
+class InstanceRoutines(EvaluationRoutines):
     """Writer of the routines of an instance.
 
     Args:
@@ -84,14 +82,13 @@ class InstanceRoutines(KinematicsRoutines):
         quantities: Sequence[str],
         tip_offset: Array | None,
     ):
-        super().__init__(layout, chart.machine.closure.compiled_closure)
+        closure = chart.machine.closure.compiled_closure
+        super().__init__(layout, closure, programs, len(chart.stick_slip.columns))
         self.chart, self.stepper = chart, stepper
-        self._programs, self._quantities, self._tip_offset = programs, quantities, tip_offset
+        self._quantities, self._tip_offset = quantities, tip_offset
         machine = self.machine = chart.machine
         self.control = chart.control
         self._nq, self._n = machine.model.nv, len(machine.active)
-        self._k = len(chart.stick_slip.columns)
-        self._dead_times = DeadTimes(layout) if layout.parts["delays"] else None
 
     def add_to(self, program: Program) -> None:
         """Add all routines to a program that has the functions of `programs`."""
@@ -100,7 +97,7 @@ class InstanceRoutines(KinematicsRoutines):
         self._add_stiction(program)
         self._add_initialize(program)
         self._add_advance(program)
-        self._add_evaluations(program)
+        self.add_evaluations(program)
         self.add_kinematics(program)
         self._add_tip(program)
         self._add_dynamics(program)
@@ -122,9 +119,6 @@ class InstanceRoutines(KinematicsRoutines):
             inertia = ArrayPointer("instance").element_pointer(first + BODY_SIZE * (body - 1))
             r.call("laden", self._part(r.instance, "unladen"), r.payload, inertia)
             r.return_value(DONE)
-
-    def _machine_arguments(self, instance: ArrayPointer) -> tuple[ArrayPointer, ...]:
-        return tuple(self._part(instance, x) for x in ("geometry", "dynamics", "settings"))
 
     def _store(self, r: Routine, name: str, value: RoutineValue | float, index: int = 0) -> None:
         r.store(ArrayPointer("instance"), self.layout.start_index(name) + index, value)
@@ -350,66 +344,6 @@ class InstanceRoutines(KinematicsRoutines):
             self._write_halt(r, state)
         self._store(r, "time", self._element(r.instance, "time") + step)
         r.copy(start, inputs, columns)
-        r.return_value(DONE)
-
-    def _add_evaluations(self, program: Program) -> None:
-        """update_outputs(instance); derivatives(instance, rate) of the state.
-
-        event_indicators(instance, indicators); directional_derivatives(instance, direction,
-        result) of rate and outputs.
-        """
-        with program.add_routine("update_outputs", arrays=("instance",)) as r:
-            self._write_evaluation(r, "steps_observe", ["outputs"], self._part(r.instance, "tau"))
-        with program.add_routine("derivatives", arrays=("instance", "rate")) as r:
-            self._write_evaluation(r, "steps_rate", ["rate"], r.rate)
-        if self.event_parts:
-            with program.add_routine("event_indicators", arrays=("instance", "indicators")) as r:
-                self._write_evaluation(r, "steps_rate", [*self.event_parts], r.indicators)
-        if "tangent" in self._programs:
-            arrays = "instance", "direction", "result"
-            with program.add_routine("directional_derivatives", arrays=arrays) as r:
-                self._write_evaluation(r, "tangent_rate", ["all"], r.result, r.direction)
-
-    @property
-    def step_functions(self) -> Mapping[str, Formula | Routine]:
-        """Functions of the stepper by name."""
-        return self._programs["steps"].functions
-
-    @property
-    def event_parts(self) -> dict[str, int]:
-        """Numbers of event indicators by part of the formula `rate`."""
-        parts = self._programs["steps"].formula_outputs("rate").parts
-        events = {"margin": min(self._k, 1), "event_distances": parts["event_distances"]}
-        return {name: count for name, count in events.items() if count}
-
-    def _write_evaluation(
-        self,
-        r: Routine,
-        formula: str,
-        parts: Sequence[str],
-        target: ArrayPointer,
-        *further: ArrayPointer,
-    ) -> None:
-        """Write the evaluation of parts of a formula at the state, the inputs and `further`."""
-        program, own_name = formula.split("_")
-        layout = self._programs[program].formula_outputs(own_name)
-        values = r.local_array("values", layout)
-        inputs, state = (self._part(r.instance, x) for x in ("inputs", "q"))
-        if self._dead_times is not None:
-            row = r.local_array("row", self.layout.parts["inputs"])
-            r.copy(row, inputs, self.layout.parts["inputs"])
-            r.call("delay_signals", r.instance, self._part(r.instance, "time"), row)
-            inputs = row
-        arguments = *self._machine_arguments(r.instance), inputs, state, *further, values
-        if self._k:
-            with r.if_then(self._element(r.instance, "bounds", HELD_INDEX) > 0.5):
-                r.call(formula + AT_REST_SUFFIX, *arguments)
-            with r.if_else():
-                r.call(formula, *arguments)
-        else:
-            r.call(formula, *arguments)
-        count = sum(layout.parts[part] for part in parts)
-        r.copy(target, values.element_pointer(parts[0]), count)
         r.return_value(DONE)
 
     def _add_tip(self, program: Program) -> None:
