@@ -104,6 +104,11 @@ class DrawnSlide:
     cylinder: SteelCylinder | None = None
     offsets: tuple[float, ...] = (0.0,)
 
+    @property
+    def limits(self) -> Limits:
+        """Limits of its coordinate."""
+        return Limits(0.0, self.stroke)
+
 
 @dataclass(frozen=True)
 class Drawing:

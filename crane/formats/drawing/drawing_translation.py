@@ -131,15 +131,14 @@ class _DrawingTranslation:
         """Yield the edges of the tree from the base on, with parent and child."""
         pending = [self._drawing.base]
         for parent in pending:
-            for edge in tree:
-                if parent not in edge.bodies:
-                    continue
-                child = edge.bodies[edge.bodies[0] == parent]
-                if child not in self._origins:
-                    end = edge.points[-1] if child == edge.bodies[1] else edge.points[0]
-                    self._origins[child] = self._drawing.points[end]
-                    pending.append(child)
-                    yield edge, parent, child
+            edges = [edge for edge in tree if parent in edge.bodies]
+            ends = [(edge, edge.bodies[0] == parent) for edge in edges]
+            new = [(edge, i) for edge, i in ends if edge.bodies[i] not in self._origins]
+            for edge, i in new:
+                child = edge.bodies[i]
+                self._origins[child] = self._drawing.points[edge.points[-i]]
+                pending.append(child)
+                yield edge, parent, child
         for name, body in self._drawing.bodies.items():
             if name not in self._origins:
                 raise DescriptionError(
@@ -163,19 +162,17 @@ class _DrawingTranslation:
             for bar in body.bars:
                 _add_bar(link, bar, origin)
             self._locate(link, body.location)
-            for point in body.points:
-                frame = f"{name}_{point}" if len(drawing.bodies_at(point)) > 1 else point
-                if frame in drawing.bodies:
-                    raise DescriptionError(
-                        f"{body.location}: a point and a body are named '{frame}', rename one"
-                    )
-                self._locate(add_link(self._robot, Link(frame, "")), body.location)
-                self._add_joint(
-                    Joint(
-                        f"{frame}_fixed", "fixed", name, frame, "",
-                        to_vector(drawing.points[point] - origin),
-                    ), body.location,
-                )  # fmt: skip
+        frames = [(name, point) for name in self._origins for point in drawing.bodies[name].points]
+        for name, point in frames:
+            frame = f"{name}_{point}" if len(drawing.bodies_at(point)) > 1 else point
+            location = drawing.bodies[name].location
+            if frame in drawing.bodies:
+                raise DescriptionError(
+                    f"{location}: a point and a body are named '{frame}', rename one"
+                )
+            self._locate(add_link(self._robot, Link(frame, "")), location)
+            place = to_vector(drawing.points[point] - self._origins[name])
+            self._add_joint(Joint(f"{frame}_fixed", "fixed", name, frame, "", place), location)
 
     def _add_joint(
         self, joint: Joint, location: str, is_driven: bool = False, home: float | None = None
@@ -191,26 +188,22 @@ class _DrawingTranslation:
         part, origin = edge.constraint, self._origins[child] - self._origins[parent]
         if isinstance(part, DrawnSlide) and part.cylinder is not None:
             self._add_cylinder(edge, part, parent, is_tree=True)
-        elif isinstance(part, DrawnSlide):
-            direction = self._direction(part) * (1 if child == edge.bodies[1] else -1)
-            position = self._drawing.distance(part.points) - part.shortest
-            joint = Joint(
-                edge.name, "prismatic", parent, child, "",
-                to_vector(origin - position * direction), axis=to_vector(direction),
-                limits=Limits(0.0, part.stroke),
-            )  # fmt: skip
-            self._add_joint(joint, part.location, part.is_driven, position)
+            return
+        home: float | None = 0.0
+        if isinstance(part, DrawnSlide):
+            kind, axis = "prismatic", self._direction(part)
+            axis = axis if child == edge.bodies[1] else -axis
+            home, limits = self._drawing.distance(part.points) - part.shortest, part.limits
+            origin = origin - home * axis
         elif part.axis is None:
-            element = add_joint(
-                self._robot, Joint(edge.name, "spherical", parent, child, "", to_vector(origin))
-            )
-            self._locate(element, part.location)
+            kind, axis, limits, home = "spherical", np.array(Z_AXIS), Limits(), None
         else:
-            joint = Joint(
-                edge.name, "revolute", parent, child, "", to_vector(origin),
-                axis=to_vector(part.axis), limits=part.limits,
-            )  # fmt: skip
-            self._add_joint(joint, part.location, part.is_driven, 0.0)
+            kind, axis, limits = "revolute", part.axis, part.limits
+        joint = Joint(
+            edge.name, kind, parent, child, "", to_vector(origin), axis=to_vector(axis),
+            limits=limits,
+        )  # fmt: skip
+        self._add_joint(joint, part.location, part.is_driven, home)
 
     def _direction(self, slide: DrawnSlide) -> Array:
         first, second = (self._drawing.points[point] for point in slide.points)
