@@ -326,7 +326,8 @@ def test_the_written_machine_predicts_as_the_identification(name, tmp_path, requ
     (log,) = logs(name, file)
     if name == "tx40":
         log = log.between(0.0, 3.0)
-    found = crane.identify(machine, log, feasible=True)
+    found = crane.identify(machine, log)
+    assert found.feasible
     written = crane.load(crane.identification.write_identified(found, tmp_path / name))
     step = log.time[1] - log.time[0]
     q = sosfiltfilt(butter(4, 20, fs=1 / step, output="sos"), log.q, axis=0)
@@ -352,7 +353,7 @@ def test_the_tx40_predicts_the_part_it_has_not_seen(tx40):
     assert len(least.values) == 61
     assert least.training.overall_relative_error <= 0.051
 
-    better = crane.identify(tx40, first, rest, feasible=True)
+    better = crane.identify(tx40, first, rest)
     slow = [0.05009, 0.05009, 0.07505, 0.07156, 0.05585, 0.12217]
     _, error = judged(better, rest.time, rest.q, rest.tau, slow, (100.0, 20.0), trim=400)
     assert error <= 0.0555
@@ -375,7 +376,7 @@ def test_the_kr300_predicts_the_other_recording(kr300):
     assert found.validation.relative_error.mean() <= 0.0575
     assert errors.mean() <= 0.0565 and stacked <= 0.0257
     assert errors[1] <= 0.03
-    plain = crane.identify(kr300, a)
+    plain = crane.identify(kr300, a, feasible=False)
     errors, _ = judged(plain, b.time, b.q, b.tau, np.deg2rad(1.0), (20.0, 5.0))
     assert errors.mean() <= 0.0535
     scale = found.parameters[found.model.names.index("stroke.gas_scale")]

@@ -95,7 +95,13 @@ def test_the_width_is_as_wide_as_the_description_is_wrong(arm):
 def test_what_is_given_holds(arm):
     motion = noisy(arm, 0.1)
     given = quiet(
-        identify, arm, motion, prior={"bodies": "auto"}, bandwidth=20.0, min_speed={"q*": 0.03}
+        identify,
+        arm,
+        motion,
+        prior={"bodies": "auto"},
+        feasible=False,
+        bandwidth=20.0,
+        min_speed={"q*": 0.03},
     )
     assert given.bandwidth == 20.0 and (given.min_speed == 0.03).all()
     assert [trial.bandwidth for trial in given.selection.trials] == [20.0]
@@ -107,6 +113,7 @@ def test_what_is_given_holds(arm):
         )
     )
     found = quiet(identify, fixed, motion)
+    assert found.feasible and not given.feasible and not closed.feasible
     assert found.bandwidth == 25.0 and str(fixed.estimation.prior["bodies"]) == "auto"
     with pytest.raises(InputError, match="min_speed of 'q1' is -1, it must not be negative"):
         identify(arm, motion, prior={"bodies": "auto"}, min_speed={"q1": -1.0})

@@ -185,15 +185,14 @@ class ModelOptions(OptionBlock):
         list[str] | None,
         typer.Option(
             metavar="[NAME=]STD",
-            help="Prior standard deviation: one relative value for all parameters, e.g. 0.3, or "
-            "by name, e.g. bodies=10%, q1.viscous=200+-50 (value +- std); none: no prior; "
-            "bodies=auto selects it, and the bandwidth and --min-speed that are not given, by "
-            "cross-validation on the training data.",
+            help="Prior standard deviation: relative, e.g. 0.3, or by name, e.g. bodies=10%, "
+            "q1.viscous=200+-50; bodies=auto: by cross-validation, with the bandwidth; or none.",
         ),
     ] = None
     feasible: Annotated[
-        bool, typer.Option("--feasible", help="Require physically feasible parameters.")
-    ] = False
+        bool | None,
+        typer.Option(help="Require physically feasible parameters; default if a prior is auto."),
+    ] = None
 
 
 @command()

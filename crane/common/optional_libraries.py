@@ -1,6 +1,7 @@
 """Optional libraries, which extras of the package install."""
 
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 from crane.common.errors import InputError
@@ -32,6 +33,11 @@ def import_optional_library(module: str, purpose: str) -> Any:
         return import_module(module)
     except ImportError:
         raise InputError(f"{purpose} needs {name}, {installation_hint(extra)}") from None
+
+
+def is_installed(module: str) -> bool:
+    """Whether an optional library is installed."""
+    return find_spec(module) is not None
 
 
 def installation_hint(extra: str) -> str:

@@ -309,7 +309,7 @@ IDENTIFICATION = section_schema(
             ), "term",
         ),
         "prior": MapKey(
-            "priors of parameters, e.g. 50, 10 %, 609 +- 60, 0.6 +- 0.1 kN",
+            "priors of parameters, e.g. 50, 10 %, 609 +- 60, 0.6 +- 0.1 kN, or auto",
             VariantKey("", (NumberKey(), TextKey())), "parameter",
         ),
         "bandwidth": NumberKey(

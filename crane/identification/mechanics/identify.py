@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.common.errors import CraneWarning, InputError, RecordingError, check_name
+from crane.common.optional_libraries import is_installed
 from crane.common.progress import Progress, ignore_progress, progress_reporter
 from crane.common.samples import Array, as_number
 from crane.common.threads import with_single_threaded_blas
@@ -37,7 +38,6 @@ from crane.identification.mechanics.identifiability import (
     motion_advice,
     parameter_magnitudes,
     prior_from_names,
-    read_priors,
 )
 from crane.identification.mechanics.identification_model import IdentificationModel, TermChanges
 from crane.identification.mechanics.identification_result import Identification
@@ -49,6 +49,8 @@ from crane.identification.mechanics.regression_equations import (
 )
 from crane.identification.mechanics.settings_selection import (
     default_bandwidth,
+    has_open_prior,
+    merge_priors,
     select_settings,
     standstill_velocities,
 )
@@ -71,7 +73,7 @@ def identify(
     validation: RecordingOrMotion | Sequence[RecordingOrMotion] | None = None,
     method: str = "wls",
     prior: float | Mapping[str, object] | Prior | None = None,
-    feasible: bool = False,
+    feasible: bool | None = None,
     *,
     terms: Sequence[ModelTerm] | TermChanges | None = None,
     bandwidth: float | None = None,
@@ -100,7 +102,8 @@ def identify(
             deviation of the whole description; or means and standard deviations (p,) of all
             parameters. With a prior all parameters are estimated, not only the base parameters.
         feasible: Whether to constrain bodies to be physically feasible and friction to be
-            nonnegative; all parameters are estimated then.
+            nonnegative; all parameters are estimated then. Default with a prior of the width
+            "auto", if CVXPY is installed.
         terms: Terms of the model; or changes of the default terms by name, such as
             {"q*.rotor_inertia": (), "q1.coulomb": None}, see `select_terms`.
         bandwidth: Bandwidth of the low-pass [Hz]; default far above the frequencies of the motion,
@@ -121,19 +124,16 @@ def identify(
     """
     progress = progress_reporter(progress)
     check_name(method, METHODS, f"method '{method}' is unknown")
-    model = IdentificationModel(machine, terms)
-    if feasible:
-        if not model.bodies:
-            raise InputError("the model has no bodies, so nothing has to be feasible")
-        load_convex_solver()  # fail early
+    model, priors = IdentificationModel(machine, terms), merge_priors(machine, prior)
+    feasible = _requires_feasible_bodies(model, feasible, has_open_prior(priors))
     final_progress, progress = progress, multi_pass_progress(progress)
     check_shared_samples(as_list(recording), as_list(validation), trust)
     motions = prepare_motions(machine, recording, trust, progress)
-    priors, settings = _merged_prior(machine, prior), None
-    if isinstance(priors, Mapping) and any(what.is_open for what in priors.values()):
+    settings = None
+    if has_open_prior(priors):
         settings = select_settings(model, motions, priors, bandwidth, min_speed, progress)
-        bandwidth, min_speed = settings.best.bandwidth, settings.min_speed
-        priors = settings.priors
+        bandwidth, priors = settings.best.bandwidth, settings.priors
+        min_speed = settings.min_speed
     equations, identifiable = build_equations(model, motions, bandwidth, min_speed, progress)
     delays = _check_forces(model, motions, equations, trust) if model.bodies else ()
     selection = equations.column_selection(identifiable)
@@ -187,6 +187,23 @@ def identify(
     return identification
 
 
+def _requires_feasible_bodies(
+    model: IdentificationModel, given: bool | None, is_open: bool
+) -> bool:
+    """Whether bodies have to be feasible: as given, or where settings are selected.
+
+    Raises:
+        InputError: There are no bodies, or the solver is missing.
+    """
+    if given is None:
+        return is_open and bool(model.bodies) and is_installed("cvxpy")
+    if given and not model.bodies:
+        raise InputError("the model has no bodies, so nothing has to be feasible")
+    if given:
+        load_convex_solver()  # fail early
+    return given
+
+
 def _compare_held_out(
     model: IdentificationModel,
     base: BaseParameters,
@@ -214,19 +231,6 @@ def _compare_held_out(
     if short_count or comparison is None:
         warnings.warn(f"{text}, give longer ones that move", CraneWarning, stacklevel=4)
     return comparison
-
-
-def _merged_prior(
-    machine: Machine, given: float | Mapping[str, object] | Prior | None
-) -> Mapping[str, ParameterPrior] | Prior:
-    """Priors by name, given ones in place of those of the machine file; or a given prior."""
-    known = dict(machine.estimation.prior)
-    if given is None:
-        return known
-    if not isinstance(given, Mapping | int | float):
-        return given
-    given_priors = read_priors(given, machine)
-    return {name: what for name, what in known.items() if name not in given_priors} | given_priors
 
 
 def _build_prior(

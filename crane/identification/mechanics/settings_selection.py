@@ -4,6 +4,7 @@ import fnmatch
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,7 +16,11 @@ from crane.common.units import format_table
 from crane.description.estimation_settings import ParameterPrior
 from crane.identification.estimation.estimators import Prior
 from crane.identification.mechanics.base_parameters import base_parameters
-from crane.identification.mechanics.identifiability import parameter_magnitudes, prior_from_names
+from crane.identification.mechanics.identifiability import (
+    parameter_magnitudes,
+    prior_from_names,
+    read_priors,
+)
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.regression_equations import (
     MIN_PERIODS,
@@ -183,6 +188,24 @@ def select_settings(
     ordered = (*(trial for trial in trials if trial is not best), best)
     selected = min_speed if best.slow_share is None else best.slow_share * fastest
     return SettingsSelection(ordered, score_bandwidth, closed_priors(priors, best.width), selected)
+
+
+def merge_priors(
+    machine: Machine, given: float | Mapping[str, object] | Prior | None
+) -> PriorMap | Prior:
+    """Priors by name, given ones in place of those of the machine file; or a given prior."""
+    known = dict(machine.estimation.prior)
+    if given is None:
+        return known
+    if not isinstance(given, Mapping | int | float):
+        return given
+    given_priors = read_priors(given, machine)
+    return {name: what for name, what in known.items() if name not in given_priors} | given_priors
+
+
+def has_open_prior(priors: PriorMap | Prior) -> TypeGuard[PriorMap]:
+    """Whether the width of some prior is to be selected."""
+    return isinstance(priors, Mapping) and any(what.is_open for what in priors.values())
 
 
 def closed_priors(priors: PriorMap, width: float) -> dict[str, ParameterPrior]:
