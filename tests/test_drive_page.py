@@ -122,6 +122,7 @@ def test_a_gamepad_does_a_cycle(browser, tmp_path):
     path.write_text(drive_html(machine), encoding="utf-8")
     page = opened(browser, path, viewport={"width": 640, "height": 480})
     page.select_option("#goal", label="lift the load")
+    page.evaluate("window.axes = [0, 0, 0, 0]")
     page.evaluate("navigator.getGamepads = () => [{ axes: window.axes, buttons: [] }]")
     goal, levers, first = page.evaluate("[drive.goals[0], drive.levers, drive.columns.length]")
     joints = page.evaluate("drive.joints.map(({ column }) => column)")
@@ -134,17 +135,19 @@ def test_a_gamepad_does_a_cycle(browser, tmp_path):
         way = np.array(goal["points"][state["next"]]) - row[first : first + 3]
         jacobian = kinematics.jacobian([row[i] for i in joints]) * ranges / 10
         square = jacobian.T @ jacobian
-        lever = 1.5 * np.linalg.solve(
+        lever = 0.8 * np.linalg.solve(
             square + 1e-3 * np.trace(square) * np.eye(4), jacobian.T @ way
         )
-        lever /= max(1.0, np.abs(lever).max())
+        lever *= (np.linalg.norm(way) > 0.6 * goal["radius"]) / max(1.0, np.abs(lever).max())
         given = [0.0, 0.0, 0.0, 0.0]
         for one, x in zip(levers, lever, strict=True):
             axis, sign = axes[one["role"]]
             given[axis] = float(sign * one["sign"] * (0.88 * x + 0.12 * np.sign(x)))
         page.evaluate(f"window.axes = {given}")
         page.wait_for_timeout(30)
-    result = page.evaluate("crane.state.results[0]")
+    state = page.evaluate("crane.state")
+    assert state["goal"]["isDone"], page.faults
+    result = state["results"][0]
     assert (result["goal"], len(page.evaluate("crane.state.changes"))) == ("lift the load", 2)
     page.evaluate("window.axes = [0, 0, 0, 0]")
     recorded = saved(page, tmp_path / "drive.csv")

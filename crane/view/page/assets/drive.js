@@ -43,7 +43,6 @@ function show(state) {
     element("state").classList.toggle("fault", state.status !== 1);
     element("save").disabled = !state.hasMoved;
     element("repeat").textContent = state.hasMoved ? command(state.changed) : "";
-    levers.show(state.levers);
     conditions.show(state);
     goals.show(state);
     if (!state.row.length) return;
@@ -52,10 +51,10 @@ function show(state) {
     if (pull) pull.show(state);
     for (const joint of joints) showJoint(joint, state);
     for (const load of loads) showLoad(load, state);
-    if (space) space.show(state);
 }
 
-let drawn = null;
+const READABLE = 50; // interval of the numbers, which nobody reads at every frame [ms]
+let drawn = null, written = null, writtenAt = 0;
 function draw(now) {
     const wanted = levers.wanted();
     if (wanted.join() !== sent) {
@@ -63,7 +62,14 @@ function draw(now) {
         if (wanted.some((x) => x) && shown && !shown.running && shown.status === 1) setRunning(true);
     }
     sent = wanted.join();
-    if (shown && shown !== drawn) show(shown);
+    if (shown && shown !== drawn) {
+        levers.show(shown.levers);
+        if (space && shown.row.length) space.show(shown);
+    }
+    if (shown && shown !== written && (now - writtenAt > READABLE || !shown.running)) {
+        show(shown);
+        [written, writtenAt] = [shown, now];
+    }
     drawn = shown;
     if (space) space.draw(now);
     frames += 1;
