@@ -14,7 +14,7 @@ import crane
 CLASSES = """
 Accumulator Batch Breakout Buckling Calibration Capacity Chain Chart Checkpoint Closure Cluster
 Comparison
-Contact Controller Coordinates Coupling Cylinder Derivatives Design Dimension Drive Dynamics
+Contact Controller Drawing Coordinates Coupling Cylinder Derivatives Design Dimension Drive Dynamics
 Engine Estimate Excitation Finding Findings Flow Formula Friction Gearbox Gradient Ground
 Hydraulics Identification Inertial Jackknife Joint Key Kinematics Layout Limits Link Machine
 Mode Motion Oil Payload Phase Playback Program Reactions Readout Recording Regressor
@@ -24,9 +24,9 @@ Wrench _Line _Stream _Subtree
 """
 FILES = """
 attitude batch buckling calibrate charts checkpoint closure clusters command components coordinates
-describe design differentiation dynamics entry errors estimators exchange findings
+describe design differentiation drawing dynamics entry errors estimators exchange findings
 identifiability identify integrators kinematics levers linearization logs machine measures
-misfit notebook npz options parsing payload priors program progress radau rate reactions
+misfit notebook npz options parsing payload plausibility priors program progress radau rate reactions
 recording regressor result rosenbrock samples scene sensors serialization show simulate
 specification statics strokes sway symbolic terminal threads timeseries trajectory transmission
 trim units unknowns

@@ -31,7 +31,7 @@ _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 @dataclass(frozen=True)
-class Bar:
+class BarShape:
     """A straight part of the shape of a body.
 
     Attributes:
@@ -58,7 +58,7 @@ class DrawnBody:
     """
 
     points: tuple[str, ...]
-    bars: tuple[Bar, ...]
+    bars: tuple[BarShape, ...]
     inertia: pin.Inertia
     location: str
 
@@ -291,15 +291,15 @@ class _DrawingReader:
 
     def _outline_bars(
         self, points: Sequence[str], width: float | None = None, y: float = 0.0
-    ) -> list[Bar]:
+    ) -> list[BarShape]:
         """Return bars along a polygon, or a line of two points."""
         places = self._coordinates(points) + [0.0, y, 0.0]
         size = _BAR_SHARE * float(np.linalg.norm(np.ptp(places, axis=0)))
         last = len(places) if len(places) > 2 else len(places) - 1
         pairs = (np.array([places[i], places[(i + 1) % len(places)]]) for i in range(last))
-        return [Bar(ends, size, width) for ends in pairs if np.ptp(ends, axis=0).any()]
+        return [BarShape(ends, size, width) for ends in pairs if np.ptp(ends, axis=0).any()]
 
-    def _read_plates(self, item: YamlSection) -> Iterator[tuple[list[Bar], pin.Inertia]]:
+    def _read_plates(self, item: YamlSection) -> Iterator[tuple[list[BarShape], pin.Inertia]]:
         for plate in item.list_items("plates", f"a plate of {item.title}"):
             names = self._point_names(plate, "outline", least=3)
             outline = self._coordinates(names)
@@ -313,7 +313,7 @@ class _DrawingReader:
                     plate_inertia(outline, values["thickness"], y, values["density"]),
                 )
 
-    def _read_tubes(self, item: YamlSection) -> Iterator[tuple[list[Bar], pin.Inertia]]:
+    def _read_tubes(self, item: YamlSection) -> Iterator[tuple[list[BarShape], pin.Inertia]]:
         for tube in item.list_items("tubes", f"a tube of {item.title}"):
             ends = self._coordinates(self._point_names(tube, "points"))
             values: dict[str, Any] = {
@@ -324,7 +324,7 @@ class _DrawingReader:
             }
             values |= tube.values("points")
             for y in values.pop("y"):
-                bar = Bar(ends + [0.0, y, 0.0], values["height"], values["width"])
+                bar = BarShape(ends + [0.0, y, 0.0], values["height"], values["width"])
                 yield [bar], tube_inertia(bar.ends, **values)
 
     def _estimate_mass(self, name: str, item: YamlSection, points: Sequence[str]) -> float:

@@ -29,7 +29,7 @@ from crane.description.kinematic_tree import (
 from crane.description.machine_schema import MACHINE
 from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
 from crane.formats.drawing.body_inertia import rigid_inertia
-from crane.formats.drawing.drawing import Bar, Drawing, DrawnPin, DrawnSlide, read_drawing
+from crane.formats.drawing.drawing import BarShape, Drawing, DrawnPin, DrawnSlide, read_drawing
 from crane.formats.machine_file.yaml_section import YamlSection
 from crane.formats.steel_cylinder import SteelCylinder, add_cylinder_visuals, sum_inertias
 from crane.formats.xml_file import (
@@ -47,7 +47,7 @@ _NO_ROTATION = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
-class _Edge:
+class _BodyConnection:
     """A pin or a slide between two bodies.
 
     Attributes:
@@ -103,11 +103,11 @@ class _DrawingTranslation:
             etree.SubElement(state, "joint", name=joint, value=repr(value))
         return XmlFile(file, self._robot, self._locations)
 
-    def _edges(self) -> Iterator[_Edge]:
+    def _edges(self) -> Iterator[_BodyConnection]:
         """Yield slides of bodies and pins, those with a drive first, and at last cylinders."""
         drawing = self._drawing
         edges = [
-            _Edge(name, (slide.bodies[0], slide.bodies[1]), slide.points, slide)
+            _BodyConnection(name, (slide.bodies[0], slide.bodies[1]), slide.points, slide)
             for name, slide in drawing.slides.items()
             if slide.bodies
         ]
@@ -115,19 +115,19 @@ class _DrawingTranslation:
             first, *others = drawing.bodies_at(point) or [""]
             for other in others:
                 name = point if len(others) == 1 else f"{point}_{other}"
-                edges.append(_Edge(name, (first, other), (point,), self._pin(point)))
+                edges.append(_BodyConnection(name, (first, other), (point,), self._pin(point)))
         yield from sorted(edges, key=lambda edge: not edge.constraint.is_driven)
         for name, slide in drawing.slides.items():
             if slide.cylinder is not None:
                 first, second = (self._body_of_end(name, slide, x) for x in slide.points)
-                yield _Edge(name, (first, second), slide.points, slide)
+                yield _BodyConnection(name, (first, second), slide.points, slide)
 
     def _pin(self, point: str) -> DrawnPin:
         return self._drawing.pins.get(point) or DrawnPin(
             np.array([0.0, -1.0, 0.0]), location=self._drawing.location
         )
 
-    def _directed(self, tree: list[_Edge]) -> Iterator[tuple[_Edge, str, str]]:
+    def _directed(self, tree: list[_BodyConnection]) -> Iterator[tuple[_BodyConnection, str, str]]:
         """Yield the edges of the tree from the base on, with parent and child."""
         pending = [self._drawing.base]
         for parent in pending:
@@ -184,7 +184,7 @@ class _DrawingTranslation:
             self._home[joint.name] = home
         self._locate(element, location)
 
-    def _add_tree_joint(self, edge: _Edge, parent: str, child: str) -> None:
+    def _add_tree_joint(self, edge: _BodyConnection, parent: str, child: str) -> None:
         part, origin = edge.constraint, self._origins[child] - self._origins[parent]
         if isinstance(part, DrawnSlide) and part.cylinder is not None:
             self._add_cylinder(edge, part, parent, is_tree=True)
@@ -209,7 +209,7 @@ class _DrawingTranslation:
         first, second = (self._drawing.points[point] for point in slide.points)
         return np.asarray((second - first) / np.linalg.norm(second - first))
 
-    def _add_body_loop(self, edge: _Edge) -> None:
+    def _add_body_loop(self, edge: _BodyConnection) -> None:
         part = edge.constraint
         if edge.bodies[0] == edge.bodies[1]:
             raise DescriptionError(
@@ -249,7 +249,9 @@ class _DrawingTranslation:
         etree.SubElement(loop, "axis", xyz=format_numbers(axis))
         self._locate(loop, location)
 
-    def _add_cylinder(self, edge: _Edge, slide: DrawnSlide, parent: str, is_tree: bool) -> None:
+    def _add_cylinder(
+        self, edge: _BodyConnection, slide: DrawnSlide, parent: str, is_tree: bool
+    ) -> None:
         """Add barrel and rod from the body of one end; the other end is a joint or a loop."""
         assert slide.cylinder is not None
         name, location = edge.name, slide.location
@@ -334,10 +336,12 @@ class _DrawingTranslation:
         return np.column_stack([direction, normal, np.cross(direction, normal)]), is_planar
 
 
-def _spanning_edges(edges: list[_Edge]) -> tuple[list[_Edge], list[_Edge]]:
+def _spanning_edges(
+    edges: list[_BodyConnection],
+) -> tuple[list[_BodyConnection], list[_BodyConnection]]:
     """Return edges of a spanning tree, earlier ones first, and those that close loops."""
     bodies = DisjointSet(body for edge in edges for body in edge.bodies)
-    tree, loops = list[_Edge](), list[_Edge]()
+    tree, loops = list[_BodyConnection](), list[_BodyConnection]()
     for edge in edges:
         (tree if bodies.merge(*edge.bodies) else loops).append(edge)
     return tree, loops
@@ -347,7 +351,7 @@ def _shifted(inertia: pin.Inertia, y: float) -> pin.Inertia:
     return rigid_inertia(inertia.mass, inertia.lever + [0.0, y, 0.0], inertia.inertia)
 
 
-def _add_bar(link: etree._Element, bar: Bar, origin: Array) -> None:
+def _add_bar(link: etree._Element, bar: BarShape, origin: Array) -> None:
     """Add the shape of a bar to a link at an origin."""
     axis = bar.ends[1] - bar.ends[0]
     length = float(np.linalg.norm(axis))
