@@ -13,9 +13,8 @@ import crane
 # What one word alone may name. A name of several words says more, and needs no list.
 CLASSES = """
 Accumulator Batch Breakout Buckling Calibration Capacity Chain Chart Checkpoint Closure Cluster
-Comparison
-Contact Controller Drawing Coordinates Coupling Cylinder Derivatives Design Dimension Drive Dynamics
-Engine Estimate Excitation Finding Findings Flow Formula Friction Gearbox Gradient Ground
+Comparison Contact Controller Coordinates Coupling Cylinder Derivatives Design Dimension Drawing Drive
+Dynamics Engine Estimate Excitation Finding Findings Flow Formula Friction Gearbox Gradient Ground
 Hydraulics Identification Inertial Jackknife Joint Key Kinematics Layout Limits Link Machine
 Mode Motion Oil Payload Phase Playback Program Reactions Readout Recording Regressor
 Remedy Result Rope Routine Rule Scene Sensitivities Sensor Session Soil Spool Strokes Study
@@ -26,8 +25,8 @@ FILES = """
 attitude batch buckling calibrate charts checkpoint closure clusters command components coordinates
 describe design differentiation drawing dynamics entry errors estimators exchange findings
 identifiability identify integrators kinematics levers linearization logs machine measures
-misfit notebook npz options parsing payload plausibility priors program progress radau rate reactions
-recording regressor result rosenbrock samples scene sensors serialization show simulate
+misfit notebook npz options parsing payload plausibility priors program progress radau rate
+reactions recording regressor result rosenbrock samples scene sensors serialization show simulate
 specification statics strokes sway symbolic terminal threads timeseries trajectory transmission
 trim units unknowns
 """
