@@ -117,8 +117,9 @@ def test_a_payload_that_the_file_lacks_is_a_candidate():
     assert (found.start, found.scale, found.prior) == (210.0, 6.0, 1.0)
     assert "carry 210 kg at the tip, the machine file has payload.mass 0" in weighed.finding(0.0)
     assert weighed.finding(200.0) == "" and StaticPayload(5.0, 6.0).candidates(0.0) == []
-    (known,) = weighed.candidates(150.0)
-    assert (known.start, known.scale) == (150.0, 60.0)
+    (known,) = weighed.candidates(200.0)
+    assert (known.start, known.scale) == (200.0, 10.0)
+    assert weighed.candidates(150.0)[0].start == 210.0  # of statics, not of the file
 
 
 def test_a_load_is_weighed_through_friction():

@@ -168,9 +168,9 @@ def calibrate(
         "recordings": [x.contents for x in cases],
         "settings": (unknowns, extras, automatic),
     }
-    if automatic:
-        problem = CalibrationProblem(machine, [*unknowns, *extras], cases)
-    kept = [x.name for x in unknowns] + [PAYLOAD_MASS] * (not known_mass)
+    problem = CalibrationProblem(machine, [*unknowns, *(extras if automatic else [])], cases)
+    kept = [x.name for x in unknowns]
+    kept += [x.name for x in extras if x.name == PAYLOAD_MASS and x.start != known_mass]
     with open_checkpoint(checkpoint, dependencies, LOG_COLUMNS, 1) as table:
         first = LevenbergMarquardt(problem, progress, SearchLog(table))
         if automatic:

@@ -293,7 +293,8 @@ def _determined(
         kept = [i for i, x in enumerate(parameters) if x.name in kept_names]
         selection = LinearizedSelection(search, z, kept)
         everything = list(range(len(parameters)))
-        worst = selection.dispensable(everything)
+        unmoved = [i for i, x in enumerate(parameters) if x.prior and not z[i] and i not in kept]
+        worst = unmoved[0] if unmoved else selection.dispensable(everything)
         if worst is None:
             return search, z
         rest = [x for x in everything if x != worst]

@@ -50,12 +50,14 @@ class StaticPayload(NamedTuple):
     def candidates(self, known: float) -> list[Unknown]:
         """The payload as a candidate of a calibration, if there is one.
 
+        It starts from statics where the file says otherwise.
+
         Args:
             known: Mass in the machine file [kg], 0 if it has no payload.
         """
-        if known:
-            std = max(self.std, abs(self.mass - known))
+        if known and not self.finding(known):
             low, high = known / _MAX_DEVIATIONS, known * _MAX_DEVIATIONS
+            std = max(self.std, abs(self.mass - known))
             return [Unknown(PAYLOAD_MASS, known, low, high, std, prior=1.0)]
         if self.mass < _MAX_DEVIATIONS * self.std:
             return []
