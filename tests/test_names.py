@@ -13,8 +13,8 @@ import crane
 # What one word alone may name. A name of several words says more, and needs no list.
 CLASSES = """
 Accumulator Batch Breakout Buckling Calibration Capacity Chain Chart Checkpoint Closure Cluster
-Comparison Contact Controller Coordinates Coupling Cylinder Derivatives Design Dimension Drawing Drive
-Dynamics Engine Estimate Excitation Finding Findings Flow Formula Friction Gearbox Gradient Ground
+Comparison Contact Controller Coordinates Coupling Cylinder Derivatives Design Dimension Drawing
+Drive Dynamics Engine Estimate Excitation Finding Findings Flow Formula Friction Gearbox Gradient Ground
 Hydraulics Identification Inertial Jackknife Joint Key Kinematics Layout Limits Link Machine
 Mode Motion Oil Payload Phase Playback Program Reactions Readout Recording Regressor
 Remedy Result Rope Routine Rule Scene Sensitivities Sensor Session Soil Spool Strokes Study
