@@ -15,11 +15,11 @@ CLASSES = """
 Accumulator Batch Breakout Buckling Calibration Capacity Chain Chart Checkpoint Closure Cluster
 Comparison Contact Controller Coordinates Coupling Cylinder Derivatives Design Dimension Drawing
 Drive Dynamics Engine Estimate Excitation Finding Findings Flow Formula Friction Gearbox
-Gradient Ground Hydraulics Identification Inertial Jackknife Joint Key Kinematics Layout Limits Link Machine
-Mode Motion Oil Payload Phase Playback Program Reactions Readout Recording Regressor
-Remedy Result Rope Routine Rule Scene Sensitivities Sensor Session Soil Spool Strokes Study
-Supply Sway Table Tape Task Torques Trajectory Transmission Tree Unknown Valve Visual Workspace
-Wrench _Line _Stream _Subtree
+Gradient Ground Hydraulics Identification Inertial Jackknife Joint Key Kinematics Layout Limits
+Link Machine Mode Motion Oil Payload Phase Playback Program Reactions Readout Recording
+Regressor Remedy Result Rope Routine Rule Scene Sensitivities Sensor Session Soil Spool Strokes
+Study Supply Sway Table Tape Task Torques Trajectory Transmission Tree Unknown Valve Visual
+Workspace Wrench _Line _Stream _Subtree
 """
 FILES = """
 attitude batch buckling calibrate charts checkpoint closure clusters command components coordinates
