@@ -38,6 +38,8 @@ class ScipyIntegrator(StickSlipIntegrator):
         super().__init__(chart, None)
         self._chart, self._closure, self._method = chart, chart.machine.closure, method
 
+    _max_transitions = 200  # each restarts the method
+
     def _advance(
         self,
         first: float,
@@ -112,6 +114,7 @@ class ScipyIntegrator(StickSlipIntegrator):
                 event_state = solver.y
             if event_state is not None:
                 state[:] = event_state
+                self._count_transition(until, state, step)
                 self.python_stepper.close_loops(until, state)
                 self._find_modes(until, state)
                 self.next_instant = self.done
