@@ -6,6 +6,7 @@ import pytest
 import crane
 from crane.common.errors import CraneWarning, InputError, RecordingError
 from crane.control.force_inputs import ForceInputs
+from crane.control.reference_samples import interpolate_references
 from crane.recordings.measured_recordings import read_measured
 from crane.simulation.parameter_schedule import ParameterSchedule
 
@@ -24,7 +25,7 @@ def forces(machine):
     time = np.linspace(0.0, 0.2, 21)
     hold = crane.Dynamics(machine).gravity(machine.home[machine.closure.active])
     ripple = 0.05 * np.sin(40.0 * time)[:, None] * np.abs(hold).max()
-    return ForceInputs(machine, time, hold + ripple * [0.0, 1.0, 1.0])
+    return interpolate_references(ForceInputs(machine), time, hold + ripple * [0.0, 1.0, 1.0])
 
 
 def test_parameters_that_change_give_the_runs_of_two_machines(machine, forces):
@@ -33,7 +34,8 @@ def test_parameters_that_change_give_the_runs_of_two_machines(machine, forces):
     assert run.changes == '[[0.1, {"payload.mass": 0.2, "gravity.x": 0.5}]]'
     first = crane.simulate(machine, forces, duration=0.1, step=STEP)
     np.testing.assert_array_equal(run.q[:11], first.q)
-    later = ForceInputs(machine, np.linspace(0.0, 0.1, 11), run.tau[10:])
+    times = np.linspace(0.0, 0.1, 11)
+    later = interpolate_references(ForceInputs(machine), times, run.tau[10:])
     second = crane.simulate(
         crane.load("mini_forwarder", CHANGED), later, (first.q[-1], first.v[-1]), 0.1, STEP
     )
@@ -64,10 +66,10 @@ def test_a_malformed_schedule_is_refused(text):
 
 
 def test_forces_of_another_shape_are_refused(machine):
-    with pytest.raises(InputError, match="give increasing times"):
-        ForceInputs(machine, [0.0, 1.0], np.zeros((2, 2)))
-    with pytest.raises(InputError, match="give increasing times"):
-        ForceInputs(machine, [1.0, 0.0], np.zeros((2, 3)))
+    with pytest.raises(InputError, match="the references has the shape"):
+        interpolate_references(ForceInputs(machine), [0.0, 1.0], np.zeros((2, 2)))
+    with pytest.raises(InputError, match="at times that increase"):
+        interpolate_references(ForceInputs(machine), [1.0, 0.0], np.zeros((2, 3)))
 
 
 def test_a_missing_force_is_told(machine, tmp_path):

@@ -159,7 +159,7 @@ def test_levers_and_programs_move_the_second_spool_alone(tmp_path):
     run = crane.simulate(machine, program, duration=0.1)
     assert (run.channels["voltage_x"][-1], run.channels["voltage_x_b"][-1]) == (0.3, 2.0)
     short = crane.control.SampledCommand(lambda t, q, v, p: [0.3], machine, period=0.01)
-    with pytest.raises(CraneError, match=r"the signals at t = 0 s .*x_b"):
+    with pytest.raises(CraneError, match=r"the sample at t = 0 s .*x_b"):
         crane.simulate(machine, short, duration=0.1)
 
 

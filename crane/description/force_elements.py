@@ -1,9 +1,11 @@
 """Force elements of a machine: friction, springs, gas springs, ropes and end stops."""
 
+import dataclasses
 from dataclasses import dataclass
 from typing import ClassVar
 
 from crane.common.errors import InputError
+from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import as_number
 
 
@@ -42,8 +44,8 @@ def _check_frames(element: "AnyForceElement") -> None:
         raise InputError(f"the {element_name(element)} needs two frames, give two")
 
 
-@dataclass(frozen=True)
-class Friction:
+@dataclass(frozen=True, repr=False)
+class Friction(OneLineRepr):
     """Friction of one tree joint, asymmetric Coulomb and viscous.
 
     tau = (coulomb + stiction e^-(v / stribeck)^2 + stiction_2 e^-(v / stribeck_2)^2
@@ -93,6 +95,15 @@ class Friction:
     memory: float = 0.0
     memory_time: float = 0.1
     memory_speed: float = 1e-2
+
+    def _one_line(self) -> str:
+        """The values that are not the defaults."""
+        given = [
+            f"{x.name}={value:g}"
+            for x in dataclasses.fields(self)
+            if (value := getattr(self, x.name)) != x.default
+        ]
+        return f"Friction({', '.join(given)})"
 
     def __post_init__(self) -> None:
         scales = ("stribeck", "stribeck_2", "presliding_length", "memory_time", "memory_speed")
