@@ -419,6 +419,7 @@ def test_a_pi_controller_of_another_program_controls_as_that_of_crane(tmp_path):
         tmp_path / "Controller.fmu", machine, {"error1": lambda *at: np.nan}, {"X1": "force1"},
         period, {"kp1": 1.0},
     )  # fmt: skip
+    assert repr(broken).startswith("FmuController(") and len(repr(broken)) <= 200
     with pytest.raises(SimulationError, match="at t = 0 s its outputs are not finite"):
         run(broken)
 
