@@ -226,7 +226,8 @@ def test_a_piston_that_leaves_its_cylinder_ends_the_run(unstopped):
     part = caught.value.recording
     assert part.stopped == str(caught.value) and part["X_lift"][-1] - 0.535 < room
     assert part.time[-1] == pytest.approx(float(told[1]) - 1e-3)
-    np.testing.assert_array_equal(part.q[: len(before.time)], before.q)
+    # the last rows before the event are rounded in another order
+    np.testing.assert_allclose(part.q[: len(before.time)], before.q, rtol=1e-15, atol=1e-15)
     assert room - 0.02 < before["X_lift"][-1] - 0.535 < room
 
 

@@ -24,7 +24,6 @@ from crane.identification.mechanics.identify_payload import identify_payload
 from crane.identification.mechanics.model_terms import (
     InertialTerm,
     body_names,
-    friction_term,
 )
 from crane.identification.mechanics.write_identified import divide_locked_bodies
 from crane.identification.signals.signal_processing import Motion
@@ -218,16 +217,6 @@ def test_what_cannot_be_written(mini, found, tmp_path):
         ),
         (dataclasses.replace(found, parameters=bodies), "the identified machine is not valid: "),
         (identify(mini, motion(mini), feasible=True, terms=spring), "the model has 'q1.spring'"),
-        (
-            identify(
-                mini, motion(mini), feasible=True,
-                terms=[
-                    InertialTerm(mini), friction_term(mini, "q1"), friction_term(mini, "X2"),
-                    friction_term(mini, "X1", smoothing=0.01),
-                ],
-            ),
-            "the model has friction over other velocities than the machine's",
-        ),
     ):  # fmt: skip
         with pytest.raises(InputError) as caught:
             crane.identification.write_identified(result, tmp_path / "out")
