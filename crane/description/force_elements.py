@@ -48,11 +48,11 @@ def _check_frames(element: "AnyForceElement") -> None:
 class Friction(OneLineRepr):
     """Friction of one tree joint, asymmetric Coulomb and viscous.
 
-    tau = (coulomb + stiction e^-(v / stribeck)^2 + stiction_2 e^-(v / stribeck_2)^2
-           + memory e^-(w / memory_speed)) sign(v) + presliding z + coulomb_offset
-          + viscous v + viscous_offset |v| + root sign(v) |v|^(1/2),
+        tau = (coulomb + stiction e^-(v / stribeck)^2 + stiction_2 e^-(v / stribeck_2)^2
+        + memory e^-(w / memory_speed)) sign(v) + presliding z + coulomb_offset
+        + viscous v + viscous_offset |v| + root sign(v) |v|^(1/2)
 
-    the joint's drive force that the friction consumes. It depends on the history of the motion by
+    is the joint's drive force that the friction consumes. It depends on the history of the motion by
     Dahl's deflection z of the contacts, dz = (1 - sign(v) z) dq / presliding_length, and by the
     speed that the contact remembers, memory_time w' = |v| - w. At steady speeds z is sign(v) and w
     is |v|: so a simulation takes them, and `Dynamics.inverse` with the step of a motion takes its
