@@ -52,8 +52,8 @@ class Friction(OneLineRepr):
         + memory e^-(w / memory_speed)) sign(v) + presliding z + coulomb_offset
         + viscous v + viscous_offset |v| + root sign(v) |v|^(1/2)
 
-    is the joint's drive force that the friction consumes. It depends on the history of the motion by
-    Dahl's deflection z of the contacts, dz = (1 - sign(v) z) dq / presliding_length, and by the
+    is the joint's drive force that the friction consumes. It depends on the history of the motion
+    by Dahl's deflection z of the contacts, dz = (1 - sign(v) z) dq / presliding_length, and by the
     speed that the contact remembers, memory_time w' = |v| - w. At steady speeds z is sign(v) and w
     is |v|: so a simulation takes them, and `Dynamics.inverse` with the step of a motion takes its
     history. At rest friction is what keeps the joint there, at most `breakaway_force` from
