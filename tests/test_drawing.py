@@ -327,6 +327,8 @@ def test_a_platform_on_six_legs_by_ball_joints(tmp_path):
         (("bore: 0.14, rod", "stroke: 0.14, rod"), "unknown key 'stroke' in cylinder 'X_tilt'"),
         (("mass: 150", "mass: -150"), "'mass' of body 'bellcrank' is -150, give at least 0"),
         (("tip: edge", "tip: egde"), "'egde' is unknown, did you mean"),
+        (("H: [2.3, 1.0]", "H: [1.5, 1.0]"), "a tube of body 'link' has no length, name other"),
+        (("tip: edge", "  pins: {D: {axis: w}}\ntip: edge"), "'axis' of pin 'D': 'w' is unknown"),
     ],
 )  # fmt: skip
 def test_errors_are_in_terms_of_the_drawing(loaded, changes, message):

@@ -57,7 +57,8 @@ def test_the_squeezer_ends_where_the_test_set_for_ivp_solvers_says():
                               ("flyball_governor", 1e-11), ("stewart_platform", 1e-12),
                               ("cassie_leg", 1e-12), ("grbda_chains", 1e-11),
                               ("grbda_tree", 1e-11),
-                              ("slider_crank", 1e-9), ("n_four_bar_2", 5e-8),  # amplified
+                              # rounding, which processors do differently, grows at change points
+                              ("slider_crank", 1e-9), ("n_four_bar_2", 5e-8),
                               ("n_four_bar_40", 2e-6))),
     ],
 )  # fmt: skip

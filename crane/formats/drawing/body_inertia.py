@@ -115,5 +115,6 @@ def inertia_from_moments(mass: float, centre: Array, second_moments: Array) -> p
 def rigid_inertia(mass: float, centre: Array, tensor: Array) -> pin.Inertia:
     """Return an inertia without a check, which the reader of links makes with names."""
     found = pin.Inertia(float(mass), np.asarray(centre, dtype=np.float64), np.zeros((3, 3)))
-    found.inertia = tensor
+    if np.isfinite(tensor).all():  # else a number has been refused
+        found.inertia = (tensor + tensor.T) / 2
     return found

@@ -316,6 +316,8 @@ class _DrawingReader:
     def _read_tubes(self, item: YamlSection) -> Iterator[tuple[list[BarShape], pin.Inertia]]:
         for tube in item.list_items("tubes", f"a tube of {item.title}"):
             ends = self._coordinates(self._point_names(tube, "points"))
+            if not np.ptp(ends, axis=0).any():
+                raise tube.error_at("points", f"{tube.title} has no length, name other points")
             values: dict[str, Any] = {
                 "width": None,
                 "wall": None,
@@ -378,6 +380,8 @@ def _read_tensor(item: YamlSection) -> Array:
 def _read_pin(item: YamlSection) -> DrawnPin:
     values = item.values()
     axis, is_driven = values.pop("axis", "y"), values.pop("driven", False)
+    if axis not in (*_AXES, "ball"):
+        raise FollowUpError("the axis has been refused")
     direction = None if axis == "ball" else np.array(_AXES[axis])
     if direction is None and (values or is_driven):
         raise item.error_at(
