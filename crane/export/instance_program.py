@@ -21,7 +21,6 @@ from crane.codegen import (
     SymbolicExpression,
 )
 from crane.codegen.differentiation import directional_derivative
-from crane.codegen.linked_functions import LinkedFunction
 from crane.codegen.vector_layout import Formula
 from crane.common.errors import CraneWarning, InputError
 from crane.common.samples import Array
@@ -38,6 +37,7 @@ from crane.export.instance_routines import INNER_ROUTINES, InstanceRoutines
 from crane.export.kinematics_program import (
     SINGLE_PRECISION_BOUNDS,
     Linked,
+    LinkedProgram,
     check_formulas,
     joined_program,
     link_entries,
@@ -107,7 +107,7 @@ def _exported_control(
     return control
 
 
-class InstanceProgram:
+class InstanceProgram(LinkedProgram):
     """A machine with its drives as one program.
 
     The inputs are the forces of the drives [N], [N m], or the signals at the valves [V] of a
@@ -311,16 +311,6 @@ class InstanceProgram:
     def output_count(self) -> int:
         """Elements of an instance that `update_outputs` writes."""
         return sum(self.chart.output_layout.parts.values())
-
-    @property
-    def entries(self) -> dict[str, LinkedFunction]:
-        """Routines by name; each takes an instance, and further arrays."""
-        return self._linked[0]
-
-    @property
-    def functions(self) -> list[LinkedFunction]:
-        """All linked functions, each after what it calls."""
-        return self._linked[1]
 
 
 def _controlled_chart(machine: Machine, controller: Controller | ValveCommand | None) -> Chart:

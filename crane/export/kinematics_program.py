@@ -1,5 +1,6 @@
 """The kinematics of a machine as one program for any target: loops and gamma."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
 
@@ -19,7 +20,26 @@ SINGLE_PRECISION_BOUNDS = np.array([1e9, 1e8, 1e6])
 Linked = tuple[dict[str, LinkedFunction], list[LinkedFunction]]
 
 
-class KinematicsProgram:
+class LinkedProgram(ABC):
+    """A program whose routines are linked with all that they call."""
+
+    @property
+    @abstractmethod
+    def _linked(self) -> Linked:
+        """Routines, and all functions."""
+
+    @property
+    def entries(self) -> dict[str, LinkedFunction]:
+        """Routines by name; each takes an instance, and further arrays."""
+        return self._linked[0]
+
+    @property
+    def functions(self) -> list[LinkedFunction]:
+        """All linked functions, each after what it calls."""
+        return self._linked[1]
+
+
+class KinematicsProgram(LinkedProgram):
     """The closed loops of a machine as one program, see `crane.export.InstanceProgram`.
 
     Args:
@@ -63,16 +83,6 @@ class KinematicsProgram:
         known = {*own.functions}
         KinematicsRoutines(self.layout, self._closure).add_kinematics(own)
         return link_entries(parts, own, known, self._closure)
-
-    @property
-    def entries(self) -> dict[str, LinkedFunction]:
-        """Routines by name; each takes an instance, and further arrays."""
-        return self._linked[0]
-
-    @property
-    def functions(self) -> list[LinkedFunction]:
-        """All linked functions, each after what it calls."""
-        return self._linked[1]
 
 
 class KinematicsRoutines:

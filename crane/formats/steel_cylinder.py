@@ -11,9 +11,10 @@ from lxml import etree
 from crane.common.errors import InputError, warn
 from crane.common.plausible_ranges import LONGEST, implausible_value_text, suggested_units_text
 from crane.common.samples import as_number
+from crane.description.drawing_schema import STEEL_DENSITY
+from crane.formats.drawing.body_inertia import tube_inertia
 from crane.formats.xml_file import add_origin, format_numbers
 
-STEEL_DENSITY = 7850.0  # [kg/m3]
 RELIEF_PRESSURE = 35e6  # [Pa] usual in mobile machines; determines the effort of the joint
 _WALL_SHARE = 0.1  # of the bore: at 35 MPa the stress in the tube is 35 / 0.2 MPa
 
@@ -91,9 +92,9 @@ class SteelCylinder:
         """Inertia of tube, cap and gland; x points from the barrel's eye to the rod's."""
         barrel_end, part = self.retracted_length - self.part_length, self.part_length
         return sum_inertias(
-            tube_inertia(0, barrel_end, self.bore, (1 + 2 * _WALL_SHARE) * self.bore),
-            tube_inertia(0, part, 0, self.bore),
-            tube_inertia(barrel_end - part, barrel_end, self.rod, self.bore),
+            _round_inertia(0, barrel_end, self.bore, (1 + 2 * _WALL_SHARE) * self.bore),
+            _round_inertia(0, part, 0, self.bore),
+            _round_inertia(barrel_end - part, barrel_end, self.rod, self.bore),
         )
 
     @property
@@ -101,8 +102,8 @@ class SteelCylinder:
         """Inertia of rod and piston in the rod's eye, with x as for the barrel."""
         back = 2 * self.part_length - self.retracted_length
         return sum_inertias(
-            tube_inertia(back, 0, 0, self.rod),
-            tube_inertia(back - self.part_length, back, 0, self.bore),
+            _round_inertia(back, 0, 0, self.rod),
+            _round_inertia(back - self.part_length, back, 0, self.bore),
         )
 
 
@@ -111,16 +112,10 @@ def sum_inertias(*inertias: pin.Inertia) -> pin.Inertia:
     return sum(inertias[1:], start=inertias[0])
 
 
-def tube_inertia(start: float, end: float, inner: float, outer: float) -> pin.Inertia:
-    """Return the inertia of a tube along x with two diameters [m]."""
-    length, squares = end - start, (inner**2 + outer**2) / 4
-    mass = STEEL_DENSITY * math.pi / 4 * (outer**2 - inner**2) * length
-    transverse_moment = mass * (3 * squares + length**2) / 12
-    return pin.Inertia(
-        mass,
-        np.array([(start + end) / 2, 0, 0]),
-        np.diag([mass * squares / 2, transverse_moment, transverse_moment]),
-    )
+def _round_inertia(start: float, end: float, inner: float, outer: float) -> pin.Inertia:
+    """Return the inertia of a round tube along x with two diameters [m]."""
+    ends = np.array([[start, 0.0, 0.0], [end, 0.0, 0.0]])
+    return tube_inertia(ends, outer, None, (outer - inner) / 2, STEEL_DENSITY)
 
 
 def add_cylinder_visuals(

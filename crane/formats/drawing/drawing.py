@@ -9,6 +9,7 @@ import pinocchio as pin
 
 from crane.common.errors import DescriptionError, suggest_names, warn
 from crane.common.samples import Array
+from crane.description.drawing_schema import STEEL_DENSITY
 from crane.description.findings import FollowUpError, error_recovery
 from crane.description.kinematic_tree import Limits
 from crane.formats.drawing.body_inertia import (
@@ -20,7 +21,7 @@ from crane.formats.drawing.body_inertia import (
     tube_inertia,
 )
 from crane.formats.machine_file.yaml_section import YamlSection
-from crane.formats.steel_cylinder import STEEL_DENSITY, SteelCylinder, sum_inertias
+from crane.formats.steel_cylinder import SteelCylinder, sum_inertias
 
 # Of a body without mass: times the section of the largest pistons that act on it, over its length.
 # Boom and arm of the bundled excavator have 1.6 and 1.9, the lift boom of the log crane 0.8.
