@@ -141,8 +141,10 @@ def variables_read(routine: Routine) -> set[str]:
 
 def _variables_in(value: RoutineValue | ArrayPointer | int) -> Iterator[str]:
     if isinstance(value, ArrayPointer):
-        yield from _variables_in(value.offset)
-    elif isinstance(value, RoutineValue) and value.operation == "variable":
+        value = value.offset
+    if not isinstance(value, RoutineValue) or value.operation in ("constant", "argument"):
+        return
+    if value.operation == "variable":
         yield value.operands[0]
-    elif isinstance(value, RoutineValue) and value.operation not in ("constant", "argument"):
+    else:
         yield from (name for x in value.operands for name in _variables_in(x))

@@ -188,9 +188,8 @@ def lu_factorize(matrix: Sequence[Sequence[Scalar]]) -> Matrix:
     for k in range(len(rows)):
         inverse = 1.0 / rows[k][k]
         rows[k][k] = inverse
-        for row in rows[k + 1 :]:
-            if not isinstance(row[k], SymbolicExpression) and row[k] == 0:
-                continue
+        below = (x for x in rows[k + 1 :] if isinstance(x[k], SymbolicExpression) or x[k] != 0)
+        for row in below:
             row[k] = factor = row[k] * inverse
             row[k + 1 :] = [
                 entry - factor * pivot

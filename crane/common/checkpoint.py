@@ -120,10 +120,11 @@ class Checkpoint:
     def __exit__(self, kind: type | None, error: BaseException | None, _: object) -> None:
         would_repeat = isinstance(error, CraneError) and not isinstance(error, _PASSING_ERRORS)
         with self._file, suppress(OSError):  # or something else is in a folder
-            if would_repeat or not self._has_rows:
-                self._path.unlink()
-                for folder in self._missing_folders:
-                    folder.rmdir()
+            if self._has_rows and not would_repeat:
+                return
+            self._path.unlink()
+            for folder in self._missing_folders:
+                folder.rmdir()
 
 
 class NoCheckpoint(Checkpoint):

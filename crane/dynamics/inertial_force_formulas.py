@@ -61,9 +61,8 @@ class InertialForceFormulas(JointForceFormulas):
             xx, xy, xz, yy, yz, zz = rest[3:]
             half = matmul(rotation, [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
             tensor: list[Vector] = [[0.0] * 3 for _ in range(3)]
-            for r in range(3):
-                for c in range(r + 1):
-                    tensor[r][c] = tensor[c][r] = dot(half[r], rotation[c])
+            for r, c in ((i, j) for i in range(3) for j in range(i + 1)):
+                tensor[r][c] = tensor[c][r] = dot(half[r], rotation[c])
             out.append((mass, matvec(rotation, rest[:3]), tensor))
         return out
 
