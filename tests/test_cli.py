@@ -241,8 +241,8 @@ def test_without_a_command_the_help_is_shown():
 def test_an_option_has_one_text_in_all_commands():
     """But for those whose meaning depends on the command."""
     own = {
-        "--controller", "--drive", "--duration", "--method", "--name", "--out", "--period",
-        "--step", "--task", "--to", "--vary",
+        "--at", "--controller", "--drive", "--duration", "--method", "--name", "--out", "--over",
+        "--period", "--step", "--task", "--to", "--vary",
     }  # fmt: skip
     texts = {}
     for name, command in walked(typer.main.get_command(entry.program())):

@@ -194,6 +194,7 @@ def results(mini, run):
     yield crane.workspace(mini, 100)
     yield crane.identify(mini, run, prior=0.3)
     yield crane.capacity(patu, step=1.0)
+    yield crane.ratings.lift_chart(patu, ["X_lift"])
     yield crane.ratings.torques(patu, radius=5.0)
     yield crane.ratings.breakout(digger)
     yield crane.working_range(digger)
@@ -322,8 +323,8 @@ WITH_FIGURES = {
 # Those that take seconds: `results`, and tests of what makes them.
 RESULTS = {
     "Breakout", "Capacity", "Comparison", "Design", "Excitation", "Gradient", "Identification",
-    "LinearModel", "PowerBalance", "PowerComparison", "Sensitivities", "SignalExcitation",
-    "Study", "ToolForce", "WorkingRange", "Workspace",
+    "LiftChart", "LinearModel", "PowerBalance", "PowerComparison", "Sensitivities",
+    "SignalExcitation", "Study", "ToolForce", "WorkingRange", "Workspace",
 }  # fmt: skip
 
 

@@ -139,6 +139,11 @@ CASES = {
         {},
         "study.csv study.png",
     ),
+    "LiftChart": (
+        lambda _: crane.ratings.lift_chart(crane.load("patu655"), ["X_lift"]),
+        {},
+        "lift_chart.md lift_chart.csv lift_chart.png",
+    ),
     "ToolForce": (
         lambda _: crane.ratings.tool_force(crane.load("patu655"), "up", step=2.0),
         {},

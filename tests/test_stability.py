@@ -143,7 +143,7 @@ def test_wrong_supports_are_told(folder):
     for given, match in (
         ("[foot0, foot1]", "2 supports make no area, name three or more"),
         ("[foot0, foot1, foott]", "the support 'foott' is unknown, did you mean"),
-        ("[foot0, foot1, tip]", "support 'tip' moves, name links of the base"),
+        ("[foot0, foot1, tip]", "support 'tip' is lifted by 'q2', name links of the base"),
         ("[foot0, foot1, foot1]", "lists 'foot1' twice"),
     ):
         path.write_text(text.replace("[foot0, foot1, foot2, foot3]", given))

@@ -77,7 +77,11 @@ Configuration = Annotated[
 ]
 Rule = Annotated[
     str,
-    typer.Option(metavar="RULE", help="Rule of the ratings: none, iso10567, en12999 or sfs4677."),
+    typer.Option(
+        metavar="RULE",
+        help="Rule of the ratings: none, iso10567, en12999, sfs4677, or iso14397 (also -crawler, "
+        "-forks, -rough).",
+    ),
 ]
 Outputs = Annotated[
     str | None,

@@ -25,12 +25,21 @@ from crane.cli.options import (
     Seed,
     Task,
 )
-from crane.cli.parsing import parse_numbers, parse_slew_angles
+from crane.cli.parsing import joint_units, parse_configuration, parse_numbers, parse_slew_angles
 from crane.cli.show import active_coordinates
 from crane.cli.terminal import status
 from crane.common.errors import CraneWarning, InputError
 from crane.common.result import Result
 
+Posture = Annotated[
+    str | None,
+    typer.Option(
+        "--at",
+        metavar="NAME=VALUE,...",
+        help="Posture: active coordinates in m or rad, angle=VALUE of the frame's x axis above "
+        "the horizontal, its height=VALUE; e.g. X_tilt=0.4, or angle=-45deg.",
+    ),
+]
 ChartStep = Annotated[float | None, number_option("m", "Grid spacing in m.", "--step")]
 
 
@@ -90,11 +99,14 @@ def breakout(
         ),
     ] = None,
     step: ChartStep = None,
+    at: Posture = None,
 ) -> None:
     """Compute break-out forces (ISO 6015) or tool forces."""
-    if direction is None and step is not None:
+    if at is not None:
+        refuse_options({"--step": step}, "is for the reach, leave out --at")
+    elif direction is None and step is not None:
         raise InputError("--step is for the reach, add --direction")
-    if direction is not None and arm is not None:
+    if direction is not None and arm is not None and at is None:
         raise InputError("--arm is for break-out forces, leave it out with --direction")
     loaded = options.load(machine)
     vector: str | list[float] | None = direction
@@ -103,8 +115,12 @@ def breakout(
         vector = parse_numbers(direction.split(","), message, ("",))
     result: Result
     with status("computing forces"):
-        if vector is None:
-            result = crane.ratings.breakout(loaded, frame, bucket=bucket, arm=arm, weights=weights)
+        if vector is None or at is not None:
+            result = crane.ratings.breakout(
+                loaded, frame, bucket=bucket, arm=arm, weights=weights,
+                direction=vector or "tangent",
+                at=None if at is None else parse_configuration("--at", at, joint_units(loaded)),
+            )  # fmt: skip
         else:
             result = crane.ratings.tool_force(
                 loaded, vector, frame, joint=bucket, weights=weights, step=step
@@ -193,9 +209,23 @@ def capacity(
         ),
     ] = None,
     by: OptionalParameters = None,
+    over: Annotated[
+        str | None,
+        typer.Option(
+            metavar="JOINT,...",
+            help="Chart the loads over one stroke (lift curve) or two instead of the reach; the "
+            "others stay at --at. By default where one stroke is left.",
+        ),
+    ] = None,
+    at: Posture = None,
+    zones: Annotated[
+        str | None,
+        typer.Option(metavar="KG,...", help="Loads of zones over two strokes; default: round."),
+    ] = None,
 ) -> None:
     """Compute rated loads over the reach (load chart)."""
     from crane.dynamics.tipping_stability import has_supports
+    from crane.ratings.strokes import Strokes
 
     conditions = rating.arguments()
     loaded, tipping_share = options.load(machine), conditions["rule"].tipping
@@ -207,6 +237,22 @@ def capacity(
             CraneWarning,
             stacklevel=2,
         )
+    if over is None and at is None and len(Strokes(loaded, frame).moving) != 1:
+        refuse_options({"--zones": zones}, "are over two strokes, name them with --over")
+    else:
+        refuse_options(
+            {"--step": step, "--torque": torque, "--by": by}, "is for the reach, not over strokes"
+        )
+        loads = None if zones is None else parse_numbers(
+            zones.split(","), f"--zones {zones} are no loads, give numbers in kg", ("kg",)
+        )  # fmt: skip
+        with status("rating"):
+            lift = crane.ratings.lift_chart(
+                loaded, None if over is None else over.split(","), frame,
+                at=parse_configuration("--at", at, joint_units(loaded)), zones=loads, **conditions,
+            )  # fmt: skip
+        output.write(lift)
+        return
     with status("rating"):
         chart, lifting = crane.capacity(loaded, frame, step=step, **conditions), None
         if torque is not None:

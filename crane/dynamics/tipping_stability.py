@@ -16,6 +16,8 @@ from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.machine.machine import Machine
 
 _NEGATIVE_LOAD_TOLERANCE = -1e-9  # force over weight of an unloaded support
+_LEVEL_TOLERANCE = 1e-9  # vertical rate of a support that stays on the ground [m/m], [m/rad]
+_OUTLINE_TOLERANCE = 1e-9  # share of the largest area by which a support may be outside of a line
 
 
 class TippingMargins(NamedTuple):
@@ -54,6 +56,9 @@ class TippingStability:
 
     with external wrenches F, M_F. For a machine on contacts they are the contact forces.
 
+    Supports may be on bodies that joints move along the ground, as the front wheels of a loader
+    with an articulated frame: the lines then go through the places where they stand.
+
     Args:
         machine: With `supports`, or at least three contacts.
 
@@ -61,7 +66,7 @@ class TippingStability:
         support_names: Names of the supports.
         line_names: Names of the two supports of each line.
         line_indices: Indices of the two supports of each line.
-        is_stationary: Whether no support moves.
+        is_stationary: Whether its base is fixed to the world; otherwise it stands on contacts.
         mass: Mass of the machine [kg].
 
     Raises:
@@ -83,10 +88,13 @@ class TippingStability:
             if isinstance(force, Contact)
             and (not machine.supports or force.frame in self._support_links)
         ]
-        self.is_stationary = all(
-            not machine.model.frames[machine.frame(x)].parentJoint for x in self._support_links
-        )
-        if not self.is_stationary and len(self._support_contacts) < len(self._support_links):
+        self._moves = bool(self.support_rates().any())
+        contacts = {machine.external_forces[k].frame for k in self._support_contacts}
+        self.is_stationary = not self._moves or not contacts
+        leaves_ground = np.abs(self.support_rates()[:, 2]).max(initial=0.0) > _LEVEL_TOLERANCE
+        if (leaves_ground or not self.is_stationary) and len(self._support_contacts) < len(
+            self._support_links
+        ):
             raise InputError(f"'{machine.name}' has supports that move without being contacts")
         from scipy.spatial import ConvexHull, QhullError  # slow to import
 
@@ -137,7 +145,7 @@ class TippingStability:
         if link is None:
             raise InputError(f"'{machine.name}' has no tip, name the frame that a load hangs from")
         q = np.atleast_2d(machine.closure.solve(q_a))
-        moments = self.tipping_margins(q, self.ground_wrench(q)).moments
+        moments = self.static_margins(q_a).moments
         hanging = self._frame_jacobians.frame_origins(q, [link])[:, 0]
         levers = self._moments_about_lines(
             self.support_positions(q),
@@ -207,6 +215,9 @@ class TippingStability:
         Args:
             q: (N, nv) closed configurations.
             ground_wrench: (N, 6) see `ground_wrench`.
+
+        Raises:
+            InputError: Supports moved so far that their outline has other corners than at home.
         """
         points = self.support_positions(q)
         weight = self.mass * float(np.linalg.norm(self._gravity))
@@ -216,6 +227,11 @@ class TippingStability:
         across = points[:, None, :, :2] - points[:, first, None, :2]  # (N, k, s, 2)
         area = lines[..., 0] * across[..., 1] - lines[..., 1] * across[..., 0]
         distances = np.abs(area).max(axis=2) / np.linalg.norm(lines[:, :, 0], axis=2)
+        if self._moves and self.is_stationary and area.min() < -_OUTLINE_TOLERANCE * area.max():
+            raise InputError(
+                f"the outline of the supports of '{self.machine.name}' has other corners here "
+                "than at home: name under 'supports' those that are its corners in both"
+            )
         return TippingMargins(moments, moments / (weight * distances))
 
     def support_forces(self, q: Array, ground_wrench: Array) -> Array:
@@ -239,9 +255,17 @@ class TippingStability:
     def support_positions(self, q: Array) -> Array:
         """(N, s, 3) positions of the supports."""
         found = self._frame_jacobians.frame_origins(
-            q[:1] if self.is_stationary else q, self._support_links
+            q if self._moves else q[:1], self._support_links
         )
         return np.broadcast_to(found, (len(q), *found.shape[1:]))
+
+    def support_rates(self) -> Array:
+        """(s, 3, n) derivatives of the supports' positions by the active joints, at home."""
+        machine, frames = self.machine, self._frame_jacobians
+        frames.set_configuration(machine.home)
+        gamma = machine.closure.gamma(machine.home)
+        rates = [frames.jacobian(link)[:3] @ gamma for link in self._support_links]
+        return np.array(rates).reshape(-1, 3, gamma.shape[1])
 
     def _moments_about_lines(self, points: Array, wrench: Array) -> Array:
         """(N, k) moments of wrenches (N, 6) about the lines."""

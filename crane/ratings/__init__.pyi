@@ -1,5 +1,7 @@
 from .breakout_forces import Breakout as Breakout
 from .breakout_forces import breakout as breakout
+from .lift_charts import LiftChart as LiftChart
+from .lift_charts import lift_chart as lift_chart
 from .lifting_capacity import Capacity as Capacity
 from .lifting_capacity import Torques as Torques
 from .lifting_capacity import capacity as capacity

@@ -1,5 +1,6 @@
 """Break-out forces of bucket and arm (ISO 6015, SAE J1179)."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -13,10 +14,11 @@ from crane.common.samples import Array
 from crane.common.units import format_quantity
 from crane.dynamics.statics import StaticQuantities
 from crane.machine.machine import Machine
-from crane.motion.workspaces.workspace_patch import fill_patch, last_closed_configuration
+from crane.motion.workspaces.workspace_patch import last_closed_configuration
 from crane.motion.workspaces.workspace_section import WorkspaceSection
 from crane.ratings.drive_force_limits import drive_force_limits
 from crane.ratings.limiting_factors import LimitingFactor, LoadLimits
+from crane.ratings.posture_search import PostureSearch
 from crane.ratings.rating_rules import find_rule
 from crane.ratings.strokes import (
     TOGGLE_DISTANCE,
@@ -27,7 +29,7 @@ from crane.ratings.strokes import (
     find_toggle,
     instantaneous_rotation,
 )
-from crane.ratings.tool_forces import tangent_action
+from crane.ratings.tool_forces import direction_action, direction_text
 
 _DIGGING_STROKE_VALUES = 81  # values of the stroke that digs in the grid of starts
 _OTHER_STROKE_VALUES = 9  # values of another stroke in this grid
@@ -82,6 +84,8 @@ class Breakout(Result):
         frame: Link that digs.
         section: Section in which it digs.
         with_weight: Whether weight and tipping are included.
+        direction: Direction of the force.
+        at: Posture of the forces; None for that of the largest ones.
         bucket: Force of the bucket's drive.
         arm: Force of the arm's drive; None if there is no arm.
     """
@@ -90,6 +94,8 @@ class Breakout(Result):
     frame: str
     section: WorkspaceSection
     with_weight: bool
+    direction: str
+    at: Mapping[str, float] | None
     bucket: BreakoutForce
     arm: BreakoutForce | None
 
@@ -103,10 +109,14 @@ class Breakout(Result):
     def to_markdown(self) -> str:
         """Return a table of forces, levers, configurations and limiting factors."""
         weight_text = f"weight and tipping {'included' if self.with_weight else 'left out'}"
+        path_text = self.direction
+        if path_text == "tangent":
+            path_text = "along its path when the drive moves alone"
+        alone_text = "with the drive's best lever" if self.at is None else "at this posture"
         lines = [
             f"# Break-out forces of {self.machine.name}\n",
-            f"At `{self.frame}`, along its path when the drive moves alone, without friction. "
-            "Alone: with the drive's best lever, if everything else held. At home: with the lever "
+            f"At `{self.frame}`, {path_text}, without friction. "
+            f"Alone: {alone_text}, if everything else held. At home: with the lever "
             f"at home. Force: {weight_text}, other circuits hold at their relief valves.\n",
             "| | drive | turns about | radius [m] | alone [kN] | at | at home [kN] | force [kN] | "
             "limited by | at |",
@@ -160,6 +170,8 @@ def breakout(
     bucket: str | None = None,
     arm: str | None = None,
     weights: bool = False,
+    direction: str | Sequence[float] = "tangent",
+    at: Mapping[str, float] | None = None,
 ) -> Breakout:
     """Compute the largest forces of bucket and arm at the lip, tangent to its path.
 
@@ -174,6 +186,10 @@ def breakout(
     force is computed with the bucket at the stroke of its own best lever. All forces are optima
     within the limits of the strokes. ISO measures at the lip, SAE at the tip of the teeth; choose
     the frame accordingly.
+
+    By ISO 14397-2 and SAE J732 the force of a loader is vertical, 100 mm behind the edge of the
+    level bucket on the ground, by either cylinder: direction "up" at a frame there, at the posture
+    {"angle": 0.0, "height": 0.0}; with weights also as far as the machine does not tip.
 
     The path is a circle about the pivot if the stroke turns one pin only. If it turns several, as
     for the boom of a loader whose tilt cylinder stands on the frame, it is a circle about the
@@ -191,32 +207,38 @@ def breakout(
         arm: Joint whose drive turns the arm; by default the one before the bucket's.
         weights: Whether the machine has weight, which its drives hold and which keeps it from
             tipping: all limits of the configuration, with the slewing joint at home.
+        direction: Direction of the force, see `tool_force`.
+        at: Posture of all forces, see `PostureSearch`; by default the best one of each.
 
     Raises:
-        InputError: No joint moves a bucket, a frame or joint is unknown, or nothing limits a
-            force.
+        InputError: There is no such posture or direction, no joint moves a bucket, a frame or
+            joint is unknown, or nothing limits a force.
     """
     strokes = Strokes(machine, frame)
     bucket_stroke, arm_stroke = bucket_and_arm_strokes(strokes, bucket, arm)
-    held_coordinates = machine.home[machine.closure.active].copy()
+    start, moving = machine.home, strokes.moving
+    if at is not None:
+        start, moving = PostureSearch(strokes, at).configuration(), []
+    held_coordinates = start[machine.closure.active].copy()
     bucket_force, lever = _largest_breakout_force(
-        strokes, bucket_stroke, (held_coordinates, machine.home), strokes.moving, weights
+        strokes, bucket_stroke, (held_coordinates, start), moving, weights, direction
     )
     arm_force = None
     if arm_stroke is not None:
-        start = machine.home
-        if np.isfinite(bucket_force.isolated_force):
+        if np.isfinite(bucket_force.isolated_force) and moving:
             held_coordinates[bucket_stroke], start = bucket_force.stroke, lever
         arm_force, _ = _largest_breakout_force(
             strokes,
             arm_stroke,
             (held_coordinates, start),
-            [i for i in strokes.moving if i != bucket_stroke],
+            [i for i in moving if i != bucket_stroke],
             weights,
+            direction,
         )
     return Breakout(
-        machine, strokes.statics.frame, strokes.section, weights, bucket_force, arm_force
-    )
+        machine, strokes.statics.frame, strokes.section, weights, direction_text(direction), at,
+        bucket_force, arm_force,
+    )  # fmt: skip
 
 
 def _largest_breakout_force(
@@ -225,6 +247,7 @@ def _largest_breakout_force(
     held: tuple[Array, Array],
     moved: list[int],
     with_weight: bool,
+    direction: str | Sequence[float],
 ) -> tuple[BreakoutForce, Array]:
     """Return the force of the drive of one stroke, and the configuration (nq,) of its best lever.
 
@@ -233,11 +256,14 @@ def _largest_breakout_force(
         stroke_index: Index of the stroke among the active joints.
         held: Active coordinates (n,) of the strokes that are held, and a closed configuration
             (nq,) to start from.
-        moved: Indices of the strokes that move.
+        moved: Indices of the strokes that move; none for the posture to start from.
         with_weight: Whether weight is included.
+        direction: Direction of the force, see `tool_force`.
     """
     machine, frame, active = strokes.machine, strokes.statics.frame, strokes.machine.closure.active
-    joint, action = machine.active[stroke_index], tangent_action(strokes, stroke_index)
+    joint = machine.active[stroke_index]
+    is_path = isinstance(direction, str) and direction.endswith(("tangent", "normal"))
+    action = direction_action(strokes, direction, joint if is_path else None)[0]
     rule, drives = find_rule("none"), drive_force_limits(machine, [joint])
     own_limits = LoadLimits(
         strokes.statics, [x for x in drives if x.joint == joint], rule, action, with_weight=False
@@ -300,26 +326,23 @@ def _start_configurations(
 ) -> tuple[Array, Array]:
     """Return closed configurations (N, nq) over stroke i alone, and over it and each other one."""
     machine, (base, start) = strokes.machine, held
-    low, high = strokes.low, strokes.high
-    values = np.linspace(low[i], high[i], _DIGGING_STROKE_VALUES)
-    own, pairs = [], []
-    others = [k for k in moved if k != i]
-    if not others:
-        patch = fill_patch(machine, base, (i, i), (values, base[[i]]), start)
-        if patch is not None:
-            own = pairs = [patch.configurations[patch.is_closed]]
-    for k in others:
-        other_values = np.r_[base[k], np.linspace(low[k], high[k], _OTHER_STROKE_VALUES)]
-        order = np.argsort(other_values)
-        patch = fill_patch(machine, base, (i, k), (values, other_values[order]), start)
-        if patch is None:
-            continue
-        pairs.append(patch.configurations[patch.is_closed])
-        row = int(np.flatnonzero(order == 0)[0])
-        own.append(patch.configurations[patch.is_closed[:, row], row])
-    if not pairs:
+    if not moved:
+        return start[None], start[None]
+    counts = {k: _OTHER_STROKE_VALUES for k in moved} | {i: _DIGGING_STROKE_VALUES}
+
+    def grid(*swept: int) -> Array:
+        names = [machine.active[k] for k in swept]
+        at = {x: base[k] for k, x in enumerate(machine.active) if x not in names}
+        axes = [np.linspace(strokes.low[k], strokes.high[k], counts[k]) for k in swept]
+        values = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, len(swept))
+        q, is_found = PostureSearch(strokes, at, names).configurations(values, start)
+        return q[is_found]
+
+    own = grid(i)
+    pairs = np.concatenate([own, *(grid(i, k) for k in moved if k != i)])
+    if not len(pairs):
         raise InputError(f"no configuration of '{machine.name}' closes on the way from home")
-    return np.concatenate(own), np.concatenate(pairs)
+    return own, pairs
 
 
 def maximize_force(strokes: Strokes, limits: LoadLimits, q: Array, moved: list[int]) -> Array:
@@ -343,7 +366,7 @@ def maximize_force(strokes: Strokes, limits: LoadLimits, q: Array, moved: list[i
     """
     statics, active = strokes.statics, strokes.machine.closure.active
     force = float(limits.rated_values(statics.evaluate(q[None]))[0].min())
-    if not 0 < force < np.inf:
+    if not (0 < force < np.inf and moved):
         return q
     lower, lengths = strokes.low[moved], (strokes.high - strokes.low)[moved]
 
@@ -357,8 +380,7 @@ def maximize_force(strokes: Strokes, limits: LoadLimits, q: Array, moved: list[i
         return found, statics.evaluate(found[None]), statics.coordinate_derivatives(found[None])
 
     def coefficients(at_rest: StaticQuantities) -> list[tuple[Array, ...]]:
-        unit = limits.action.unit_vectors(at_rest, np.zeros(1))
-        return [limits.bound_coefficients(x, at_rest, unit) for x in limits.bounds]
+        return [limits.bound_coefficients(x, at_rest, np.zeros(1)) for x in limits.bounds]
 
     def slacks(y: Any) -> Any:
         """Return the slack of each bound over its scale."""

@@ -11,7 +11,7 @@ from crane.common.errors import SingularConfigurationError
 from crane.common.samples import Array
 from crane.common.units import format_quantity
 from crane.ratings.limiting_factors import PIN_FORCE, TIPPING
-from crane.ratings.rating_chart import RatingChart
+from crane.ratings.rating_chart import RatingChart, RatingValues
 
 if TYPE_CHECKING:
     from crane.ratings.lifting_capacity import Capacity
@@ -21,6 +21,8 @@ _MAX_ROWS, _MAX_COLUMNS = 12, 18  # columns over all slews
 _RADIUS_SUBDIVISIONS = 25  # of a step, for the largest radius
 _SIGNIFICANT_DIGITS = 3  # of the largest load
 _STEP_TOLERANCE = 1e-6  # of a step
+_LEVEL_QUANTILES = 0.05, 0.9  # of loads, between which round levels are
+_ROUND_VALUES = np.array([1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
 
 
 class LoadTable(NamedTuple):
@@ -168,7 +170,7 @@ _SIDE_NAMES = {0: "front", 90: "side", -90: "side", 180: "rear", -180: "rear"}  
 ASTERISK_NOTE = "* limited by drives, all others by tipping"
 
 
-def capacity_facts(chart: RatingChart) -> list[tuple[str, str]]:
+def capacity_facts(chart: RatingValues) -> list[tuple[str, str]]:
     """Return the conditions of a load chart: names and texts."""
     holding = [x for x in chart.machine.driven_joints if x not in chart.working_joints]
     raising_text = ", ".join(chart.working_joints) or "nothing"
@@ -186,7 +188,7 @@ def capacity_facts(chart: RatingChart) -> list[tuple[str, str]]:
     return [*rows, ("limits", "; ".join(limit_texts(chart)))]
 
 
-def limit_texts(chart: RatingChart) -> list[str]:
+def limit_texts(chart: RatingValues) -> list[str]:
     """Return the limits of drives and pins as texts: "X_boom 350 bar (working pressure)"."""
     out = []
     for drive in chart.drive_limits():
@@ -206,7 +208,7 @@ def limit_texts(chart: RatingChart) -> list[str]:
     ]
 
 
-def slew_labels(chart: RatingChart) -> list[str]:
+def slew_labels(chart: RatingValues) -> list[str]:
     """Return a label for each slew angle: front, side, rear or degrees; empty for home alone."""
     slewing_joint = chart.section.slewing_joint
     if slewing_joint is None:
@@ -253,7 +255,7 @@ def to_markdown(chart: "Capacity", table: LoadTable) -> str:
         f"# Lifting capacity of {chart.machine.name}\n",
         *(f"- {name}: {text}" for name, text in capacity_facts(chart)),
         "",
-        *_markdown_table([f"{chart.section.coordinate_names[1]} [m]", *columns, "at [m]"], rows),
+        *markdown_table([f"{chart.section.coordinate_names[1]} [m]", *columns, "at [m]"], rows),
         "",
         table_note(chart, table),
         "\n| limited by | of all positions | of all, with another |",
@@ -265,7 +267,7 @@ def to_markdown(chart: "Capacity", table: LoadTable) -> str:
     ]
     if rows := _structural_rows(chart):
         heading = ["under these loads", "", *chart.section.coordinate_names, "slew"]
-        lines += ["", *_markdown_table(heading, rows)]
+        lines += ["", *markdown_table(heading, rows)]
     return "\n".join(lines) + "\n"
 
 
@@ -317,7 +319,20 @@ def table_note(chart: RatingChart, table: LoadTable) -> str:
     return f"{radius_note} Nothing tips: {chart.machine.name} has no supports."
 
 
-def _markdown_table(heading: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+def round_levels(values: Array, count: int) -> list[float]:
+    """Return round values between quantiles of some, denser at small ones."""
+    if not len(values):
+        return []
+    low, high = np.quantile(values, _LEVEL_QUANTILES)
+    levels = set()
+    for value in np.geomspace(max(low, 1e-3 * high), high, count):
+        power = 10.0 ** np.floor(np.log10(value))
+        levels.add(float(power * _ROUND_VALUES[np.abs(_ROUND_VALUES * power - value).argmin()]))
+    return sorted(levels)
+
+
+def markdown_table(heading: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a table, with its columns aligned."""
     width = [max(map(len, column)) for column in zip(heading, *rows, strict=True)]
     separator = ["-" * (w - 1) + ":" for w in width]
     cells = [

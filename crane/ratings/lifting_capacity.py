@@ -6,7 +6,6 @@ from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from crane.common import one_line_repr
 from crane.common.errors import InputError
@@ -20,26 +19,26 @@ from crane.ratings.capacity_report import LoadTable, load_table, to_markdown
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.drive_force_limits import DriveForceLimits, PinForces, drive_force_limits
 from crane.ratings.limiting_factors import RatingConditions
-from crane.ratings.rating_chart import RatingChart, compute_chart
+from crane.ratings.posture_search import PostureSearch, smallest_value
+from crane.ratings.rating_chart import RatingChart, RatingValues, compute_chart
 from crane.ratings.rating_rules import MAX_GROUND_SLOPE, Rule, find_rule, gravity_action
-from crane.ratings.strokes import find_pivot
+from crane.ratings.strokes import Strokes, find_pivot
 
 _STROKE_STEPS = 200  # steps of the stroke over which the gross torque is sampled
-_HEIGHT_TOLERANCE = 1e-3  # share of the reach
+_HEIGHT_COUNT, _HEIGHT_ROUNDS = 61, 2  # heights over the reach, and refinements of them
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class Capacity(RatingChart):
-    """Rated loads over radius and height [kg], see `RatingChart`."""
+class RatingLoads(RatingValues):
+    """Rated loads at the postures of a grid [kg], see `RatingValues`."""
 
     quantity: ClassVar[tuple[str, str]] = ("load", "kg")
 
-    def _one_line(self) -> str:
+    def _range_text(self) -> str:
         loads = self.loads[np.isfinite(self.loads)]
         range_text = f"{loads.min():.4g} to {loads.max():.4g} kg" if len(loads) else "no load"
         return (
-            f"Capacity of '{self.machine.name}' at '{self.frame}': {range_text} over "
-            f"{self.radii[0]:.4g} to {self.radii[-1]:.4g} m, rule '{self.rule.name}'"
+            f"{type(self).__name__} of '{self.machine.name}' at '{self.frame}': {range_text} over"
         )
 
     @property
@@ -161,6 +160,17 @@ class Capacity(RatingChart):
         out[np.isfinite(self.values)] = values
         return out
 
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Capacity(RatingLoads, RatingChart):
+    """Rated loads over radius and height [kg], see `RatingChart`."""
+
+    def _one_line(self) -> str:
+        return (
+            f"{self._range_text()} {self.radii[0]:.4g} to {self.radii[-1]:.4g} m, "
+            f"rule '{self.rule.name}'"
+        )
+
     @cached_property
     def table(self) -> LoadTable:
         """Load table at round steps, as in manuals."""
@@ -212,26 +222,40 @@ def capacity(
             and the ground slopes, or the frame is not moved by two to four strokes in a plane
             through the slewing axis.
     """
-    rule = find_rule(rule)
-    slope = max(
-        abs(as_number(slope, "the slope", "rad", max_magnitude=MAX_GROUND_SLOPE)),
-        rule.min_ground_slope,
+    conditions = load_conditions(
+        ConfigurationSearch(machine, frame), rule, raising, slope, friction
     )
-    search = ConfigurationSearch(machine, frame)
-    if raising is None:
-        raising = (
-            [find_raising_joint(search)] if rule.only_raising_drive else machine.driven_joints
-        )
-    conditions = RatingConditions(
-        machine=machine, places=search, action=gravity_action(machine), rule=rule,
-        working_joints=tuple(raising), ground_slope=slope, with_friction=friction,
-    )  # fmt: skip
     return compute_chart(
         Capacity, conditions, slews=slews, step=step, radii=radii, heights=heights
     )
 
 
-def find_raising_joint(search: ConfigurationSearch) -> str:
+def load_conditions(
+    places: Strokes,
+    rule: str | Rule,
+    raising: Collection[str] | None,
+    slope: float,
+    friction: bool,
+) -> RatingConditions:
+    """Return the conditions of a rated load, see `capacity`.
+
+    Raises:
+        InputError: The rule is unknown, or the slope is no such number.
+    """
+    machine, rule = places.machine, find_rule(rule)
+    slope = abs(as_number(slope, "the slope", "rad", max_magnitude=MAX_GROUND_SLOPE))
+    if raising is None:
+        raising = (
+            [find_raising_joint(places)] if rule.only_raising_drive else machine.driven_joints
+        )
+    return RatingConditions(
+        machine=machine, places=places, action=gravity_action(machine), rule=rule,
+        working_joints=tuple(raising), ground_slope=max(slope, rule.min_ground_slope),
+        with_friction=friction,
+    )  # fmt: skip
+
+
+def find_raising_joint(search: Strokes) -> str:
     """Return the joint whose stroke changes the machine's first moment most."""
     machine = search.machine
     changes = np.linalg.norm(
@@ -356,23 +380,15 @@ def _gross_torque(
     machine, i = search.machine, drive.active_index
     column = machine.column(pivot_joint)
 
-    def torque(stroke: float) -> float:
-        q_a = machine.home[machine.closure.active].copy()
-        q_a[i] = stroke
-        rate = float(machine.closure.gamma(machine.closure.solve(q_a))[column, i])
-        statics = search.statics.evaluate(machine.closure.solve(q_a)[None])
-        load_forces = statics.tip_load_forces(machine.model.gravity.linear)
-        return abs((drive.max_force if load_forces[0, i] > 0 else drive.min_force) / rate)
+    def negative_torques(strokes: Array) -> Array:
+        q = PostureSearch(search, {}, [drive.joint]).configurations(strokes[:, None])[0]
+        load_forces = search.statics.evaluate(q).tip_load_forces(machine.model.gravity.linear)
+        forces = np.where(load_forces[:, i] > 0, drive.max_force, drive.min_force)
+        return -np.abs(forces / machine.closure.gamma(q)[:, column, i])
 
     strokes = np.linspace(search.low[i], search.high[i], _STROKE_STEPS + 1)
-    values = np.array([torque(x) for x in strokes])
-    best = int(values.argmax())
-    interval = strokes[max(best - 1, 0)], strokes[min(best + 1, _STROKE_STEPS)]
-    optimum = minimize_scalar(
-        lambda x: -torque(x), bounds=interval, method="bounded", options={"xatol": 1e-9}
-    )
-    grid_optimum = float(values[best]), float(strokes[best])
-    return max(grid_optimum, (-float(optimum.fun), float(optimum.x)))
+    negative, stroke = smallest_value(negative_torques, strokes)
+    return -negative, stroke
 
 
 def _largest_load_at_radius(
@@ -384,14 +400,12 @@ def _largest_load_at_radius(
         raise InputError(
             f"'{frame}' reaches from {lower[0]:.3g} to {upper[0]:.3g} m, not {radius:g} m"
         )
-    heights = np.linspace(lower[1], upper[1], 61)
-    for _ in range(3):  # refine around the best height
+
+    def negative_loads(heights: Array) -> Array:
         chart = capacity(machine, frame, radii=[radius], heights=heights.tolist(), **options)
-        loads = np.where(np.isnan(chart.loads), np.inf, chart.loads)
-        smallest = np.nanmin(loads, axis=0)[:, 0]
-        loads = np.where(np.isfinite(smallest), smallest, -np.inf)
-        best, step = int(loads.argmax()), heights[1] - heights[0]
-        if step < _HEIGHT_TOLERANCE * (upper[1] - lower[1]):
-            break
-        heights = np.linspace(heights[best] - step, heights[best] + step, 21)
-    return float(loads[best]), float(heights[best])
+        loads = chart.loads.min(axis=0)[:, 0]
+        return -np.where(np.isfinite(loads), loads, np.nan)
+
+    heights = np.linspace(lower[1], upper[1], _HEIGHT_COUNT)
+    load, height = smallest_value(negative_loads, heights, _HEIGHT_ROUNDS)
+    return -load, height

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crane.common.errors import InputError
 from crane.common.result import Result
@@ -12,10 +13,10 @@ from crane.common.samples import Array
 from crane.dynamics.statics import StaticQuantities, StaticsEvaluator
 from crane.dynamics.tipping_stability import TippingStability, has_supports
 from crane.machine.machine import Machine
-from crane.motion.workspaces.workspace_section import WorkspaceSection
-from crane.ratings.configuration_search import ConfigurationSearch
+from crane.motion.workspaces.workspace_section import WorkspaceSection, find_slewing_joint
 from crane.ratings.drive_force_limits import DriveForceLimits, PinForces, drive_force_limits
-from crane.ratings.rating_rules import Rule, UnitAction
+from crane.ratings.rating_rules import Rule, UnitAction, rotate_about_axis
+from crane.ratings.strokes import Strokes, frame_rates
 
 TIPPING, PIN_FORCE = "tips", "pin force"
 
@@ -109,7 +110,8 @@ class LoadLimits:
         self._slope_tangent = np.tan(ground_slope)
         self._vertical_gravity = weight * np.cos(ground_slope)
         self._lateral_gravity = weight * np.sin(ground_slope)
-        drives, lines = list(drive_limits), list(tipping_lines(machine)) if with_weight else []
+        drives = list(drive_limits)
+        lines = tipping_lines(machine, statics.frame) if with_weight else []
         capacities = machine.pin_capacities if action.is_weight else {}
         if capacities and ground_slope:
             raise InputError(
@@ -146,12 +148,10 @@ class LoadLimits:
         """
         pin_forces = self.pin_loads(statics, angles, q)
         out = np.full((len(statics.total_mass), len(self.factors)), np.inf)
-        unit = self.action.unit_vectors(
-            statics, np.zeros(len(statics.total_mass)) if angles is None else angles
-        )
+        angles = np.zeros(len(statics.total_mass)) if angles is None else angles
         for bound in self.bounds:
             magnitude = self.bound_magnitude(
-                bound, self.bound_coefficients(bound, statics, unit, pin_forces)
+                bound, self.bound_coefficients(bound, statics, angles, pin_forces)
             )
             out[:, bound.factor_index] = np.minimum(out[:, bound.factor_index], magnitude)
         return np.asarray(out * self.rated_shares)
@@ -175,7 +175,7 @@ class LoadLimits:
         self,
         bound: LimitBound,
         statics: StaticQuantities,
-        unit: Array,
+        angles: Array,
         pin_forces: tuple[Array, Array] | None = None,
     ) -> tuple[Array, ...]:
         """Return a, b (N,), c and d (N, 3) of a bound a + b x + |c + d x| <= 0.
@@ -183,7 +183,7 @@ class LoadLimits:
         Args:
             bound: One of `bounds`.
             statics: The machine at rest.
-            unit: (N, 3) unit action e.
+            angles: (N,) slew angles from home [rad].
             pin_forces: Result of `pin_loads`.
         """
         if bound.pin_index is not None:
@@ -194,7 +194,8 @@ class LoadLimits:
                 zeros,
                 *(x[:, bound.pin_index] for x in pin_forces),
             )
-        weight_lever, action_lever, constant_part = self._lever_arms(bound, statics, 1.0)
+        weight_lever, action_lever, constant_part = self._lever_arms(bound, statics, 1.0, angles)
+        unit = self.action.unit_vectors(statics, angles)
         return self._sum_coefficients(bound, weight_lever, constant_part, [(action_lever, unit)])
 
     def coefficient_derivatives(
@@ -208,14 +209,16 @@ class LoadLimits:
         angles = np.zeros(len(statics.total_mass)) if angles is None else angles
         unit = self.action.unit_vectors(statics, angles)
         unit_derivatives = self.action.unit_derivatives(statics, derivatives, angles)
-        weight_lever, action_lever, constant_part = self._lever_arms(bound, derivatives, 0.0)
+        weight_lever, action_lever, constant_part = self._lever_arms(
+            bound, derivatives, 0.0, angles
+        )
         return self._sum_coefficients(
             bound,
             weight_lever,
             constant_part,
             [
                 (action_lever, unit),
-                (self._lever_arms(bound, statics, 1.0)[1], unit_derivatives),
+                (self._lever_arms(bound, statics, 1.0, angles)[1], unit_derivatives),
             ],
         )
 
@@ -245,7 +248,7 @@ class LoadLimits:
         return bound.sign * (a + constant_part), bound.sign * b, c, d
 
     def _lever_arms(
-        self, bound: LimitBound, statics: StaticQuantities, constant_factor: float
+        self, bound: LimitBound, statics: StaticQuantities, constant_factor: float, angles: Array
     ) -> tuple[Array, Array, Array]:
         """Return the levers of the weight and of the action (N, 3), and the constant part (N,).
 
@@ -258,7 +261,7 @@ class LoadLimits:
             constant_part = -statics.passive_forces[:, i] - constant_factor * limit
             return statics.moment_jacobian[:, :, i], statics.tip_jacobian[:, :, i], constant_part
         assert bound.tipping_line is not None
-        point, direction = bound.tipping_line.point, bound.tipping_line.direction
+        point, direction = bound.tipping_line.slewed(angles)
         return (
             np.cross(direction, statics.first_moment - statics.total_mass[:, None] * point),
             np.cross(direction, statics.tip_positions - constant_factor * point),
@@ -272,7 +275,7 @@ class RatingConditions(Result):
 
     Attributes:
         machine: The machine.
-        places: Search for configurations that put the frame at positions of its section.
+        places: Strokes of the frame, and for charts over its positions a `ConfigurationSearch`.
         action: Unit action at the frame.
         rule: Rating rule.
         working_joints: Joints whose drives work; all others hold.
@@ -282,7 +285,7 @@ class RatingConditions(Result):
     """
 
     machine: Machine
-    places: ConfigurationSearch
+    places: Strokes
     action: UnitAction
     rule: Rule
     working_joints: tuple[str, ...]
@@ -314,24 +317,62 @@ class RatingConditions(Result):
 
 
 class TippingLine(NamedTuple):
-    """A tipping line: its name, a point on it (3,) [m], and its direction (3,)."""
+    """A tipping line between two supports.
+
+    Attributes:
+        name: Name, "A to B".
+        ends: (2, 3) places of the supports with the slewing joint at home [m].
+        turns: Which of the two supports turn with the slewing joint, as the front wheels of a
+            machine with an articulated frame do with its steering joint.
+        origin: (3,) point on the slewing axis [m].
+        axis: (3,) slewing axis, upwards.
+    """
 
     name: str
-    point: Array
-    direction: Array
+    ends: Array
+    turns: NDArray[np.bool_]
+    origin: Array
+    axis: Array
+
+    def slewed(self, angles: Array) -> tuple[Array, Array]:
+        """Return a point (N, 3) and the direction (N, 3) at slew angles (N,) from home [rad]."""
+        first, second = (
+            self.origin + rotate_about_axis(
+                np.broadcast_to(end - self.origin, (len(angles), 3)), self.axis, turns * angles
+            )
+            for end, turns in zip(self.ends, self.turns, strict=True)
+        )  # fmt: skip
+        way = second - first
+        return first, way / np.linalg.norm(way, axis=1, keepdims=True)
 
 
-def tipping_lines(machine: Machine) -> Iterable[TippingLine]:
-    """Yield the tipping lines of a machine whose supports are stationary; none for others."""
-    if not has_supports(machine):
-        return
-    stability = TippingStability(machine)
-    if not stability.is_stationary:
-        return
+def tipping_lines(machine: Machine, frame: str) -> list[TippingLine]:
+    """Return the tipping lines of a machine on a fixed base; none for others.
+
+    Raises:
+        InputError: A joint moves a support and the frame, and it is not the slewing joint.
+    """
+    if not has_supports(machine) or not (stability := TippingStability(machine)).is_stationary:
+        return []
     (points,) = stability.support_positions(machine.home[None])
-    for (first, second), names in zip(stability.line_indices, stability.line_names, strict=True):
-        direction = points[second] - points[first]
-        yield TippingLine(" to ".join(names), points[first], direction / np.linalg.norm(direction))
+    moved = np.abs(stability.support_rates()).max(axis=1) > 0.0  # (s, n)
+    slew = find_slewing_joint(machine, frame)
+    index, origin, _ = (None, np.zeros(3), 1.0) if slew is None else slew
+    rates = frame_rates(machine, frame, machine.home)
+    for i in np.flatnonzero(moved.any(axis=0) & rates.any(axis=0)).tolist():
+        if i != index:
+            joint = machine.active[i]
+            raise InputError(
+                f"'{joint}' moves the supports and '{frame}', but is no upright pin on the base: "
+                f"lock it: --lock {joint}=..."
+            )
+    turns = np.zeros(len(points), dtype=bool) if index is None else moved[:, index]
+    return [
+        TippingLine(
+            " to ".join(names), points[list(pair)], turns[list(pair)], origin, machine.up_direction
+        )
+        for pair, names in zip(stability.line_indices, stability.line_names, strict=True)
+    ]
 
 
 def largest_feasible_magnitude(

@@ -1,7 +1,7 @@
 """Rating charts: the largest load or force over radius and height, and its limiting factors."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,8 +13,13 @@ from numpy.typing import NDArray
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_number, as_sample
 from crane.dynamics.statics import StaticQuantities
+from crane.dynamics.tipping_stability import TippingStability
 from crane.machine.machine import Machine
-from crane.ratings.configuration_search import ConfigurationSearch, ValueFunction
+from crane.ratings.configuration_search import (
+    ConfigurationSearch,
+    ConfigurationSet,
+    ValueFunction,
+)
 from crane.ratings.limiting_factors import (
     TIPPING,
     LimitingFactor,
@@ -26,6 +31,7 @@ from crane.ratings.rating_derivatives import (
     rating_derivatives,
 )
 from crane.ratings.rating_rules import slew_angles
+from crane.ratings.strokes import Strokes
 from crane.recordings.timeseries import Table, write_table
 
 # largest number of cells along the larger extent, by the number of free strokes
@@ -36,13 +42,10 @@ _MAX_CELLS = 400  # cells along one axis
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class RatingChart(RatingConditions):
-    """The largest load or force over radius and height.
+class RatingValues(RatingConditions):
+    """The largest loads or forces at the postures of a grid (b, a).
 
     Attributes:
-        radii: (a,) first coordinate of the section [m], usually the distance from the slewing
-            axis.
-        heights: (b,) second coordinate [m].
         slews: (s,) angles of the slewing joint [rad]; one, at home, if nothing slews.
         limiting_factors: Limiting factors.
         values: (s, b, a) largest load [kg] or force [N]; NaN where the frame does not reach,
@@ -55,8 +58,6 @@ class RatingChart(RatingConditions):
     The attributes of `RatingConditions` come first.
     """
 
-    radii: Array
-    heights: Array
     slews: Array
     limiting_factors: tuple[LimitingFactor, ...]
     values: Array
@@ -76,6 +77,68 @@ class RatingChart(RatingConditions):
     def simultaneous_factors(self) -> NDArray[np.bool_]:
         """(s, b, a, K) which factors limit the value; several if the best configuration has."""
         return _simultaneous_factors(self.values_by_factor, self.values)
+
+    def file_notes(self) -> dict[str, str]:
+        """Return further notes for the head of a file: the rule."""
+        return {"rule": self.rule.description}
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write one row per posture: slew, place, value, limiting factor, coordinates.
+
+        Values by limiting factor precede the active coordinates.
+
+        Raises:
+            OutputError: The file cannot be written.
+        """
+        machine, (name, unit) = self.machine, self.quantity
+        units = {
+            "cause": "1",
+            **{
+                "_".join([name, *factor.reason.split(), *factor.element.split()]): unit
+                for factor in self.limiting_factors
+            },
+            **{joint: machine.unit(joint) for joint in machine.active},
+        }
+        indices = np.nonzero(np.isfinite(self.values) | (self.limiting_factor_index >= 0))
+        columns: tuple[Any, ...] = self.limiting_factor_index, self.values_by_factor, self.q_a
+        notes = {f"cause {k}": str(factor) for k, factor in enumerate(self.limiting_factors)}
+        self._write_rows(path, indices, units, [x[indices] for x in columns], notes)
+
+    def _places(self, b: Any, a: Any) -> dict[str, tuple[str, Array]]:
+        raise NotImplementedError  # units and values of the columns of the place, by name
+
+    def _write_rows(
+        self,
+        path: str | Path,
+        indices: tuple[Any, ...],
+        units: dict[str, str],
+        columns: Sequence[Array],
+        notes: dict[str, str],
+    ) -> None:
+        (name, unit), places = self.quantity, self._places(*indices[1:])
+        units = {"slew": "rad", **{x: u for x, (u, _) in places.items()}, name: unit, **units}
+        values = (x for _, x in places.values())
+        rows = np.column_stack([self.slews[indices[0]], *values, self.values[indices], *columns])
+        rows[~np.isfinite(rows)] = np.nan
+        head = {"machine": self.machine.load_expression, "frame": self.frame, **self.file_notes()}
+        write_table(path, Table(units, rows, head | notes))
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class RatingChart(RatingValues):
+    """The largest load or force over radius and height.
+
+    Attributes:
+        radii: (a,) first coordinate of the section [m], usually the distance from the slewing
+            axis.
+        heights: (b,) second coordinate [m].
+
+    The attributes of `RatingValues` come first.
+    """
+
+    places: ConfigurationSearch
+    radii: Array
+    heights: Array
 
     def derivatives(self, parameter_names: Sequence[str]) -> Array:
         """Compute derivatives of the values by parameters, see `rating_derivatives`.
@@ -102,28 +165,6 @@ class RatingChart(RatingConditions):
         slews = None if self.section.slewing_joint is None else self.slews.tolist()
         return compute_chart(type(self), self, slews=slews, radii=radii, heights=heights)
 
-    def to_csv(self, path: str | Path) -> None:
-        """Write one row per position: slew, radius, height, value, limiting factor, coordinates.
-
-        Values by limiting factor precede the active coordinates.
-
-        Raises:
-            OutputError: The file cannot be written.
-        """
-        machine, (name, unit) = self.machine, self.quantity
-        units = {
-            "cause": "1",
-            **{
-                "_".join([name, *factor.reason.split(), *factor.element.split()]): unit
-                for factor in self.limiting_factors
-            },
-            **{joint: machine.unit(joint) for joint in machine.active},
-        }
-        s, b, a = np.nonzero(np.isfinite(self.values) | (self.limiting_factor_index >= 0))
-        columns: tuple[Any, ...] = self.limiting_factor_index, self.values_by_factor, self.q_a
-        notes = {f"cause {k}": str(factor) for k, factor in enumerate(self.limiting_factors)}
-        self._write_rows(path, (s, b, a), units, [x[s, b, a] for x in columns], notes)
-
     def derivatives_to_csv(self, path: str | Path, parameter_names: Sequence[str]) -> None:
         """Write one row per position: slew, radius, height, value, derivatives by parameters.
 
@@ -136,27 +177,8 @@ class RatingChart(RatingConditions):
         indices = np.nonzero(np.isfinite(self.values))
         self._write_rows(path, indices, units, [self.derivatives(parameter_names)[indices]], {})
 
-    def file_notes(self) -> dict[str, str]:
-        """Return further notes for the head of a file: the rule."""
-        return {"rule": self.rule.description}
-
-    def _write_rows(
-        self,
-        path: str | Path,
-        indices: tuple[Any, ...],
-        units: dict[str, str],
-        columns: Sequence[Array],
-        notes: dict[str, str],
-    ) -> None:
-        name, unit = self.quantity
-        units = {"slew": "rad", "radius": "m", "height": "m", name: unit, **units}
-        s, b, a = indices
-        rows = np.column_stack(
-            [self.slews[s], self.radii[a], self.heights[b], self.values[s, b, a], *columns]
-        )
-        rows[~np.isfinite(rows)] = np.nan
-        head = {"machine": self.machine.load_expression, "frame": self.frame, **self.file_notes()}
-        write_table(path, Table(units, rows, head | notes))
+    def _places(self, b: Any, a: Any) -> dict[str, tuple[str, Array]]:
+        return {"radius": ("m", self.radii[a]), "height": ("m", self.heights[b])}
 
 
 ChartType = TypeVar("ChartType", bound=RatingChart)
@@ -186,21 +208,52 @@ def compute_chart(
     Raises:
         InputError: See `capacity`.
     """
-    search, machine, limits = conditions.places, conditions.machine, conditions.load_limits()
+    search = conditions.places
+    assert isinstance(search, ConfigurationSearch)
     axes = _chart_axes(search, step, radii, heights)
-    can_tip = any(factor.reason == TIPPING for factor in limits.factors)
-    slew_coordinates = _slew_coordinates(machine, search, slews, can_tip)
     configurations = search.find_all(axes)
     if not len(configurations.position_index):
         raise InputError(f"'{conditions.frame}' reaches none of these positions, give others")
-    shape = (len(slew_coordinates), len(axes[1]) * len(axes[0]))
+
+    def select(evaluate: ValueFunction) -> ConfigurationSet:
+        return search.select_best(configurations, axes, partial(_smallest_values, evaluate))[0]
+
+    rated = rate_postures(conditions, (len(axes[1]), len(axes[0])), select, slews)
+    return chart_class(**rated, radii=axes[0], heights=axes[1], **attributes)
+
+
+def rate_postures(
+    conditions: RatingConditions,
+    grid: tuple[int, int],
+    select: Callable[[ValueFunction], ConfigurationSet],
+    slews: Sequence[float] | None = None,
+) -> dict[str, Any]:
+    """Rate the postures of a grid, and return the attributes of `RatingValues`.
+
+    Args:
+        conditions: Conditions of the rating.
+        grid: Shape (b, a) of the grid.
+        select: Chooses the configurations by their values, with their indices in the grid.
+        slews: Angles of the slewing joint, see `capacity` [rad].
+
+    Raises:
+        InputError: A slew angle is beyond the limits, or the supports have another outline there.
+    """
+    machine, places, limits = conditions.machine, conditions.places, conditions.load_limits()
+    can_tip = any(factor.reason == TIPPING for factor in limits.factors)
+    slew_coordinates = _slew_coordinates(machine, places, slews, can_tip)
+    shape = (len(slew_coordinates), grid[0] * grid[1])
     values_by_factor = np.full((*shape, len(limits.factors)), np.nan)
     q_a = np.full((*shape, len(machine.active)), np.nan)
-    slewing_joint, active = search.section.slewing_joint, machine.closure.active
-    angles = slew_angles(machine, search.section, slew_coordinates)
+    slewing_joint, active = places.section.slewing_joint, machine.closure.active
+    angles = slew_angles(machine, places.section, slew_coordinates)
+    if can_tip and slewing_joint is not None:  # the supports have the outline of home
+        slewed = np.tile(machine.home[active], (len(slew_coordinates), 1))
+        slewed[:, slewing_joint] = slew_coordinates
+        TippingStability(machine).static_margins(slewed)
     for k, slew_coordinate in enumerate(slew_coordinates):
         evaluate = partial(_values_by_factor, conditions, limits, slew_coordinate, angles[k])
-        best, _ = search.select_best(configurations, axes, partial(_smallest_values, evaluate))
+        best = select(evaluate)
         values_by_factor[k, best.position_index] = evaluate(best.q, best.statics)
         q_a[k, best.position_index] = best.q[:, active]
         if slewing_joint is not None:
@@ -208,19 +261,16 @@ def compute_chart(
     smallest = np.where(np.isnan(values_by_factor), np.inf, values_by_factor).min(axis=2)
     smallest = np.where(np.isfinite(q_a[..., 0]), smallest, np.nan)
     first_factor = _simultaneous_factors(values_by_factor, smallest).argmax(axis=2)
-    grid = (len(slew_coordinates), len(axes[1]), len(axes[0]))
-    return chart_class(
+    full = (len(slew_coordinates), *grid)
+    return {
         **{x.name: getattr(conditions, x.name) for x in dataclasses.fields(RatingConditions)},
-        radii=axes[0],
-        heights=axes[1],
-        slews=slew_coordinates,
-        limiting_factors=limits.factors,
-        values=smallest.reshape(grid),
-        limiting_factor_index=np.where(np.isfinite(smallest), first_factor, -1).reshape(grid),
-        values_by_factor=values_by_factor.reshape(*grid, -1),
-        q_a=q_a.reshape(*grid, -1),
-        **attributes,
-    )
+        "slews": slew_coordinates,
+        "limiting_factors": limits.factors,
+        "values": smallest.reshape(full),
+        "limiting_factor_index": np.where(np.isfinite(smallest), first_factor, -1).reshape(full),
+        "values_by_factor": values_by_factor.reshape(*full, -1),
+        "q_a": q_a.reshape(*full, -1),
+    }
 
 
 def _values_by_factor(
@@ -288,9 +338,12 @@ def _chart_axes(
 
 
 def _slew_coordinates(
-    machine: Machine, search: ConfigurationSearch, slews: Sequence[float] | None, can_tip: bool
+    machine: Machine, search: Strokes, slews: Sequence[float] | None, can_tip: bool
 ) -> Array:
-    """Return the angles of the slewing joint [rad]: given, or home and a quarter turn."""
+    """Return the angles of the slewing joint [rad]: given, or home and a quarter turn.
+
+    A joint that turns less, as the steering of an articulated frame, goes as far as it turns.
+    """
     slewing_joint = search.section.slewing_joint
     home = (
         0.0
@@ -298,13 +351,10 @@ def _slew_coordinates(
         else float(machine.home[machine.closure.active[slewing_joint]])
     )
     if slews is None:
-        quarter_turn = home + np.pi / 2
-        is_within_limits = (
-            slewing_joint is not None
-            and can_tip
-            and search.low[slewing_joint] <= quarter_turn <= search.high[slewing_joint]
-        )
-        return np.array([home, quarter_turn] if is_within_limits else [home])
+        turned = home
+        if slewing_joint is not None and can_tip:
+            turned = min(home + np.pi / 2, float(search.high[slewing_joint]))
+        return np.array([home, turned] if turned > home else [home])
     if slewing_joint is None:
         raise InputError(f"nothing slews '{machine.name}', leave slews out")
     slew_coordinates = as_sample(slews, len(slews), "slews")

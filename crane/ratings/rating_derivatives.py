@@ -68,9 +68,8 @@ def rating_derivatives(
         return np.array([[drive.max_force, drive.min_force] for drive in limits]).ravel()
 
     def tipping_line_values(variant: Machine) -> Array:
-        return np.concatenate(
-            [[0.0], *(np.r_[x.point, x.direction] for x in tipping_lines(variant))]
-        )
+        lines = tipping_lines(variant, conditions.frame)
+        return np.concatenate([[0.0], *(np.r_[x.ends.ravel(), x.origin] for x in lines)])
 
     by_drive = constants.jacobian(parameter_names, drive_forces)
     if np.any(constants.jacobian(parameter_names, tipping_line_values)):
@@ -139,11 +138,10 @@ def _bound_derivatives(
         coordinates (N, n) and by parameters (N, k).
     """
     at_rest, by_coordinates, by_parameters = statics
-    unit = limits.action.unit_vectors(at_rest, angles)
     magnitudes = np.empty((len(angles), len(limits.bounds)))
     all_by_q, all_by_p = {}, {}
     for j, bound in enumerate(limits.bounds):
-        coefficients = limits.bound_coefficients(bound, at_rest, unit, pin_forces)
+        coefficients = limits.bound_coefficients(bound, at_rest, angles, pin_forces)
         x = limits.bound_magnitude(bound, coefficients)
         share = limits.rated_shares[bound.factor_index]
         magnitudes[:, j] = x * share

@@ -60,6 +60,23 @@ RULES = {
             tipping=0.75,
             only_raising_drive=True,
         ),
+        *(
+            Rule(
+                f"iso14397{name}",
+                f"in the manner of ISO 14397-1 (loaders): the less of {100 * share:g} % of the "
+                f"tipping load, {text}, and what the lift cylinders raise at the working "
+                "pressure; the percentages as makers' handbooks give them, not read in the "
+                "standard",
+                tipping=share,
+                only_raising_drive=True,
+            )
+            for name, share, text in (
+                ("", 0.5, "of wheel loaders with buckets, at full turn"),
+                ("-crawler", 0.35, "of crawler loaders with buckets"),
+                ("-forks", 0.8, "with forks on firm level ground"),
+                ("-rough", 0.6, "with forks on rough ground"),
+            )
+        ),
         Rule(
             "en12999",
             "in the manner of EN 12999 (loader cranes): what is lifted at the working pressure, "

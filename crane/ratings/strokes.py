@@ -107,11 +107,14 @@ def find_pivot(machine: Machine, frame: str, stroke_index: int) -> str:
     return max(rates, key=lambda name: rates[name])
 
 
-def frame_angular_jacobian(machine: Machine, frame: str, q: Array) -> Array:
-    """Return the angular velocity (3, n) of a frame by the active joints at a closed q (nq,)."""
+def frame_rates(machine: Machine, frame: str, q: Array) -> Array:
+    """Return the rates (6, n) of a frame by the active joints at a closed q (nq,).
+
+    Those of its origin [m/m], [m/rad], then its angular velocity [rad/m], [1].
+    """
     frames = FrameJacobians(machine)
     frames.set_configuration(q)
-    return np.asarray(frames.jacobian(frame)[3:] @ machine.closure.gamma(q))
+    return np.asarray(frames.jacobian(frame) @ machine.closure.gamma(q))
 
 
 class InstantaneousRotation(NamedTuple):

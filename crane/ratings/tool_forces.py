@@ -23,7 +23,7 @@ from crane.ratings.rating_rules import (
     rotate_about_axis,
     slew_angles,
 )
-from crane.ratings.strokes import Strokes, bucket_and_arm_strokes, frame_angular_jacobian
+from crane.ratings.strokes import Strokes, bucket_and_arm_strokes, frame_rates
 
 TOOL_DIRECTIONS = ("up", "down", "in", "out", "tangent", "-tangent", "normal", "-normal")
 
@@ -148,21 +148,24 @@ def tool_force(
             is not moved by two to four strokes in a plane through the slewing axis.
     """
     search = ConfigurationSearch(machine, frame)
-    action, single_joint = _direction_action(search, direction, joint)
+    action, single_joint = direction_action(search, direction, joint)
     if working is None:
         working = machine.driven_joints if single_joint is None else [single_joint]
     conditions = RatingConditions(
         machine=machine, places=search, action=action, rule=find_rule("none"),
         working_joints=tuple(working), with_weight=weights,
     )  # fmt: skip
-    if not isinstance(direction, str):
-        direction = "({:g}, {:g}, {:g})".format(*direction)
-    elif isinstance(action, PathUnitAction):
-        direction += f" of {machine.active[action.stroke]}"
+    text = direction_text(direction)
+    if isinstance(action, PathUnitAction):
+        text += f" of {machine.active[action.stroke]}"
     return compute_chart(
-        ToolForce, conditions, slews=slews, step=step, radii=radii, heights=heights,
-        direction=direction,
-    )  # fmt: skip
+        ToolForce, conditions, slews=slews, step=step, radii=radii, heights=heights, direction=text
+    )
+
+
+def direction_text(direction: str | Sequence[float]) -> str:
+    """Return a direction as text."""
+    return direction if isinstance(direction, str) else "({:g}, {:g}, {:g})".format(*direction)
 
 
 def tangent_action(strokes: Strokes, stroke_index: int) -> PathUnitAction:
@@ -180,8 +183,8 @@ def tangent_action(strokes: Strokes, stroke_index: int) -> PathUnitAction:
     return PathUnitAction(stroke_index, -1.0 if pushes_harder else 1.0, machine.up_direction)
 
 
-def _direction_action(
-    search: ConfigurationSearch, direction: str | Sequence[float], joint: str | None
+def direction_action(
+    search: Strokes, direction: str | Sequence[float], joint: str | None
 ) -> tuple[UnitAction, str | None]:
     """Return the unit action on the frame, and the joint for a tangent of a path."""
     machine, section = search.machine, search.section
@@ -218,15 +221,13 @@ def _direction_action(
     return FixedUnitAction(-pushed, up), None
 
 
-def _normal_action(
-    search: ConfigurationSearch, path_action: PathUnitAction, sign: float
-) -> PathUnitAction:
+def _normal_action(search: Strokes, path_action: PathUnitAction, sign: float) -> PathUnitAction:
     """Return the reaction to a force away from the pivot, or with sign -1 towards it."""
     machine, frame, section = search.machine, search.statics.frame, search.section
     normal = np.cross(section.first_direction, section.second_direction)
     statics = search.statics.evaluate(machine.home[None])
     tip_tangent = statics.tip_jacobian[0, :, path_action.stroke]
-    angular_rate = frame_angular_jacobian(machine, frame, machine.home)[:, path_action.stroke]
+    angular_rate = frame_rates(machine, frame, machine.home)[3:, path_action.stroke]
     outward = np.cross(tip_tangent, angular_rate)  # r w^2, from the centre of rotation
     orientation = np.sign(np.cross(normal, tip_tangent) @ outward)
     return PathUnitAction(path_action.stroke, -sign * float(orientation), path_action.up, normal)

@@ -228,14 +228,20 @@ class DimensionFinder:
         violation = np.abs(self._positions[:, axes] - targets).sum(axis=1) / self._size
         return self._maximize(objective, values, constraints, violation)
 
-    def _dimension(self, name: str, optimum: Optimum, definition: str) -> Dimension | None:
+    def _dimension(
+        self,
+        name: str,
+        optimum: Optimum,
+        definition: str,
+        place: FrameSectionCoordinates | None = None,
+    ) -> Dimension | None:
         if optimum is None:
             return None
         value, q = optimum
         return Dimension(
             name,
             value,
-            self._rounded_position(self._lip, q),
+            self._rounded_position(place or self._lip, q),
             np.round(q[self._machine.closure.active], _ROUNDING_DIGITS) + 0.0,
             definition,
         )
@@ -329,6 +335,14 @@ class DimensionFinder:
 
         return evaluate
 
+    def hinge_pin_height(self) -> Dimension | None:
+        """Return the largest height of the bucket's pivot over the ground."""
+        pivot = self._pivot
+        assert pivot is not None, "it has a bucket"
+        heights = pivot.coordinates(self._q)[:, 1] - self._ground
+        optimum = self._maximize(pivot.coordinate_objective(1, 1.0, self._ground), heights)
+        return self._dimension("hinge pin height", optimum, "highest pivot of the bucket", pivot)
+
     def _dump_height(self, pivot: FrameSectionCoordinates) -> Dimension | None:
         lip, size = self._lip, self._size
         horizontal = objective_difference(
@@ -378,13 +392,10 @@ class DimensionFinder:
         if best is None:
             return None
         pin, radius, configuration = best
-        dimension = self._dimension(
+        return self._dimension(
             "smallest front slewing radius", (radius, configuration),
-            "smallest radius that contains the lip and all pins of the front",
+            "smallest radius that contains the lip and all pins of the front", pin,
         )  # fmt: skip
-        return dimension and dimension._replace(
-            section_position=self._rounded_position(pin, configuration)
-        )
 
 
 def _front_pin_links(machine: Machine, frame: str) -> list[str]:

@@ -8,14 +8,17 @@ import numpy as np
 from crane.common.errors import InputError, check_name
 from crane.common.result import Result
 from crane.common.samples import as_number
+from crane.dynamics.tipping_stability import TippingStability, has_supports
 from crane.machine.machine import Machine
 from crane.motion.workspaces import Workspace, workspace
+from crane.ratings.posture_search import ANGLE, PostureSearch
 from crane.ratings.strokes import Strokes, bucket_and_arm_strokes, find_pivot
 from crane.ratings.working_range_dimensions import Dimension, DimensionFinder
 from crane.recordings.timeseries import Table, write_table
 
 DEFAULT_LEVEL_LENGTH = 2.44  # 8 ft [m]
 _WORKSPACE_SAMPLES = 4000
+_LOADER_DIMENSIONS = "reach", "reach at ground level", "digging depth", "cutting height"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -98,7 +101,10 @@ def working_range(
 
     Each dimension is an optimum over all strokes within their limits, computed with exact
     derivatives from several starts (`maximize_on_branch`); the slewing joint stays at home.
-    Without a bucket there are only reach, depth and height.
+    Without a bucket there are only reach, depth and height. For a bucket that two strokes move,
+    as a loader's, the terms are those of SAE J732 (ISO 7131): height of the hinge pin with the
+    boom up, and height and reach of the edge there at a dump angle of 45 degrees. The angle of the
+    bucket is that of the frame's x axis.
 
     Args:
         machine: The machine.
@@ -129,6 +135,11 @@ def working_range(
     ground_height = next(
         (float(x.height) for x in grounds if x is not None and not x.profile), 0.0
     )
+    finder = DimensionFinder(reach, ground_height, pivot_joint)
+    dimensions = list(finder.find_all(level))
+    if joint is not None and len(strokes.moving) == 2:
+        dimensions = [x for x in dimensions if x.name in _LOADER_DIMENSIONS]
+        dimensions += _dump_dimensions(strokes, joint, finder.hinge_pin_height(), ground_height)
     return WorkingRange(
         machine,
         reach.frame,
@@ -136,5 +147,35 @@ def working_range(
         reach,
         joint,
         level,
-        tuple(DimensionFinder(reach, ground_height, pivot_joint).find_all(level)),
+        tuple(dimensions),
     )
+
+
+def _dump_dimensions(
+    strokes: Strokes, bucket_joint: str, hinge: Dimension | None, ground_height: float
+) -> list[Dimension]:
+    """Return height of the hinge pin, and height and reach of the edge that dumps at 45 degrees.
+
+    The last two only for a bucket that turns so far where its pin is highest.
+    """
+    machine, section = strokes.machine, strokes.section
+    if hinge is None:
+        return []
+    at = dict(zip(machine.active, hinge.q_a.tolist(), strict=True)) | {ANGLE: -np.pi / 4}
+    del at[bucket_joint]
+    try:
+        q = PostureSearch(strokes, at).configuration()
+    except InputError:
+        return [hinge]
+    place = section.coordinates(strokes.statics.evaluate(q[None]).tip_positions)[0]
+    points = section.origin[None]
+    if has_supports(machine):
+        (points,) = TippingStability(machine).support_positions(machine.home[None])
+    q_a, front = q[machine.closure.active], section.coordinates(points)[:, 0].max()
+    return [
+        hinge,
+        Dimension("dump height at 45 degrees", place[1] - ground_height, place, q_a,
+                  "edge of the dumping bucket where its pivot is highest"),
+        Dimension("dump reach at 45 degrees", place[0] - front, place, q_a,
+                  "that edge before the foremost support, or the origin"),
+    ]  # fmt: skip

@@ -414,6 +414,11 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         figures={"study.png": "plots.study_figures.study_figure"},
         stale=lambda *_: (UNFINISHED,),
     ),
+    "LiftChart": ResultFiles(
+        summary="lift_chart.md",
+        tables={"lift_chart.csv": "to_csv"},
+        figures={"lift_chart.png": "plots.rating_figures.lift_figure"},
+    ),
     "ToolForce": ResultFiles(
         summary="tool_force.md",
         tables={"tool_force.csv": "to_csv"},

@@ -218,15 +218,13 @@ def _read_supports(
     contacts = {force.frame for force in external_forces if isinstance(force, Contact)}
     for link in names:
         tree.check_link(link, top.source_location("supports"), "the support")
-        if tree.is_movable(link) and link not in contacts:
-            raise tree.unknown_name_error(
-                str(
-                    top.error_at(
-                        "supports",
-                        f"support '{link}' moves, name links of the base or those of contacts",
-                    )
-                )
+        lifting_joint = "" if link in contacts else tree.lifting_joint(link)
+        if lifting_joint:
+            text = (
+                f"support '{link}' is lifted by '{lifting_joint}', name links of the base, of "
+                "contacts, or that turn about z as the front of an articulated frame"
             )
+            raise tree.unknown_name_error(str(top.error_at("supports", text)))
     if names and len(names) < 3:
         raise top.error_at("supports", f"{len(names)} supports make no area, name three or more")
     return names

@@ -16,7 +16,7 @@ from crane.common.errors import CraneError, DescriptionError, suggest_names, war
 from crane.description.findings import FollowUpError, error_recovery, report_error
 from crane.description.force_elements import ForceElement, Friction
 from crane.description.kinematic_tree import Joint, Link, Tree, body_of, path_to_root
-from crane.description.pinocchio_conversion import se3_from_xyz_rpy
+from crane.description.pinocchio_conversion import rotation_from_rpy, se3_from_xyz_rpy
 from crane.description.rotation_vectors import add_base_joints, check_freedoms
 from crane.description.specification import (
     AXISLESS_TYPES,
@@ -36,7 +36,7 @@ _LOOP_END_PATTERN = re.compile(
     r"((?:closing_|closed?_?loop|loop_?clos).*?)_?([12AB])", re.IGNORECASE
 )
 _END_LABELS = ({"1", "2"}, {"A", "B"})
-_MAX_SHOWN = 4  # pairs in a line
+_MAX_SHOWN, _UPRIGHT_TOLERANCE = 4, 1e-9  # pairs in a line; rise of a level unit vector
 
 
 class TreeBuilder:
@@ -161,6 +161,15 @@ class TreeBuilder:
         is_forest = any(joint.is_cut for joint in self.tree.joints.values())
         is_known = self.is_complete and not is_forest
         return not is_known or body_of(self._parent_joints, link) != self.tree.root_link
+
+    def lifting_joint(self, link: str) -> str:
+        """The first joint from the world to a link that does not move it level; "" if none."""
+        rotation, found = np.eye(3), ""
+        for joint in path_to_root(self._parent_joints, link)[::-1]:
+            rotation = rotation @ rotation_from_rpy(joint.rpy)
+            tilt = abs(abs(float(rotation[2] @ joint.axis)) - (joint.kind == "revolute"))
+            found = found or joint.name * (joint.is_movable and tilt > _UPRIGHT_TOLERANCE)
+        return found
 
     def missing_limit_text(self, joint: str) -> str:
         """How a joint lacks a finite range, in words; empty if it has one, or is unknown."""

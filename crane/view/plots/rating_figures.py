@@ -16,12 +16,15 @@ from matplotlib.ticker import MaxNLocator
 
 from crane.common.samples import Array
 from crane.common.units import display_unit
-from crane.ratings.capacity_report import slew_labels
+from crane.ratings.capacity_report import round_levels, slew_labels
+from crane.ratings.lift_charts import LiftChart
 from crane.ratings.lifting_capacity import Capacity
-from crane.ratings.rating_chart import RatingChart
+from crane.ratings.rating_chart import RatingChart, RatingValues
 from crane.ratings.tool_forces import ToolForce
 from crane.recordings.recording_summary import result_title
 from crane.view.plots.figure_style import (
+    CURVE_COLOURS,
+    FAINT_COLOUR,
     INK_COLOUR,
     add_heading,
     add_side_colour_bar,
@@ -40,11 +43,7 @@ BODY_COLOUR, ROD_COLOUR = "#4a4f57", "#8b929b"
 _LABEL_SIZE = 7  # of contours [points]
 _ROOM = 0.1  # above and below panels [inch]
 _DENSE = 8  # parts of a contour within a cell, to end it where the cells do
-_MAX_CONTOURS, _CONTOUR_QUANTILES = (
-    8,
-    (0.05, 0.9),
-)  # contours at most, and between which quantiles of the loads
-_ROUND_VALUES = np.array([1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
+_MAX_CONTOURS = 8
 
 
 @figure_style
@@ -107,18 +106,18 @@ def _draw_factors(axes: Axes, chart: RatingChart, k: int) -> None:
     )
 
 
-def capacity_heading(chart: Capacity) -> str:
+def capacity_heading(chart: RatingValues) -> str:
     """Return the heading of a load chart."""
     rule_text = "" if chart.rule.name == "none" else f" by {chart.rule.name}"
     return result_title(chart.machine.name, f"lifting capacity at {chart.frame}{rule_text}")
 
 
-def factor_colours(chart: RatingChart) -> Mapping[int, str]:
+def factor_colours(chart: RatingValues) -> Mapping[int, str]:
     """Return the colour of each active limiting factor, by index."""
     return {k: FACTOR_COLOURS[i % len(FACTOR_COLOURS)] for i, k in enumerate(chart.active_factors)}
 
 
-def legend_patches(chart: RatingChart) -> list[Patch]:
+def legend_patches(chart: RatingValues) -> list[Patch]:
     """Return the legend: limiting factors in their colours."""
     patches = [
         Patch(color=colour, label=escape_label(str(chart.limiting_factors[k])))
@@ -129,7 +128,7 @@ def legend_patches(chart: RatingChart) -> list[Patch]:
     return patches
 
 
-def home_outlines(chart: Capacity) -> list[MachineOutline]:
+def home_outlines(chart: RatingValues) -> list[MachineOutline]:
     """Return outlines of the machine at home, turned to each slew angle."""
     outlines, machine = [], chart.machine
     for slew_coordinate in chart.slews:
@@ -176,10 +175,9 @@ def load_contours(chart: Capacity, k: int) -> list[tuple[float, list[Array]]]:
     loads = chart.loads[k]
     beyond = np.ma.masked_invalid(_continued(np.where(np.isfinite(loads), loads, np.nan)))
     lines = contour_generator(chart.radii, chart.heights, beyond, name="serial")
-    lowest, highest = np.quantile(finite_loads, _CONTOUR_QUANTILES)
     return [(level, [part for line in lines.lines(level)
                      for part in _parts_within(chart, k, np.asarray(line))])
-            for level in _contour_levels(float(lowest), float(highest))]  # fmt: skip
+            for level in round_levels(finite_loads, _MAX_CONTOURS)]  # fmt: skip
 
 
 def _continued(loads: Array) -> Array:
@@ -248,17 +246,6 @@ def _draw_contours(axes: Axes, chart: Capacity, k: int) -> None:
         label.set_path_effects([withStroke(linewidth=1.6, foreground="white")])
 
 
-def _contour_levels(low: float, high: float) -> list[float]:
-    """Return round contour levels, denser at small loads."""
-    levels = set()
-    for load in np.geomspace(max(low, 1e-3 * high), high, _MAX_CONTOURS):
-        power = 10.0 ** np.floor(np.log10(load))
-        levels.add(
-            float(power * _ROUND_VALUES[int(np.abs(_ROUND_VALUES * power - load).argmin())])
-        )
-    return sorted(levels)
-
-
 def draw_machine(axes: Axes, machine_outline: MachineOutline) -> None:
     """Draw the outline of a machine."""
     if len(machine_outline.stationary_hull) > 1:  # an undercarriage is often no more than its feet
@@ -278,6 +265,63 @@ def draw_machine(axes: Axes, machine_outline: MachineOutline) -> None:
         axes.plot(*np.array([start, end]).T, color=ROD_COLOUR, linewidth=1.2, zorder=5.4)
         axes.plot(*np.array([start, mouth]).T, color=BODY_COLOUR, linewidth=2.8, zorder=5.5,
                   solid_capstyle="butt")  # fmt: skip
+
+
+@figure_style
+def lift_figure(chart: LiftChart) -> Figure:
+    """Return curves of load, force and angle over one stroke, or zones of load over two."""
+    is_curve, (u, w) = len(chart.over) == 1, chart.section.coordinate_names
+    count = 3 if is_curve else len(chart.slews)
+    figure = Figure(figsize=(9.6 if is_curve else 6.4 * count, 5.4), layout="constrained")
+    panels = figure.subplots(1, count, sharey=True, squeeze=False)[0]
+    panels[0].set_ylabel(f"{w} [m]")
+    if is_curve:
+        _draw_lift_curves(panels, chart)
+        figure.legend(handles=legend_patches(chart), loc="outside lower center", ncols=3)
+    for k, axes in enumerate([] if is_curve else panels):
+        draw_machine(axes, home_outlines(chart)[k])
+        _draw_zones(axes, chart, k)
+        axes.set(aspect="equal", xlabel=f"{u} [m]")
+        axes.set_title(slew_labels(chart)[k], fontsize=9.5, loc="left")
+    add_heading(figure, escape_label(capacity_heading(chart)))
+    return figure
+
+
+def _draw_lift_curves(panels: list[Axes], chart: LiftChart) -> None:
+    # loads in the colours of their limiting factors, holding force and angle
+    height, joint = chart.positions[0, :, 1], chart.over[0]
+    unit = "kN" if chart.machine.unit(joint) == "m" else "kN m"
+    force = chart.holding_forces[0, :, chart.machine.active.index(joint)] / 1e3
+    for loads, factors, label in zip(
+        chart.loads[:, 0], chart.limiting_factor_index[:, 0], slew_labels(chart), strict=True
+    ):
+        for k, colour in factor_colours(chart).items():
+            panels[0].plot(np.where(factors == k, loads, np.nan), height, "o-", color=colour,
+                           markersize=3.5)  # fmt: skip
+        panels[0].annotate(f" {label}", (loads[0], height[0]), va="top", fontsize=_LABEL_SIZE)
+    panels[0].set(xlabel="rated load [kg]", xlim=(0, None))
+    panels[1].plot(force, height, color=CURVE_COLOURS[0])
+    panels[1].set_xlabel(f"force of {escape_label(joint)} without load [{unit}]")
+    panels[2].plot(np.rad2deg(chart.angles[0]), height, color=CURVE_COLOURS[0])
+    panels[2].set_xlabel(f"angle of {escape_label(chart.frame)} [deg]")
+
+
+def _draw_zones(axes: Axes, chart: LiftChart, k: int) -> None:
+    # the reach with lines of the first stroke, and the edges of the zones of load
+    style: Any = {"path_effects": [withStroke(linewidth=1.6, foreground="white")], "zorder": 6}
+    for line in (*chart.positions, *np.swapaxes(chart.positions, 0, 1)[:: _DENSE // 2]):
+        axes.plot(*line.T, color=FAINT_COLOUR, linewidth=0.6, zorder=1)
+    for line, angle in list(zip(np.swapaxes(chart.positions, 0, 1), chart.boom_angles(),
+                                strict=True))[:: _DENSE // 2]:  # fmt: skip
+        axes.annotate(f" {np.rad2deg(angle):.0f}°", line[-1], fontsize=_LABEL_SIZE)
+    for edge, load, colour in zip(chart.zone_edges[k], chart.zones, CURVE_COLOURS, strict=False):
+        strokes = np.column_stack([chart.strokes[0, :, 0], edge])[np.isfinite(edge)]
+        if len(strokes):
+            places = chart.at_strokes(strokes[None]).positions[0]
+            axes.plot(*places.T, color=colour, linewidth=2.0, zorder=5)
+            axes.annotate(
+                f"{load:g} kg", places[len(places) // 4], ha="center", rotation=90, **style
+            )
 
 
 _MAX_ARROWS = 12  # along the larger side
