@@ -213,6 +213,18 @@ def test_what_the_recording_cannot_say_is_said(tmp_path):
     assert "Strongly correlated" in text
 
 
+@pytest.mark.slow
+def test_a_delay_of_a_signal_that_never_changes_is_not_determined(tmp_path):
+    machine = simple(tmp_path)
+    path = recorded(machine, tmp_path / "run.csv", 4)
+    fit = {"load_x.mass": None, "valve.x.delay": (0.05, 0.0, 0.3)}
+    found = quiet(crane.calibrate, machine, path, fit, train=(0.0, 0.55))
+    mass, delay = found.parameters
+    assert np.isinf(delay.interval_half_width) and np.isfinite(mass.interval_half_width)
+    assert delay.value == 0.05 and delay.remark == "not determined by the recordings"
+    assert not found.correlated_pairs
+
+
 @pytest.mark.parametrize(
     "options, said",
     [

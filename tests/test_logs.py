@@ -8,7 +8,7 @@ import pytest
 from command_line import typed
 
 import crane
-from crane.common.errors import RecordingError
+from crane.common.errors import CraneWarning, RecordingError
 from crane.recordings import table_reader, timeseries
 from crane.recordings.logs import read_log
 from crane.recordings.recording import Recording
@@ -135,15 +135,15 @@ def test_broken_files_of_columns(log, tmp_path, text, message):
 
 
 def test_logs_that_cannot_be_read(log, tmp_path):
-    good = columns(tmp_path, GOOD)
+    good = columns(tmp_path, "time [s] = t\nq1 [rad] = x\n")
     for path, text, message in (
         ("gone.npz", None, "no such file"),
         ("gone.csv", None, "no such file"),
         ("words.csv", "t,x\n0,up\n", "words.csv: line 2, column 'x': 'up' is not a number"),
         ("empty.csv", "# a: 1\nt;x\n0;1\n1;\n", "line 4, column 'x': '' is not a number, corr"),
-        ("short_row.csv", "t;x\n0;1\n1\n", "no table of numbers"),
-        ("twice.csv", "t,t\n0,1\n", "1 different names head 2 columns"),
-        ("short.csv", "t\n0,1\n", "1 different names head 2 columns"),
+        ("short_row.csv", "t;x\n0;1\n1\n", "line 3 has 1 cells, none for 'x'"),
+        ("twice.csv", "t,x,x\n0,1,2\n", "'x' heads 2 columns, give the .* one instead, .* '#2'"),
+        ("short.csv", "t\n0,1\n", "1 names head 2 columns, name each"),
     ):
         if text is not None:
             (tmp_path / path).write_text(text)
@@ -153,6 +153,54 @@ def test_logs_that_cannot_be_read(log, tmp_path):
         read_log(log, tmp_path / "gone.txt")
     with pytest.raises(RecordingError, match="/dev/zero: it is no plain file, copy it into one"):
         read_log(log, "/dev/zero")
+
+
+# as dSPACE ControlDesk writes them: rows of properties, names in two of them, and a label before
+DESK = """descriptions,General,User,"me, too"
+trace_size,3
+
+trace_names,,In1,In1,duty,
+path,,Pressures/rod,Pressures/head,Valve,Valve
+min,,-1e308,-1e308,0,0
+trace_values,0.5,1.25,2.5,10,up
+,0.6,1.5,2.25,20,down
+,0.7,1.75,2,30,"up, again"
+"""
+
+
+def test_only_the_columns_in_use_need_names_and_numbers(tmp_path):
+    path, text = tmp_path / "desk.csv", (
+        "# samples from line: 7\ntime [s] = '#2'\nrod [bar] = 'Pressures/rod'\n"
+        "head [bar] = '#4'\nduty = duty / 10\n"
+    )  # fmt: skip
+    path.write_text(DESK)
+    table = read_log(path, columns(tmp_path, text))
+    wanted = [[0.5, 1.25e5, 2.5e5, 1], [0.6, 1.5e5, 2.25e5, 2], [0.7, 1.75e5, 2e5, 3]]
+    np.testing.assert_allclose(table.values, wanted, rtol=1e-14)
+    assert table.notes == {}
+    for old, new, message in (
+        ("'#4'", "In1", "desk.csv: 'In1' heads 2 columns, give the number of one .* '#3'"),
+        ("'#4'", "Valve", "'Valve' heads 2 columns"),
+        ("'#4'", "'#6'", "desk.csv: line 7, column '#6': 'up' is not a number"),
+        ("'#4'", "'#7'", "columns.txt:4: the log has no '#7'"),
+        ("'#4'", "'#0'", "columns.txt:4: the log has no '#0'"),
+        ("'#4'", "tail", "columns.txt:4: the log has no 'tail'"),
+        ("7", "6", "desk.csv: line 6, column '#2': '' is not a number"),
+        ("7", "10", "desk.csv: has 9 lines, samples cannot begin on line 10"),
+        ("7", "x", "desk.csv: has 9 lines, samples cannot begin on line x"),
+    ):
+        with pytest.raises(RecordingError, match=message):
+            read_log(path, columns(tmp_path, text.replace(old, new)))
+
+
+def test_rows_may_end_before_their_header_does_and_with_a_separator(tmp_path):
+    path, text = tmp_path / "log.csv", columns(tmp_path, "time [s] = t\nq1 [rad] = x\n")
+    path.write_text("t,x,note\n0,1\n1,3\n")  # the logger did not write the last column
+    with pytest.warns(CraneWarning, match="log.csv: 3 names head 2 columns, 'note' is"):
+        short = read_log(path, text)
+    path.write_text("t,x\n0,1,\n1,3,\n")
+    for table in (short, read_log(path, text)):
+        np.testing.assert_array_equal(table.values, [[0, 1], [1, 3]])
 
 
 def test_command_line(log, tmp_path):

@@ -60,6 +60,20 @@ def test_the_model_s_own_recording_comes_back(tmp_path, measured):
     assert np.ptp(recording.q[300:, 0]) > 0.005
 
 
+def test_lost_samples_over_which_a_signal_changes_are_told(tmp_path, measured):
+    machine, recording = measured
+    columns, units = columns_of(recording)
+    kept = np.abs(recording.time - 2.0) > 0.1005
+    columns = {name: x[kept] for name, x in columns.items()}
+    path = write(tmp_path / "file.csv", columns, units)
+    told = r"^no samples between 14\.399 and 14\.601 s, over which the signal of 'x' is"
+    with pytest.warns(CraneWarning, match=told) as caught:
+        replay(machine, path)
+    assert len(caught) == 1
+    columns["voltage_x"] = 0.0 * columns["voltage_x"] + 5.8  # nothing is interpolated
+    replay(machine, write(tmp_path / "constant.csv", columns, units))
+
+
 def test_measured_strokes_beyond_the_limits_are_told(tmp_path, measured):
     """A bump of the sensor to 600 mm, the stroke being 535 mm; noise of 1 mm is none."""
     machine, recording = measured

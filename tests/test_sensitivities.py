@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+import singular_linkages
 from command_line import typed
 from test_ball_joints import ROD, RSSR, RSSR_FILE
 from test_floating import box, hinge
@@ -161,6 +162,17 @@ def test_a_closed_chain_under_computed_torque():
 
     by = ("link3.mass", "friction.X1.viscous", "link3_G.x")
     compare(machine, made, by, 2.0, 1e-3, ("X1", "q2", "X1_force", "tip_z"), 1e-2)
+
+
+def test_a_linkage_short_of_its_dead_centre(tmp_path):
+    """Velocities of joints per that of the slider become 15 times those at home."""
+    machine = singular_linkages.slider_crank(tmp_path, "s", 0.3, 0.6)
+    begin = singular_linkages.start(machine, "a", 2.0)
+    outputs = ("s", "s_velocity", "a")
+    by = ("rod.mass", "slider.mass")
+    compare(machine, lambda _: (None, begin), by, 0.173, 1e-3, outputs, 1e-2)
+    with pytest.raises(CraneError, match="come near a dead centre"):
+        crane.sensitivities(machine, None, begin, 0.2, 1e-3, parameters=by)
 
 
 SHIP = (

@@ -47,7 +47,11 @@ def test_notes_keep_what_follows_the_first_colon(tmp_path):
     assert notes == {"machine": "C:\\cranes\\big.yaml", "task": "lift"}
 
 
-@pytest.mark.parametrize("read", [read_table, read_log_arrays], ids=["as recording", "as log"])
+@pytest.mark.parametrize(
+    "read",
+    [read_table, lambda path: read_log_arrays(path, ["time [s]", "a [m]", "b"])],
+    ids=["as recording", "as log"],
+)
 def test_a_file_that_is_cut_short_anywhere_is_told(tmp_path, read):
     path, whole = tmp_path / "cut.csv", tmp_path / "whole.csv"
     values = np.array([[0.0, 1.25, -3e-5], [0.5, 1.5, 22.75]])

@@ -9,9 +9,10 @@ in the arrays of the log, and notes as in a recording:
     q2_force [N m] = gear_ratio[1] * motor_torque[1]
 
 Arrays are those of an npz file, or the columns of a CSV by the names in its header row; names that
-are no identifiers are quoted. a[i] is column i of a table a, counted from 0, or element i of a
-list. Operators are + - * /, parentheses, numbers and pi. Notes such as `# sensor.q2.delay: 0.02`
-are sensor parameters, see crane.description.sensors.
+are no identifiers are quoted. '#2' is the second column of a CSV. a[i] is column i of a table a,
+counted from 0, or element i of a list. Operators are + - * /, parentheses, numbers and pi. Notes
+such as `# sensor.q2.delay: 0.02` are sensor parameters, see crane.description.sensors. The note
+`# samples from line: 30` is for a CSV with other rows between its names and its numbers.
 """
 
 import ast
@@ -66,7 +67,11 @@ def read_log(path: str | Path, columns: str | Path) -> Table:
             names files and lines.
     """
     notes, lines = read_log_columns(Path(columns))
-    arrays = table_reader.read_log_arrays(Path(path))
+    arrays = table_reader.read_log_arrays(
+        Path(path),
+        wanted=[name for line in lines for name in expression_names(line.expression)],
+        first_line=notes.pop("samples from line", ""),
+    )
     missing = [(line, name) for line in lines for name in missing_names(line.expression, arrays)]
     if missing:
         messages = [f"{line.source_location}: the log has no '{name}'" for line, name in missing]

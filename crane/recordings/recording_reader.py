@@ -110,12 +110,9 @@ def _read_table(path: str | Path, machine: Machine | None, columns: str | Path |
         return table
     log_sensors = {} if machine is None else {x: s for x, s in machine.sensors.items() if s.column}
     if machine is not None and log_sensors:
-        arrays = table_reader.read_log_arrays(Path(path))
-        if any(
-            name in arrays
-            for s in log_sensors.values()
-            for name in logs.expression_names(s.column)
-        ):
+        wanted = [x for s in log_sensors.values() for x in logs.expression_names(s.column)]
+        arrays = table_reader.read_log_arrays(Path(path), wanted)
+        if any(name in arrays for name in wanted):
             return _read_machine_log(Path(path), machine, log_sensors, arrays)
     return table_reader.read_table(path)
 

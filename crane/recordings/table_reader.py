@@ -9,7 +9,6 @@ import csv
 import io
 import itertools
 import os
-import stat
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -18,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from crane.common import scratch_arrays
-from crane.common.errors import RecordingError
+from crane.common.errors import RecordingError, warn
 from crane.common.number_text import parse_float
 from crane.common.samples import Array
 from crane.common.unit_conversions import accepted_units, column_conversion
@@ -30,6 +29,7 @@ from crane.recordings.timeseries import (
     SAMPLE_COUNT_NOTE,
     Table,
     check_column_name,
+    check_regular_file,
     check_unit,
     located_errors,
     parse_heading,
@@ -100,12 +100,20 @@ def read_npz(path: Path) -> Table:
     )
 
 
-def read_log_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read the arrays of an npz file or CSV of another program by name, without conversion.
+def read_log_arrays(
+    path: Path, wanted: Iterable[str], first_line: str = ""
+) -> dict[str, np.ndarray]:
+    """Read arrays of an npz file or CSV of another program by name, without conversion.
 
-    A CSV has one header row and columns separated by commas, semicolons or tabs. If the separator
-    is no comma and no number has a point, commas are decimal separators. The encoding is UTF-8,
-    UTF-16 with a byte order mark, or else Windows-1252.
+    A CSV has columns separated by commas, semicolons or tabs. If the separator is no comma and no
+    number has a point, commas are decimal separators. The encoding is UTF-8, UTF-16 with a byte
+    order mark, or else Windows-1252. Only the wanted columns need to hold numbers in every row.
+
+    Args:
+        path: The file.
+        wanted: Names of columns that are used, or their numbers, as in '#2'; others are empty.
+        first_line: Line on which the samples begin, and above which any row may name columns;
+            default below the first row, which is the header row.
 
     Raises:
         RecordingError: The file does not exist or is not valid.
@@ -116,20 +124,60 @@ def read_log_arrays(path: Path) -> dict[str, np.ndarray]:
             return read_arrays(path)
         lines = _count_lines(path)
         encoding = _detect_encoding(path)
-        notes, heading, line = _read_header(path, encoding)
+        if not first_line:
+            notes, *headings, line = _read_header(path, encoding)
+        elif first_line.isdecimal() and 0 < int(first_line) <= lines:
+            notes, line = {}, int(first_line) - 1
+            headings = list(itertools.islice(_text_rows(path, encoding, 0), line))
+        else:
+            raise RecordingError(f"has {lines} lines, samples cannot begin on line {first_line}")
         _check_last_line(path, notes, encoding)
-        separator = max(",;\t", key=heading.count)
-        try:
-            names = [cell.strip() for cell in next(csv.reader([heading], delimiter=separator))]
-        except csv.Error as error:
-            raise RecordingError(f"no table of numbers ({error}), correct it") from None
         text_rows = partial(_text_rows, path, encoding, line)
+        first_row = next(filter(str.strip, text_rows()), "").rstrip("\r\n")
+        separator = max(",;\t", key=("".join(headings) or first_row).count)
+        positions = _column_positions(headings, first_row, separator)
+        if not first_line and '"' not in first_row:
+            _check_width(
+                path,
+                next(csv.reader(headings, delimiter=separator)),
+                cells=first_row.rstrip(separator).count(separator) + 1,
+            )
+        used = {name: min(positions[name]) for name in wanted if name in positions}
+        ambiguous = next((name for name in used if len(positions[name]) > 1), None)
+        if ambiguous:
+            raise RecordingError(
+                f"'{ambiguous}' heads {len(positions[ambiguous])} columns, give the number of one "
+                f"instead, as in '#{used[ambiguous] + 1}'"
+            )
         rows: Callable[[], Iterator[str]] = text_rows
         if separator != "," and not any("." in x for x in text_rows()):  # decimal commas
             rows = lambda: (x.replace(",", ".") for x in text_rows())  # noqa: E731
-        values = _read_values(rows, line, lines, names, separator)
-        _check_sample_count(values, notes)
-        return dict(zip(names, values.T, strict=True))
+        arrays = dict.fromkeys(filter(None, positions), np.zeros(0))
+        if used:
+            values = _read_values(rows, line, lines, list(used), separator, None, [*used.values()])
+            _check_sample_count(values, notes)
+            arrays |= dict(zip(used, values.T, strict=True))
+        return arrays
+
+
+def _check_width(path: Path, names: Sequence[str], cells: int) -> None:
+    """Refuse a first row with more cells than names; warn of one with fewer."""
+    if cells > (count := len(names)):
+        raise RecordingError(f"{count} names head {cells} columns, name each in the header row")
+    if 1 < cells < count:
+        warn(f"{path}: {count} names head {cells} columns, '{names[-1]}' is taken as empty", 5)
+
+
+def _column_positions(
+    headings: Sequence[str], first_row: str, separator: str
+) -> dict[str, set[int]]:
+    """Positions of columns, counted from 0, by number and by the names above the samples."""
+    positions = {f"#{i + 1}": {i} for i in range(first_row.count(separator) + 1)}
+    for position, cell in itertools.chain.from_iterable(
+        map(enumerate, csv.reader(headings, delimiter=separator))
+    ):
+        positions.setdefault(cell.strip(), set()).add(position)
+    return positions
 
 
 def build_table(path: Path, names: Iterable[str], values: Array, notes: dict[str, str]) -> Table:
@@ -142,17 +190,6 @@ def build_table(path: Path, names: Iterable[str], values: Array, notes: dict[str
     csv.writer(heading).writerow(names)
     with located_errors(path):
         return _convert_to_si(Table(_parse_header(heading.getvalue().rstrip()), values, notes))
-
-
-def check_regular_file(path: Path) -> None:
-    """Check that a path is a regular file, no device or pipe.
-
-    Raises:
-        OSError: It does not exist.
-        RecordingError: It is not a regular file.
-    """
-    if not stat.S_ISREG(mode := path.stat().st_mode) and not stat.S_ISDIR(mode):
-        raise RecordingError("is no plain file, copy it into one")
 
 
 def _count_lines(path: Path) -> int:
@@ -319,6 +356,7 @@ def _read_values(
     names: Sequence[str],
     separator: str,
     time_unit: str | None = None,
+    positions: Sequence[int] | None = None,
 ) -> Array:
     """Read numbers (N, columns) below the header row, line `header` of `lines`.
 
@@ -330,22 +368,22 @@ def _read_values(
         separator: Between cells.
         time_unit: Unit of the time of a recording, whose times increase and whose numbers are
             finite; None for a log.
+        positions: Positions of the columns in the rows of a log, counted from 0.
     """
     values, count, remaining = scratch_arrays.empty_array(lines - header, len(names)), 0, rows()
-    raise_fault = partial(_raise_first_fault, rows, header, names, separator, time_unit)
+    raise_fault = partial(_raise_first_fault, rows, header, names, separator, time_unit, positions)
     try:
         with warnings.catch_warnings(action="ignore"):  # numpy warns of blank lines
             for line in remaining:
                 block = itertools.chain([line], itertools.islice(remaining, BLOCK_ROWS - 1))
-                part = np.loadtxt(block, delimiter=separator, comments=None, ndmin=2)
+                part = np.loadtxt(
+                    block, delimiter=separator, comments=None, ndmin=2,
+                    usecols=positions, quotechar=None if positions is None else '"',
+                )  # fmt: skip
                 if not part.size:
                     continue
-                if part.shape[1] != len(set(names)):
+                if part.shape[1] != len(names):
                     raise_fault()
-                    raise RecordingError(
-                        f"{len(set(names))} different names head {part.shape[1]} columns, name "
-                        "each"
-                    )
                 if time_unit is not None and not np.isfinite(part).all():
                     raise_fault()
                 values[count : count + len(part)] = part
@@ -376,6 +414,7 @@ def _raise_first_fault(
     names: Sequence[str],
     separator: str,
     time_unit: str | None,
+    positions: Sequence[int] | None,
 ) -> None:
     is_recording, last = time_unit is not None, -np.inf
     for line, text in enumerate(rows(), start=header + 1):
@@ -387,6 +426,14 @@ def _raise_first_fault(
             raise RecordingError(
                 f"line {line} has {len(cells)} cells, give {len(names)} as in the header"
             )
+        if positions is not None:
+            cells = next(csv.reader([text], delimiter=separator))
+            if max(positions) >= len(cells):
+                raise RecordingError(
+                    f"line {line} has {len(cells)} cells, none for "
+                    f"'{names[positions.index(max(positions))]}'"
+                )
+            cells = [cells[position] for position in positions]
         for name, cell in zip(names, cells, strict=False):
             value = _parse_number(cell)
             if value is None or (is_recording and not np.isfinite(value)):

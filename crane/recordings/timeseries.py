@@ -6,7 +6,9 @@ truncated file is recognized. A unit may be omitted, except that of time. Number
 the fewest digits that give the same float64 again.
 """
 
+import csv
 import re
+import stat
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -68,11 +70,24 @@ def located_errors(path: str | Path, wanted: str = "another file") -> Iterator[N
         yield
     except RecordingError as error:
         raise RecordingError(prefix_location(str(path), error)) from None
+    except csv.Error as error:
+        raise RecordingError(f"{path}: no table of numbers ({error}), correct it") from None
     except UnicodeError:
         raise RecordingError(f"{path}: is not text, give a file in UTF-8") from None
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise RecordingError(f"{path}: {reason}, give {wanted}") from None
+
+
+def check_regular_file(path: Path) -> None:
+    """Check that a path is a regular file, no device or pipe.
+
+    Raises:
+        OSError: It does not exist.
+        RecordingError: It is not a regular file.
+    """
+    if not stat.S_ISREG(mode := path.stat().st_mode) and not stat.S_ISDIR(mode):
+        raise RecordingError("is no plain file, copy it into one")
 
 
 def check_column_name(name: str, unit: str) -> None:

@@ -12,6 +12,7 @@ from crane.common.errors import (
     RecordingError,
     check_name,
     prefix_location,
+    warn,
 )
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.progress import progress_reporter
@@ -257,6 +258,17 @@ def replay_inputs(machine: Machine, table: Table) -> ReplayInputs:
     signals, pressures, missing = {}, {}, MissingMeasurements(machine, table)
     with missing.collect_errors():
         signals = _spool_signals(machine, tuple(circuit.spools), table)
+    gap = int(np.argmax(np.diff(time)))  # of many steps: samples may be lost
+    changed = [name for name, x in signals.items() if x[gap] != x[gap + 1]]
+    if changed and np.diff(time)[gap] > 10.0 * np.median(np.diff(time)):
+        warn(
+            "no samples between {:.6g} and {:.6g} s".format(
+                *table_column(table, TIME)[gap : gap + 2]
+            )
+            + f", over which the signal of '{changed[0]}' is interpolated: end before, or start "
+            "behind (--until, --from)",
+            stacklevel=3,
+        )
     check_pressures(machine, table)
     supply, tank = (
         table_column(table, name, "Pa") if name in table.units else None

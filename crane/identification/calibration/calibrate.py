@@ -318,7 +318,8 @@ def _calibration_result(
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     values = problem.values(z)
     divisors = np.where(deviations > 0, deviations, np.inf)[: len(unknowns)]
-    correlation = covariance[: len(unknowns), : len(unknowns)] / np.outer(divisors, divisors)
+    finite = np.nan_to_num(covariance[: len(unknowns), : len(unknowns)], posinf=0.0)
+    correlation = finite / np.outer(divisors, divisors)
     pairs = np.argwhere(np.abs(np.tril(correlation, -1)) > _MAX_CORRELATION).tolist()
     correlated = [(unknowns[j].name, unknowns[i].name, float(correlation[i, j])) for i, j in pairs]
     parameters = []

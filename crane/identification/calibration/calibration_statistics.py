@@ -130,6 +130,9 @@ def evaluate_profile_ends(
     lower_point, lowest_cost = None, minimum_cost * (1.0 - _LOWER_MINIMUM_SHARE)
     profile_ends = []
     for i, width in enumerate(half_widths):
+        if not np.isfinite(width):
+            profile_ends.append(ProfileEnds())
+            continue
         free = (z > search.low) & (z < search.high)
         free[i] = True
         inverse = np.linalg.pinv(H[np.ix_(free, free)], rcond=1e-13, hermitian=True)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.signal import correlate
 
 from crane.common.checkpoint import Checkpoint
-from crane.common.errors import CraneError
+from crane.common.errors import CraneError, SimulationError, prefix_location
 from crane.common.progress import Progress
 from crane.common.samples import Array, root_mean_square
 from crane.dynamics.joint_forces import find_stick_slip_columns
@@ -297,7 +297,10 @@ class LevenbergMarquardt:
         rows, weighted, blocks, channels = [], [], [], []
         order = {name: k for k, name in enumerate(self._scale_bounds)}
         for number, case in enumerate(self.training_cases):
-            residual, derivatives = self.problem.linearize(case, z)
+            try:
+                residual, derivatives = self.problem.linearize(case, z)
+            except SimulationError as error:
+                raise SimulationError(prefix_location(case.name, error)) from None
             weights, mask = self.channel_weights(case), case.train_mask
             rows.append(
                 (derivatives * weights[:, :, None])[mask].reshape(-1, self.problem.unknown_count)
@@ -368,7 +371,7 @@ class LevenbergMarquardt:
         """Covariance (p, p) of the scaled unknowns, and the number of blocks.
 
         It is H^-1 (sum_b g_b g_b^T) H^-1 with the gradients g_b of blocks, at least that of white
-        noise, without regard to bounds.
+        noise, without regard to bounds. The variance of an unknown without effect is infinite.
         """
         hessian = self.jacobian.T @ self.jacobian + np.diag(self.prior**2)
         inverse = np.linalg.pinv(hessian, rcond=1e-13, hermitian=True)
@@ -382,7 +385,8 @@ class LevenbergMarquardt:
         degrees_of_freedom = max(len(self.residual) - len(z), 1)
         white = inverse * float(self.residual @ self.residual) / degrees_of_freedom
         inflation = np.sqrt(np.maximum(np.diag(white) / np.maximum(np.diag(robust), 1e-300), 1.0))
-        return robust * np.outer(inflation, inflation), count
+        without_effect = np.diag(np.where(np.diag(hessian) == 0.0, np.inf, 0.0))
+        return robust * np.outer(inflation, inflation) + without_effect, count
 
     def _block_duration(self) -> float:
         """Duration of a block [s], four correlation times of the residuals."""

@@ -158,8 +158,10 @@ class SimulatedMotion:
         time, parts, self.notes = run.time, run.rows, run.notes
         self.time, self.chart = time, run.chart
         stride = max(1, len(time) // _MAX_CHECKED_SAMPLES)
+        # another chart would be sought earlier, but only a dead centre prevents derivatives
+        limits = np.array([5.0, 0.1]) * self.chart.chart_limits
         for at, configuration in zip(time[::stride], parts.q[::stride], strict=True):
-            if self.chart.largest_gamma_entry(configuration) > self.chart.chart_limits[0]:
+            if self.chart.largest_gamma_entry(configuration) > limits[0]:
                 raise SimulationError(
                     f"at t = {at:.4g} s the active coordinates come near a dead centre, where "
                     "nothing depends on them smoothly: drive other joints, or end before"
@@ -174,6 +176,7 @@ class SimulatedMotion:
         self.parts = layout.view(self.rows[::2])
         self._states = self.rows[:, : layout.start_index("tau")]
         self._integrator = integrator_factory(self.chart, method, tolerance)(self.chart)
+        self._integrator.set_chart_limits(limits)
         self.transitions = self.chart.stick_slip.transitions or []
         self.chart.stick_slip.transitions = None  # repeated parts are not recorded
         columns, closure = self.chart.user_columns, machine.closure
