@@ -64,11 +64,11 @@ def _key_rows(section: SectionSchema) -> list[tuple[str, ...]]:
 
 
 def _type_text(key: Key) -> str:
+    if isinstance(key, VariantKey):
+        return ", or ".join(dict.fromkeys(map(_type_text, key.types)))
     if key.choices:
         names = ", ".join(f"`{x}`" for x in key.choices)
         return f"list of {names}" if isinstance(key, NameListKey) else names
-    if isinstance(key, VariantKey):
-        return ", or ".join(dict.fromkeys(map(_type_text, key.types)))
     if isinstance(key, MapKey):
         is_number = type(key.item) is NumberKey and key.item.units
         item = f"[{_type_text(key.item)}]" if is_number else _type_text(key.item)

@@ -317,6 +317,9 @@ def test_a_platform_on_six_legs_by_ball_joints(tmp_path):
         (("longest: 1.0,", "longest: 0.85,"),
          "loader.yaml:23: cylinder 'X_lift' is 0.8944 m from B to C in the drawing, and 0.8 to "
          "0.85 m long: move a point, or correct its lengths"),
+        (("B: [0.4, 1.1]", "B: [0.1, 1.7]", "longest: 1.0,", "longest: 1.2,"),
+         "loader.yaml:23: cylinder 'X_lift' is 0.8 to 1.2 m long, but its ends, which turn about "
+         "A, are 0.9838 to 1.616 m apart: correct its lengths, or move a point"),
         (("X_lift: {points: [B, C]", "X_lift: {points: [B, A]"),
          "cylinder 'X_lift' has both pins on 'frame', which is rigid"),
         (("base: frame", "base: chassis"), "loader.yaml:4: 'base' is the unknown body 'chassis'"),
@@ -329,12 +332,78 @@ def test_a_platform_on_six_legs_by_ball_joints(tmp_path):
         (("tip: edge", "tip: egde"), "'egde' is unknown, did you mean"),
         (("H: [2.3, 1.0]", "H: [1.5, 1.0]"), "a tube of body 'link' has no length, name other"),
         (("tip: edge", "  pins: {D: {axis: w}}\ntip: edge"), "'axis' of pin 'D': 'w' is unknown"),
+        (("tip: edge", "  pins: {D: {axis: [0, 0]}}\ntip: edge"),
+         "the axis of pin 'D' is no direction, give [x, y, z] or a name"),
+        (("points: [F, E, G]", "points: {F: [0, 0.5], E: [0, 0], G: [0.2, -0.9]}"),
+         "loader.yaml:19: body 'bellcrank' shares points E and F with the drawing, but they are "
+         "0.5 m apart in its own coordinates and 0.5025 m there"),
+        (("points: [F, E, G]", "points: {F: [0, 0.5], E: [0, 0, 0, 0], G: [0.2, -0.9]}"),
+         "point 'E' has 4 coordinates, give [x, z] or [x, y, z]"),
+        (("points: [F, E, G]", "points: {P: [0, 0.5], E: [0, 0], Q: [0.2, -0.9]}"),
+         "loader.yaml:19: body 'bellcrank' shares 1 points with the drawing and cannot be placed "
+         "by its own coordinates, give the drawing two of its points"),
     ],
 )  # fmt: skip
 def test_errors_are_in_terms_of_the_drawing(loaded, changes, message):
     with pytest.raises(DescriptionError) as error:
         quiet(loaded, *changes)
     assert message in str(error.value)
+
+
+def own_coordinates(names, angle, origin):
+    """Points of the loader in a frame that is turned and moved, as YAML."""
+    drawn = yaml.safe_load(LOADER)["drawing"]["points"]
+    c, s = np.cos(angle), np.sin(angle)
+    places = {x: np.array([[c, s], [-s, c]]) @ np.subtract(drawn[x], origin) for x in names}
+    return {name: place.tolist() for name, place in places.items()}
+
+
+def test_bodies_drawn_on_their_own_are_placed_by_shared_points(loaded):
+    """A bellcrank upside down in its own drawing, and a link that hangs on it alone."""
+    masses = "mass: 150, centre: [1.4, 1.5], inertia: [3, 12, 9, 0, 0, 1]}"
+    one = loaded("mass: 150}", masses)
+    crank = own_coordinates(("E", "F", "G"), 2.5, (0.3, 0.7))
+    c, s = np.cos(2.5), np.sin(2.5)
+    centre = (np.array([[c, s], [-s, c]]) @ [1.1, 0.8]).tolist()
+    turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    tensor = turn @ np.array([[3, 0, 1], [0, 12, 0], [1, 0, 9.0]]) @ turn.T
+    numbers = tensor[[0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]].tolist()
+    other = loaded(
+        "    G: [1.5, 1.0]\n", "",  # of the bellcrank's own drawing alone
+        "points: [F, E, G], mass: 150}",
+        f"points: {crank}, mass: 150, centre: {centre}, inertia: {numbers}}}",
+        "link: {points: [G, H]", f"link: {{points: {own_coordinates(('G', 'H'), -1.0, (5, 5))}",
+    )  # fmt: skip
+    home = home_of(one)
+    assert home_of(other) == pytest.approx(home, abs=1e-12)
+    for strokes in (home, home + 0.05, home - 0.03):
+        motion = strokes, np.array([0.1, -0.2]), np.array([0.3, 0.4])
+        found, wanted = (crane.Dynamics(x).inverse(*motion) for x in (other, one))
+        assert found == pytest.approx(wanted, rel=1e-11)
+
+
+def test_what_two_bodies_share_is_at_one_place(loaded):
+    """A link that is 12 mm too long, and a bellcrank seen from behind."""
+    link = {"G": [0.0, 0.0], "H": [0.812, 0.0]}
+    with pytest.raises(DescriptionError) as error:
+        loaded("link: {points: [G, H]", f"link: {{points: {link}")
+    assert str(error.value) == (
+        "loader.yaml:20: body 'link' shares points G and H with the drawing, but they are 0.812 m "
+        "apart in its own coordinates and 0.8 m there: correct one of them"
+    )
+    crank = own_coordinates(("E", "F", "G"), 1.0, (0.0, 0.0))
+    behind = {name: [-x, z] for name, (x, z) in crank.items()}
+    with pytest.raises(DescriptionError, match="'bellcrank' is drawn from the other side, mirror"):
+        loaded("points: [F, E, G]", f"points: {behind}")
+
+
+def test_a_pin_has_any_axis(loaded):
+    named, drawn = loaded(), "tip: edge"
+    turned = loaded(drawn, f"  pins: {{E: {{axis: [0, -2, 0]}}}}\n{drawn}")
+    home = home_of(named)
+    assert turned.tree.joints["E"].axis == pytest.approx(named.tree.joints["E"].axis)
+    forces = [crane.Dynamics(x).gravity(home) for x in (named, turned)]
+    assert forces[0] == pytest.approx(forces[1], rel=1e-14)
 
 
 def test_masses_may_be_estimated(loaded):

@@ -57,6 +57,7 @@ COMMANDS = {
     "identify": (["mini_forwarder", "mini.csv", "--prior", "0.3", "--out", "result"], "result"),
     "import": (["log.csv", "--columns", "columns.txt", "--out", "result.csv"], "result.csv"),
     "modes": (["four_bar.yaml", "--out", "result"], "result"),
+    "new": (["fourbar", "--out", "result.yaml"], "result.yaml"),
     "plot": (["run.csv", "--out", "result.png"], "result.png"),
     "power": (["rig.yaml", "rig.csv", "--out", "result"], "result"),
     "sensitivities": (

@@ -1,6 +1,9 @@
-"""Commands that describe machines: list, info, check, add."""
+"""Commands that describe machines: new, list, info, check, add."""
 
-from collections.abc import Iterator
+import re
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -13,13 +16,73 @@ from crane.cli.options import (
     OutputFile,
     PackageOptions,
 )
-from crane.common.errors import InputError
+from crane.common.atomic_output import portable_file_name, replace_file
+from crane.common.errors import InputError, check_name
 from crane.common.one_line_repr import format_count
 from crane.common.package_search import (
     NEAREST_ASSEMBLY,
     check_package_folders,
     use_load_options,
 )
+
+
+@command()
+def new(
+    output: OutputFile,
+    template: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[TEMPLATE]", help="Kind of machine, see --list; a terminal is asked for it."
+        ),
+    ] = None,
+    size: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SIZE", help="Class of the machine, e.g. 20t; a terminal is asked for it."
+        ),
+    ] = None,
+    list_templates: Annotated[
+        bool, typer.Option("--list", help="List the templates and their sizes.")
+    ] = False,
+) -> None:
+    """Write a machine file from a template.
+
+    The file is that of a typical machine of a class, with hydraulics and a task, to be changed
+    into yours. It is named TEMPLATE.yaml by default.
+    """
+    from crane.description.machine_lookup import machine_summary
+
+    templates = crane.description.machine_templates()
+    if list_templates:
+        for name, sizes in templates.items():
+            for each, path in sizes.items():
+                print(f"  {name:15} {each:5} {machine_summary(path)}")
+        return
+    name = template or _ask("template", templates)
+    check_name(name, templates, f"template '{name}' is unknown")
+    sizes = templates[name]
+    size = size or (next(iter(sizes)) if len(sizes) == 1 else _ask("size", sizes, "--size "))
+    check_name(size, sizes, f"template '{name}' has no size '{size}'")
+    path = output.path(Path(f"{name}.yaml"))
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        raise InputError(f"{path}: a machine file ends in .yaml, name it so")
+    title = f"name: '{portable_file_name(path.stem)}'"
+    text = re.sub(r"(?m)^name: .*$", title, sizes[size].read_text("utf-8"), count=1)
+    with replace_file(path) as part:
+        part.write_text(text, "utf-8")
+    print(f"written to {path}, its numbers are those of {name} {size}")
+    print(crane.check(path))
+
+
+def _ask(what: str, known: Iterable[str], option: str = "") -> str:
+    """Return what the user types, of known names.
+
+    Raises:
+        InputError: There is no terminal.
+    """
+    if sys.stdin is None or not sys.stdin.isatty():
+        raise InputError(f"no {what}, give one: {option}{', '.join(known)}")
+    return str(typer.prompt(f"{what} ({', '.join(known)})"))
 
 
 @command("list")

@@ -21,7 +21,7 @@ from crane.common.package_search import use_load_options
 _GC_THRESHOLD = 20_000  # objects between collections: nearly all that starting makes stays
 
 GROUPS = {  # modules of this room and their commands, in the order of use
-    "describe": "list info check add",
+    "describe": "new list info check add",
     "simulate": "demo simulate sway modes sensitivities",
     "identify": "excite identify payload circuit calibrate",
     "rate": "workspace working-range breakout capacity stability power",
@@ -34,15 +34,14 @@ _FLAGS = ("--debug", "--strict", "--trust-xacro")  # that all commands take
 _HELP = """\
 Simulate, identify, rate and design machines with closed kinematic chains.
 
-  crane info patu655                            describe a bundled machine
+  crane new excavator --size 20t                write a machine file of your own
   crane simulate mini_forwarder --task lift     simulate a task of a machine
   crane view simulate                           show this run in a browser
 
 {commands}
 
-crane COMMAND --help shows arguments and options. --version shows the version.
-All commands take --gravity X,Y,Z (m/s2), --strict (reject physically impossible
-inertias), --trust-xacro (allow xacro files to run Python) and --debug.
+crane COMMAND --help shows options, --version the version. All take --gravity
+X,Y,Z (m/s2), --strict (impossible inertias), --trust-xacro (Python), --debug.
 """
 
 

@@ -368,7 +368,11 @@ class OptionalOutputFolder(OptionBlock):
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="FOLDER", parser=_as_path, help="Folder of the results; none by default."
+            "--out",
+            "-o",
+            metavar="FOLDER",
+            parser=_as_path,
+            help="Folder of the results; none by default.",
         ),
     ] = None
     force: Force = False
@@ -404,13 +408,10 @@ class OutputFolder(OptionalOutputFolder):
     out: Annotated[
         Path,
         typer.Option(
-            metavar="FOLDER",
-            parser=_as_path,
-            callback=_default_folder,
-            show_default=False,
-            help="Folder of the results; named like the command by default.",
+            "--out", "-o", metavar="FOLDER", parser=_as_path, callback=_default_folder,
+            show_default=False, help="Folder of the results; named like the command by default.",
         ),
-    ] = Path()
+    ] = Path()  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -421,7 +422,7 @@ class OverwriteOptions(OptionBlock):
     force: Force = False
 
 
-_OUT_FILE = typer.Option(metavar="FILE", parser=_as_path, help="The file to write.")
+_OUT_FILE = typer.Option("--out", "-o", metavar="FILE", parser=_as_path, help="The file to write.")
 
 
 @dataclass(frozen=True, kw_only=True)

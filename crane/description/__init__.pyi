@@ -11,6 +11,7 @@ from .ground_contact import Contact as Contact
 from .ground_contact import Ground as Ground
 from .machine_lookup import bundled_machines as bundled_machines
 from .machine_lookup import example_robots as example_robots
+from .machine_lookup import machine_templates as machine_templates
 from .machine_parameters import parameters as parameters
 from .sensors import Sensor as Sensor
 from .soil_cutting import SOILS as SOILS

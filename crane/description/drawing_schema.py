@@ -53,14 +53,17 @@ TUBE = section_schema(
 DRAWN_BODY = section_schema(
     "body",
     {
-        "points": NameListKey("points that it has; a point of two bodies is a pin",
-                              default=REQUIRED),
+        "points": VariantKey(
+            "points that it has; a point of two bodies is a pin. With coordinates of its own, "
+            "`{A: [0, 0], B: [0.4, 0.1]}`, of which the drawing has two points or more",
+            (NameListKey(), MapKey("", _POINT, "point")), default=REQUIRED,
+        ),
         "mass": NumberKey(
             "mass; of plates and tubes, to which it is scaled, if they are given", "kg",
             **_POSITIVE, default_text="that of plates and tubes, else an estimate",
         ),
         "centre": VariantKey(
-            "centre of mass: coordinates, or the name of a point",
+            "centre of mass: coordinates (its own, if it has them), or the name of a point",
             (NumberListKey(unit="m"), TextKey()), default_text="that of its shape",
         ),
         "inertia": VariantKey(
@@ -109,7 +112,12 @@ DRAWN_SLIDE = section_schema(
 DRAWN_PIN = section_schema(
     "pin",
     {
-        "axis": TextKey("axis of the pin, or a ball joint", default="y", choices=PIN_AXES),
+        "axis": VariantKey(
+            "axis of the pin: a direction or `[x, y, z]`; or a ball joint",
+            (TextKey(choices=PIN_AXES), NumberListKey(size=3)),
+            default="y",
+            choices=PIN_AXES,
+        ),
         "driven": FlagKey("whether a motor turns it", default=False),
         "lower": NumberKey("least angle from the posture drawn", "rad"),
         "upper": NumberKey("largest angle", "rad"),

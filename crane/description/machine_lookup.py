@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import takewhile
 from pathlib import Path
+from string import ascii_letters
 
 from crane.common.errors import DescriptionError, suggest_names
 from crane.common.package_search import LoadOptions, load_options
@@ -18,9 +19,25 @@ MACHINE_SUFFIXES = (".yaml", ".yml", ".urdf", ".xacro", ".sdf", ".world", ".xml"
 
 def bundled_machines() -> dict[str, Path]:
     """Return the machine files of the machines in the package by name."""
+    return {path.stem: path for path in sorted(_model_folder().glob("*.yaml"))}
+
+
+def machine_templates() -> dict[str, dict[str, Path]]:
+    """Return the machine files that `crane new` copies: by machine, and by size from small on."""
+    templates: dict[str, dict[str, Path]] = {}
+    for path in sorted((_model_folder() / "templates").glob("*.yaml"), key=_size_of_template):
+        name, _, size = path.stem.rpartition("_")
+        templates.setdefault(name, {})[size] = path
+    return dict(sorted(templates.items()))
+
+
+def _size_of_template(path: Path) -> float:
+    return float(path.stem.rpartition("_")[2].rstrip(ascii_letters))
+
+
+def _model_folder() -> Path:
     package = Path(__file__).resolve().parents[1]
-    folder = package / "models" if (package / "models").is_dir() else package.parent / "models"
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    return package / "models" if (package / "models").is_dir() else package.parent / "models"
 
 
 def machine_summary(path: Path) -> str:

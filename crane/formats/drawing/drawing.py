@@ -9,7 +9,7 @@ import pinocchio as pin
 
 from crane.common.errors import DescriptionError, suggest_names, warn
 from crane.common.samples import Array
-from crane.description.drawing_schema import STEEL_DENSITY
+from crane.description.drawing_schema import PIN_AXES, STEEL_DENSITY
 from crane.description.findings import FollowUpError, error_recovery
 from crane.description.kinematic_tree import Limits
 from crane.formats.drawing.body_inertia import (
@@ -20,6 +20,7 @@ from crane.formats.drawing.body_inertia import (
     spread_inertia,
     tube_inertia,
 )
+from crane.formats.drawing.body_placement import place_bodies, read_point
 from crane.formats.machine_file.yaml_section import YamlSection
 from crane.formats.steel_cylinder import SteelCylinder, sum_inertias
 
@@ -159,13 +160,15 @@ class _DrawingReader:
     def __init__(self, section: YamlSection):
         self._section = section
         self._points: dict[str, Array] = {}
+        self._placements: dict[str, pin.SE3] = {}  # of bodies with coordinates of their own
         self._piston_areas: dict[str, float] = {}  # by point the largest of cylinders there
         self._estimates: list[str] = []
 
     def read(self) -> Drawing:
         """Return the drawing."""
         section = self._section
-        self._points = section.value_map("points", _read_point)
+        self._points = section.value_map("points", read_point)
+        self._placements = place_bodies(section, self._points)
         cylinders = section.read_map("cylinders", self._read_cylinder)
         bodies = section.read_map("bodies", self._read_body)
         base = section.text("base")
@@ -184,9 +187,12 @@ class _DrawingReader:
                 f"{', '.join(self._estimates)}, give mass, plates or tubes",
                 stacklevel=4,
             )
-        return Drawing(
+        drawing = Drawing(
             base, self._points, bodies, pins, cylinders | slides, section.source_location()
         )
+        for name in cylinders:
+            _check_reach(drawing, name)
+        return drawing
 
     def _check_pin(self, name: str, location: str) -> None:
         if name not in self._points:
@@ -264,7 +270,12 @@ class _DrawingReader:
         )
 
     def _read_body(self, name: str, item: YamlSection) -> DrawnBody:
-        points = self._point_names(item, "points", least=1)
+        placement = self._placements.get(name)
+        points = (
+            self._point_names(item, "points", least=1)
+            if placement is None
+            else item.item_names("points")
+        )
         parts = [*self._read_plates(item), *self._read_tubes(item)]
         mass = item.number("mass") if "mass" in item else None
         bars = [bar for bars, _ in parts for bar in bars]
@@ -280,9 +291,10 @@ class _DrawingReader:
             )
         centre, tensor = body.lever, body.inertia
         if "centre" in item:
-            centre = self._read_centre(item)
+            centre = self._read_centre(item, placement or pin.SE3.Identity())
         if "inertia" in item:
-            tensor = _read_tensor(item)
+            turn = np.eye(3) if placement is None else placement.rotation
+            tensor = turn @ _read_tensor(item) @ turn.T
         return DrawnBody(
             points,
             tuple(bars or self._outline_bars(points)),
@@ -341,22 +353,35 @@ class _DrawingReader:
         self._estimates.append(f"'{name}' ({mass:.3g} kg)")
         return float(mass)
 
-    def _read_centre(self, item: YamlSection) -> Array:
+    def _read_centre(self, item: YamlSection, placement: pin.SE3) -> Array:
         if isinstance(item.raw_value("centre"), str):
             name = item.text("centre")
             problem = f"the centre of {item.title} is the unknown point '{name}'"
             item.check_name("centre", name, self._points, problem)
             return self._points[name]
-        return _read_point(item, "centre")
+        return np.asarray(placement.act(read_point(item, "centre")))
 
 
-def _read_point(section: YamlSection, name: str) -> Array:
-    values = section.numbers(name)
-    if len(values) not in (2, 3):
-        raise section.error_at(
-            name, f"point '{name}' has {len(values)} coordinates, give [x, z] or [x, y, z]"
+def _check_reach(drawing: Drawing, name: str) -> None:
+    """Raise where a cylinder is shorter or longer than its ends can be apart.
+
+    Ends with the arms a and b about the one pin of their bodies are |a - b| to a + b apart.
+    """
+    slide = drawing.slides[name]
+    bodies = {body for point in slide.points for body in drawing.bodies_at(point)[:1]}
+    pivots = [x for x in drawing.points if bodies <= {*drawing.bodies_at(x)}]
+    names = (*pivots, *slide.points)
+    is_planar = np.ptp([drawing.points[x][1] for x in names]) == 0
+    if len(bodies) != 2 or len(pivots) != 1 or pivots[0] in drawing.pins or not is_planar:
+        return
+    arms = [drawing.distance((pivots[0], point)) for point in slide.points]
+    least, most, longest = abs(arms[0] - arms[1]), sum(arms), slide.shortest + slide.stroke
+    if slide.shortest < least or longest > most:
+        raise DescriptionError(
+            f"{slide.location}: cylinder '{name}' is {slide.shortest:g} to {longest:g} m long, "
+            f"but its ends, which turn about {pivots[0]}, are {least:.4g} to {most:.4g} m "
+            "apart: correct its lengths, or move a point"
         )
-    return np.array(values if len(values) == 3 else (values[0], 0.0, values[1]))
 
 
 def _read_tensor(item: YamlSection) -> Array:
@@ -379,11 +404,8 @@ def _read_tensor(item: YamlSection) -> Array:
 
 
 def _read_pin(item: YamlSection) -> DrawnPin:
-    values = item.values()
-    axis, is_driven = values.pop("axis", "y"), values.pop("driven", False)
-    if axis not in (*_AXES, "ball"):
-        raise FollowUpError("the axis has been refused")
-    direction = None if axis == "ball" else np.array(_AXES[axis])
+    values, direction = item.values(), _read_axis(item)
+    is_driven = values.pop("driven", False)
     if direction is None and (values or is_driven):
         raise item.error_at(
             None, f"{item.title} is a ball joint, which has no motor and no limits"
@@ -392,3 +414,18 @@ def _read_pin(item: YamlSection) -> DrawnPin:
         direction, is_driven, Limits(**values, source_location=item.source_location()),
         item.source_location(),
     )  # fmt: skip
+
+
+def _read_axis(item: YamlSection) -> Array | None:
+    """Return the unit vector (3,) of a pin, None for a ball joint."""
+    if "axis" in item and isinstance(item.raw_value("axis"), list):
+        axis = np.array(item.numbers("axis"))
+        if len(axis) != 3 or not axis.any():
+            raise item.error_at(
+                "axis", f"the axis of {item.title} is no direction, give [x, y, z] or a name"
+            )
+        return np.asarray(axis / np.linalg.norm(axis))
+    name = item.text("axis")
+    if name not in PIN_AXES:
+        raise FollowUpError("the axis has been refused")
+    return None if name == "ball" else np.array(_AXES[name])
