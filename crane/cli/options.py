@@ -79,8 +79,7 @@ Rule = Annotated[
     str,
     typer.Option(
         metavar="RULE",
-        help="Rule of the ratings: none, iso10567, en12999, sfs4677, or iso14397 (also -crawler, "
-        "-forks, -rough).",
+        help="Rule: none, iso10567, en12999, sfs4677 or iso14397 (-crawler, -forks, -rough).",
     ),
 ]
 Outputs = Annotated[
