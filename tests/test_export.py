@@ -9,18 +9,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import singular_linkages
 from command_line import typed
+from scipy.interpolate import CubicHermiteSpline
 from warned import quiet
 
 import crane
 from crane.codegen.wasm_emitter import emit_wasm_module
 from crane.common.errors import InputError
 from crane.control import interpolate_references
+from crane.control.force_inputs import ForceInputs
 from crane.description.force_elements import Friction
 from crane.export import InstanceProgram, write_c
 from crane.export.c_sources import CSources
 from crane.export.instance_program import DYNAMICS_ROUTINES
-from crane.export.instance_routines import TOO_MANY_CALLS
+from crane.export.instance_routines import BEYOND_CHART, TOO_MANY_CALLS
 from crane.machine.payload import Payload
 
 COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
@@ -29,6 +32,7 @@ EVERY_MACHINE = (
     "excavator", "excavator_ls", "excavator_two_pumps", "kr300", "mini_forwarder", "patu655",
     "patu655_grapple", "patu655_ls", "tx40",
 )  # fmt: skip
+STEP = 1e-3
 needs_compiler = pytest.mark.skipif(not COMPILERS, reason="no C compiler is here")
 
 
@@ -120,6 +124,25 @@ def test_a_motion_with_joints_that_stick_is_that_of_simulate(tmp_path):
     assert difference < 1e-12
     stick = np.array([x for name, x in expected.channels.items() if name.startswith("rest_")])
     assert 0 < np.count_nonzero(stick) < stick.size
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("cmake"), reason="no CMake is here")
+def test_the_build_by_cmake_uses_this_processor_and_its_self_test_passes(tmp_path):
+    program = InstanceProgram(crane.load("kr300"), quantities=("forward_dynamics",))
+    for file, text in CSources(program, "m").files().items():
+        (tmp_path / file).write_text(text)
+    for native in ("OFF", "ON"):
+        flags = [f"-DCRANE_NATIVE={native}", "-DCMAKE_BUILD_TYPE=Debug"]
+        flags.append("-DCMAKE_EXPORT_COMPILE_COMMANDS=ON")
+        subprocess.run(["cmake", "-S", tmp_path, "-B", tmp_path, *flags], check=True, timeout=100)
+        commands = (tmp_path / "compile_commands.json").read_text()
+        assert ("-march=native" in commands) == (native == "ON")
+    subprocess.run(["cmake", "--build", tmp_path], check=True, timeout=300)
+    status, output = run(tmp_path / "m_test")
+    assert status == 0, output
+    assert largest_relative_difference(output) < 1e-13
 
 
 def compare_with_changes(library, machine, configurations, random):
@@ -341,6 +364,33 @@ def test_a_controller_has_its_gains_and_references_by_name():
     assert at.controller.tolist()[0] == "error_integral_q1"
     home = program.layout.view(program.defaults).inputs[:3]
     assert home == pytest.approx(machine.home[machine.closure.active])
+
+
+@needs_compiler
+def test_a_dead_centre_ends_the_motion_with_a_status(tmp_path):
+    """A slider that its drive pushes out; `simulate` passes the dead centre."""
+    machine = singular_linkages.slider_crank(tmp_path, "s", 0.3, 0.6)
+    pushed = interpolate_references(ForceInputs(machine), [0.0, 1.0], [[40.0], [40.0]])
+    expected = quiet(crane.simulate, machine, pushed, duration=0.5, step=STEP)
+    library = Library(machine, tmp_path, quantities=())
+    library.at.step[:] = STEP
+    library.at.inputs[0] = library.at.inputs_start[0] = 40.0
+    assert library("initialize") == 1
+    worst, statuses = 0.0, [1]
+    for q_a in expected.q[1:]:
+        statuses.append(library("advance"))
+        if statuses[-1] != 1:
+            break
+        worst = max(worst, abs(library.at.q[machine.closure.active] - q_a)[0])
+    assert statuses[-1] == BEYOND_CHART and library("advance") == BEYOND_CHART
+    assert (
+        library("derivatives", np.empty(library.program.chart.state_layout.size)) == BEYOND_CHART
+    )
+    assert worst < 1e-12
+    last, (end,) = library.at.q[machine.closure.active][0], library.at.time
+    motion = CubicHermiteSpline(expected.time, expected.q[:, 0], expected.v[:, 0])
+    assert last == pytest.approx(motion(end), abs=1e-9)
+    assert 0.88 < last < expected.q.max() < 0.9 + 1e-9  # of rods of 0.3 m and 0.6 m
 
 
 @needs_compiler

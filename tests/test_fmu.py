@@ -10,12 +10,13 @@ from functools import partial
 
 import numpy as np
 import pytest
+import singular_linkages
 from command_line import typed
-from warned import quiet
+from warned import quiet, told
 
 import crane
 from crane.common.errors import InputError, SimulationError
-from crane.control import FmuController, SampledCommand, ValveSignals
+from crane.control import FmuController, SampledCommand, ValveSignals, interpolate_references
 from crane.export import fmu_libraries, write_fmu
 from crane.export.fmu_variables import base_unit
 from crane.machine.payload import Payload
@@ -25,6 +26,7 @@ validate_fmu = pytest.importorskip("fmpy.validation").validate_fmu
 COMPILER = shutil.which("gcc") or shutil.which("clang")
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O1", "-shared")
 STEP = 0.01
+DELAYS = {"valve.X_lift.delay": 0.0437, "valve.X_ext.delay": 0.02}
 needs_compiler = pytest.mark.skipif(not COMPILER, reason="no C compiler is here")
 
 
@@ -36,15 +38,26 @@ def fmus(tmp_path_factory):
         patch.setattr(fmu_libraries, "find_spec", lambda name: None)
         patch.setenv("CC", COMPILER)
         patch.setattr(fmu_libraries, "_FLAGS", STRICT)
-        for name, fmi in (("mini_forwarder", 2), ("patu655", 3)):
-            quiet(write_fmu, name, folder / f"{name}.fmu", fmi)
+        forwarder = crane.load("mini_forwarder")
+        law = crane.control.make_controller("pi", forwarder)
+        for name, machine, fmi, controller in (
+            ("mini_forwarder", forwarder, 2, None),
+            ("patu655", "patu655", 3, None),
+            ("controlled", forwarder, 2, law),
+            ("delayed", crane.load("patu655", DELAYS), 3, None),
+            ("slider", singular_linkages.slider_crank(folder, "s", 0.3, 0.6), 3, None),
+        ):
+            path = folder / f"{name}.fmu"
+            _, lines = told(write_fmu, machine, path, fmi, controller=controller)
+            warned = any("the FMU has co-simulation, and no model exchange" in x for x in lines)
+            assert warned == (name == "delayed")
     return folder
 
 
 class Instance:
     """An instance of an FMU of FMI 2 or 3, by the names of its variables."""
 
-    def __init__(self, path, log=None, co_simulation=True, **start):
+    def __init__(self, path, log=None, co_simulation=True, time=0.0, **start):
         self.description = d = fmpy.read_model_description(str(path))
         self.folder = fmpy.extract(str(path))
         kind = "Slave" if co_simulation else "Model"
@@ -53,7 +66,7 @@ class Instance:
         self.fmu = getattr(module, f"FMU{d.fmiVersion[0]}{kind}")(
             guid=d.guid,
             unzipDirectory=self.folder,
-            modelIdentifier=d.modelExchange.modelIdentifier,
+            modelIdentifier=d.coSimulation.modelIdentifier,
         )
         self.log = [] if log is None else log
         self.fmu.instantiate(**self._logger())
@@ -61,10 +74,10 @@ class Instance:
         self.states = [x.variable.derivative.name for x in d.derivatives]
         self.set(**start)
         if not self.is_fmi3:
-            self.fmu.setupExperiment(startTime=0.0)
-        self.fmu.enterInitializationMode()
+            self.fmu.setupExperiment(startTime=time)
+        self.fmu.enterInitializationMode(**({"startTime": time} if self.is_fmi3 else {}))
         self.fmu.exitInitializationMode()
-        self.time = 0.0
+        self.time = time
 
     def _logger(self):
         if self.is_fmi3:
@@ -112,6 +125,26 @@ def signals(machine, times):
     }
 
 
+def held_signals(machine, times):
+    """`signals` at the samples, and the motion where each is held until the next one."""
+    moved = signals(machine, times)
+    table = np.column_stack([*moved.values()])
+    command = SampledCommand(lambda t, *motion: table[round(t / STEP)], machine, STEP)
+    return moved, quiet(crane.simulate, machine, command, duration=times[-1], step=STEP)
+
+
+def largest_difference(machine, instances, moved, expected):
+    """Of the active coordinates of instances that run side by side, over the samples."""
+    table, worst = np.column_stack([*moved.values()]), 0.0
+    for row, q_a in zip(table, expected.q[1:], strict=False):
+        for instance in instances:
+            instance.set(**dict(zip((f"{x}__signal" for x in moved), row, strict=True)))
+            instance.step()
+            found = instance.get(*coordinates(machine))
+            worst = max(worst, np.abs(found - q_a).max())
+    return worst
+
+
 class Constant(crane.control.ControlLaw):
     """Constant forces."""
 
@@ -143,44 +176,132 @@ def test_files_are_valid(fmus, name):
 @pytest.mark.slow
 def test_co_simulation_of_eight_instances_is_that_of_simulate(fmus):
     machine, times = crane.load("patu655"), STEP * np.arange(101)
-    moved = signals(machine, times)
-    table = np.column_stack([*moved.values()])
-    command = SampledCommand(lambda t, *motion: table[round(t / STEP)], machine, STEP)
-    expected = quiet(crane.simulate, machine, command, duration=1.0, step=STEP)
+    moved, expected = held_signals(machine, times)
     instances = [Instance(fmus / "patu655.fmu") for _ in range(8)]
-    worst = 0.0
-    for i in range(100):
-        for instance in instances:
-            instance.set(**{f"{x}__signal": table[i, j] for j, x in enumerate(moved)})
-            instance.step()
-        found = [x.get(*coordinates(machine)) for x in instances]
-        assert all(np.array_equal(x, found[0]) for x in found)
-        worst = max(worst, np.abs(found[0] - expected.q[i + 1]).max())
-    assert worst < 1e-12  # [m], [rad]
+    assert largest_difference(machine, instances, moved, expected) < 1e-12  # [m], [rad]
+    found = np.array([x.get(*coordinates(machine)) for x in instances])
+    assert np.array_equal(found, np.tile(found[0], (8, 1)))
 
 
 @needs_compiler
 @pytest.mark.slow
-def test_inputs_with_slopes_are_those_of_valve_signals(fmus, tmp_path):
+def test_dead_times_are_those_of_simulate(fmus):
+    """Of signals that are held: at any start time, and as parameters of another FMU."""
+    path, machine = fmus / "delayed.fmu", crane.load("patu655", DELAYS)
+    assert validate_fmu(str(path)) == []
+    moved, expected = held_signals(machine, STEP * np.arange(101))
+    instances = [Instance(path, time=0.25), Instance(path)]
+    assert largest_difference(machine, instances, moved, expected) < 1e-12
+    moved, expected = held_signals(crane.load("patu655"), STEP * np.arange(51))
+    changed = Instance(path, X_lift__delay=0.0, X_ext__delay=0.0)
+    assert largest_difference(machine, [changed], moved, expected) < 1e-12
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_model_exchange_is_refused_where_valves_have_dead_times(fmus):
+    assert fmpy.read_model_description(str(fmus / "delayed.fmu")).modelExchange is None
+    log, failure = [], fmpy.fmi1.FMICallException
+    with pytest.raises(Exception, match="nstantiate"):
+        Instance(fmus / "delayed.fmu", log, co_simulation=False)
+    assert log == [b"valves have dead times, which model exchange has not: take co-simulation"]
+    with pytest.raises(failure):
+        Instance(fmus / "delayed.fmu", log, X_lift__delay=-1.0)
+    assert b"X_lift.delay is -1, give it at least 0" in log[-1]
+    instance = Instance(fmus / "delayed.fmu", log)
+    with pytest.raises(failure):
+        for _ in range(100):
+            instance.step(1e-4)
+    assert b"the dead time of a valve takes more calls than are kept" in log[-1]
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_a_dead_centre_ends_a_step_with_a_message(fmus):
+    """A slider that its drive pushes out; it is then where it was before the step."""
+    path, log, failure = fmus / "slider.fmu", [], fmpy.fmi1.FMICallException
+    instance = Instance(path, log, s__force=40.0)
+    with pytest.raises(failure):
+        for _ in range(500):
+            before = instance.get("s.stroke", "s.rate")
+            instance.step(1e-3)
+    assert b"a dead centre: the active joints do not determine the motion" in log[-1]
+    assert np.array_equal(instance.get("s.stroke", "s.rate"), before)
+    assert 0.85 < before[0] < 0.9
+    instance = Instance(path, log, co_simulation=False, s__force=40.0)
+    states = instance.get(*instance.states)
+    log.clear()
+    with pytest.raises(failure):
+        for _ in range(200):
+            instance.rates(states)
+            instance.fmu.completedIntegratorStep()
+            states[0] += 1e-3
+    assert b"a dead centre: the active joints do not determine the motion" in log[-1]
+    assert 0.89 < states[0] < 0.9
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_references_with_slopes_are_those_of_a_trajectory(fmus):
+    """PI through a task, whose references are linear between samples, with other gains."""
+    machine = crane.load("mini_forwarder")
+    reference = crane.task_trajectory(machine, "lift")
+    gains = machine.control | {"X1": crane.description.PIGains(2e4, 1e4)}
+    law, times = crane.PI(machine, reference, gains), STEP * np.arange(201)
+    rows, start = law.references(times), reference.position(0.0)
+    sampled = interpolate_references(law, times, rows)
+    expected = quiet(
+        crane.simulate, machine, sampled, initial=start, duration=times[-1], step=STEP
+    )
+    names = [f"{x}.reference" for x in machine.active]
+    given = dict(zip(coordinates(machine), start, strict=True))
+    given |= dict(zip(names, rows[0], strict=True)) | {"X1.kp": 2e4, "X1.ki": 1e4}
+    instances = [
+        Instance(fmus / "controlled.fmu", **{x.replace(".", "__"): y for x, y in given.items()})
+        for _ in range(2)
+    ]
+    worst = 0.0
+    for i, q_a in enumerate(expected.q[1:]):
+        for instance in instances:
+            references = [instance.references[x] for x in names]
+            instance.fmu.setReal(references, [*rows[i]])
+            slopes = (rows[i + 1] - rows[i]) / STEP
+            instance.fmu.setRealInputDerivatives(references, [1] * len(names), [*slopes])
+            instance.step()
+            found = instance.get(*coordinates(machine))
+            worst = max(worst, np.abs(found - q_a).max())
+    assert worst < 1e-12
+    assert np.ptp(expected.q, axis=0).max() > 1e-3
+    assert "X1.error_integral" in instance.states
+    log = []
+    instance = Instance(fmus / "controlled.fmu", log)
+    force, reference = instance.references["X1.force"], instance.references["X1.reference"]
+    for where, order, slope in ((force, 1, 0.0), (reference, 2, 0.0), (reference, 1, np.nan)):
+        with pytest.raises(fmpy.fmi1.FMICallException):
+            instance.fmu.setRealInputDerivatives([where], [order], [slope])
+        assert log.pop() == b"give finite first derivatives, of inputs"
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_forces_in_co_simulation_are_those_of_simulate(fmus, tmp_path):
     machine = crane.load("mini_forwarder")
     forces = 1.02 * crane.Dynamics(machine).gravity(machine.home[machine.closure.active])
     expected = quiet(crane.simulate, machine, Constant(machine, forces), duration=0.5, step=STEP)
     instance = Instance(fmus / "mini_forwarder.fmu")
-    names = [f"{x}.force" for x in machine.active[1:]]
-    references = [instance.references[x] for x in names]
-    for i in range(50):  # forces that jump to half and go to their value and back in a step
-        instance.set(**{f"{machine.active[0]}__torque" if 0 else "q1__force": forces[0]})
-        instance.set(**dict(zip((x.replace(".", "__") for x in names), forces[1:], strict=True)))
-        instance.fmu.setRealInputDerivatives(references, [1] * 2, [0.0] * 2)
+    names = [f"{x}.force" for x in machine.active]
+    for q_a in expected.q[1:]:
+        instance.fmu.setReal([instance.references[x] for x in names], [*forces])
         instance.step()
-        assert np.abs(instance.get(*coordinates(machine)) - expected.q[i + 1]).max() < 1e-12
+        assert np.abs(instance.get(*coordinates(machine)) - q_a).max() < 1e-12
 
 
 @needs_compiler
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["mini_forwarder", "patu655"])
+@pytest.mark.parametrize("name", ["mini_forwarder", "patu655", "controlled"])
 def test_model_exchange_by_cvode_is_that_of_simulate(fmus, name):
-    machine, path = crane.load(name), str(fmus / f"{name}.fmu")
+    machine = crane.load(name.replace("controlled", "mini_forwarder"))
+    path = str(fmus / f"{name}.fmu")
     if name == "patu655":
         spools = machine.hydraulics.spools
         values = {
@@ -189,6 +310,11 @@ def test_model_exchange_by_cvode_is_that_of_simulate(fmus, name):
         }
         control = ValveSignals(machine, [0.0], {x: [y] for x, y in values.items()})
         start = {f"{x}.signal": y for x, y in values.items()}
+    elif name == "controlled":  # to references that are 1 cm or 0.01 rad from home
+        row = machine.home[machine.closure.active] + 0.01
+        law = crane.control.make_controller("pi", machine)
+        control = interpolate_references(law, [0.0, 2.0], [row, row])
+        start = {f"{x}.reference": y for x, y in zip(machine.active, row, strict=True)}
     else:
         forces = 1.02 * crane.Dynamics(machine).gravity(machine.home[machine.closure.active])
         control = Constant(machine, forces)
@@ -205,17 +331,19 @@ def test_model_exchange_by_cvode_is_that_of_simulate(fmus, name):
 @needs_compiler
 @pytest.mark.slow
 def test_a_saved_state_goes_on_bit_for_bit(fmus):
-    instance = Instance(fmus / "patu655.fmu", X_lift__signal=7.0, slew__signal=4.0)
+    instance = Instance(fmus / "delayed.fmu", X_lift__signal=7.0, slew__signal=4.0)
     names = [x.name for x in instance.description.modelVariables]
     for _ in range(30):
         instance.step()
+    instance.set(X_lift__signal=4.0)  # which its spool has not got at the saved state
+    instance.step()
     state = instance.fmu.getFMUState()
     data = instance.fmu.serializeFMUState(state)
     time = instance.time
     for _ in range(30):
         instance.step()
     expected = instance.get(*names)
-    other = Instance(fmus / "patu655.fmu")
+    other = Instance(fmus / "delayed.fmu")
     for target in (instance, other):
         restored = target.fmu.deserializeFMUState(data)
         target.fmu.setFMUState(restored)
@@ -285,7 +413,7 @@ def test_wrong_values_end_in_a_status_with_a_message(fmus):
     for start, text in (
         ({"X_lift__stroke": 9.0}, "the start of X_lift.stroke is 9, set it between"),
         ({"X_lift__signal": np.nan}, "X_lift.signal is set to nan at t = 0 s, give it a finite"),
-        ({"payload__mass": -1.0}, "payload.mass is -1 kg, give it at least 0"),
+        ({"payload__mass": -1.0}, "payload.mass is -1, give it at least 0"),
         ({"kinetic": 1.0}, "kinetic cannot be set, it is computed"),
     ):
         log = []

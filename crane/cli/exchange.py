@@ -5,7 +5,7 @@ import warnings
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -100,27 +100,29 @@ def export(
     """Write a machine as a program for another environment."""
     check_name(to, _TARGETS, f"--to is '{to}'")
     if to == "fmu":
-        others = {"--name": name or None, "--controller": controller}
-        refuse_options(others, "is for --to c, leave it out")
-        _write_fmu(options.load(machine), output, fmi)
-        return
-    refuse_options({"--fmi": fmi != 3 or None}, "is for --to fmu, leave it out")
-    check_folder_is_writable(output.out, output.force)
-    loaded = options.load(machine)
-    if to == "c":
-        law = None if controller is None else crane.control.make_controller(controller, loaded)
+        refuse_options({"--name": name or None}, "is not for --to fmu, leave it out")
+    else:
+        refuse_options({"--fmi": fmi != 3 or None}, "is for --to fmu, leave it out")
+        check_folder_is_writable(output.out, output.force)
+    if to == "ros2_control":
+        refuse_options({"--controller": controller}, "is for --to c or fmu, leave it out")
+    loaded, law = options.load(machine), None
+    if controller is not None:
+        law = crane.control.make_controller(controller, loaded)
+    if to == "fmu":
+        _write_fmu(loaded, output, fmi, law)
+    elif to == "c":
         written = crane.export.write_c(
             loaded, output.out, controller=law, name=name, overwrite=output.force
         )
         print(f"written to {written}: see its header, or cmake -B build -S {written}")
     else:
-        refuse_options({"--controller": controller}, "is for --to c, leave it out")
         write = crane.export.write_ros2_control
         written = write(loaded, output.out, name=name, overwrite=output.force)
         print(f"written to {written}: a package for colcon build")
 
 
-def _write_fmu(machine: "crane.Machine", output: OutputPath, fmi: int) -> None:
+def _write_fmu(machine: "crane.Machine", output: OutputPath, fmi: int, law: Any) -> None:
     """Write a machine as an FMU, with its sketch as icon and its facts as documentation."""
     from crane.view.notebook import to_html
 
@@ -133,8 +135,8 @@ def _write_fmu(machine: "crane.Machine", output: OutputPath, fmi: int) -> None:
         icon = (Path(folder) / "icon.png").read_bytes()
     about = to_html(machine) or ""
     with status("compiling the machine"):
-        crane.export.write_fmu(machine, path, fmi, icon=icon, about=about)
-    print(f"written to {path}: an FMU of FMI {fmi} for model exchange and co-simulation")
+        crane.export.write_fmu(machine, path, fmi, controller=law, icon=icon, about=about)
+    print(f"written to {path}: an FMU of FMI {fmi}")
 
 
 def _output_format(out: Path, to: str | None) -> str:

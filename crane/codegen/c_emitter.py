@@ -6,8 +6,8 @@ C libraries of microcontrollers lack.
 """
 
 import math
-from collections.abc import Sequence
-from functools import singledispatchmethod
+import re
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from crane.codegen.linked_functions import LinkedFunction, variables_read
@@ -25,8 +25,8 @@ from crane.codegen.routine_statements import (
     RoutineValue,
     StoreStatement,
 )
-from crane.codegen.symbolic import SymbolicExpression, required_operations
-from crane.codegen.vector_layout import Formula
+from crane.codegen.symbolic import SymbolicExpression
+from crane.codegen.vector_layout import Formula, assign_memory_slots
 
 C_PRELUDE = """\
 #define MATH1(name, x) (sizeof(real) < 8 ? (real)name##f((float)(x)) : (real)name(x))
@@ -93,25 +93,23 @@ def c_parameters(linked: LinkedFunction) -> str:
 
 
 def _emit_formula(linked: LinkedFunction, formula: Formula) -> str:
-    name = linked.name
-    symbolic = [x for x in formula.outputs if isinstance(x, SymbolicExpression)]
-    operations = symbolic[0].tape.operations if symbolic else []
-    order = [i for i in required_operations(formula.outputs) if operations[i][0] != "load"]
+    name, order, operations = linked.name, formula.order, formula.operations
     pieces = [order[i : i + PIECE_LENGTH] for i in range(0, len(order), PIECE_LENGTH)] or [[]]
-    slots = _memory_slots(operations, pieces, formula)
+    slots = assign_memory_slots(pieces, operations)
+    targets = {index: [f"w[{slot}]"] for index, slot in slots.items()}
+    copies, computed = [], {*order}
+    for i, x in enumerate(formula.outputs):
+        if isinstance(x, SymbolicExpression) and x.index in computed:
+            targets.setdefault(x.index, []).append(f"out[{i}]")
+        else:
+            copied = x.index if isinstance(x, SymbolicExpression) else float(x)
+            copies.append(f"out[{i}] = {_operand(copied, operations, slots, computed)};")
     inputs = list(linked.arguments[:-1])
     parameters = ", ".join([*(f"const real *restrict {x}" for x in inputs), "real *restrict out"])
     texts, calls = [], []
     for number, piece in enumerate(pieces):
-        lines = _piece_lines(operations, piece, slots)
-        if number == len(pieces) - 1:
-            local = set(piece)
-            lines += [
-                f"out[{i}] = {_operand(x.index, operations, slots, local)};"
-                if isinstance(x, SymbolicExpression)
-                else f"out[{i}] = {format_c_real(float(x))};"
-                for i, x in enumerate(formula.outputs)
-            ]
+        lines = _piece_lines(operations, piece, slots, targets)
+        lines += copies if number == len(pieces) - 1 else []
         if len(pieces) == 1:
             return _function_text(f"void {name}({parameters})", [*inputs, "out"], lines)
         head = f"void {name}_{number}({parameters}, real *restrict w)"
@@ -122,41 +120,18 @@ def _emit_formula(linked: LinkedFunction, formula: Formula) -> str:
     return "\n".join(texts)
 
 
-def _memory_slots(
-    operations: Sequence[tuple], pieces: Sequence[Sequence[int]], formula: Formula
-) -> dict[int, int]:
-    """Memory slots of the values that a later piece uses."""
-    piece_of = {index: number for number, piece in enumerate(pieces) for index in piece}
-    last = dict(piece_of)
-    uses = [
-        (x, number)
-        for index, number in piece_of.items()
-        for x in operations[index][1:]
-        if type(x) is int
-    ]
-    outputs = [x.index for x in formula.outputs if isinstance(x, SymbolicExpression)]
-    for x, number in [*uses, *((index, len(pieces) - 1) for index in outputs)]:
-        if x in last:
-            last[x] = max(last[x], number)
-    slots: dict[int, int] = {}
-    free: list[int] = []
-    for number, piece in enumerate(pieces):
-        for index in (x for x in piece if last[x] > number):
-            slots[index] = free.pop() if free else 1 + max(slots.values(), default=-1)
-        free += [slots[i] for i in slots if last[i] == number]
-    return slots
-
-
 def _piece_lines(
-    operations: Sequence[tuple], piece: Sequence[int], slots: dict[int, int]
+    operations: Sequence[tuple],
+    piece: Sequence[int],
+    slots: Mapping[int, int],
+    targets: Mapping[int, Sequence[str]],
 ) -> list[str]:
-    local, lines = set(piece), []
+    local, lines = {*piece}, []
     for index in piece:
         kind, *operands = operations[index]
         words = [_operand(x, operations, slots, local) for x in operands]
         lines.append(f"const real v{index} = {_operation_text(kind, words)};")
-        if index in slots:
-            lines.append(f"w[{slots[index]}] = v{index};")
+        lines += [f"{target} = v{index};" for target in targets.get(index, ())]
     return lines
 
 
@@ -177,7 +152,7 @@ def _operation_text(kind: str, words: list[str]) -> str:
 
 
 def _operand(
-    x: int | float, operations: Sequence[tuple], slots: dict[int, int], local: set[int]
+    x: int | float, operations: Sequence[tuple], slots: Mapping[int, int], local: set[int]
 ) -> str:
     if not isinstance(x, int):
         return format_c_real(x) if x >= 0 else f"({format_c_real(x)})"
@@ -189,9 +164,12 @@ def _operand(
 
 def _function_text(head: str, parameters: Sequence[str], lines: Sequence[str]) -> str:
     """A static function; parameters that no line uses are named, for compilers that warn."""
-    body = "\n".join(lines)
-    unused = [f"(void){x};" for x in parameters if f"{x}[" not in body]
-    return "\n".join([f"static {head}", "{", *(f"    {x}" for x in (*lines, *unused)), "}", ""])
+    unused = [f"(void){x};" for x in parameters if not _has_word(lines, x)]
+    return "\n".join([f"static {head}", "{", *(f"    {x}" for x in (*unused, *lines)), "}", ""])
+
+
+def _has_word(lines: Sequence[str], word: str) -> bool:
+    return any(re.search(rf"\b{word}\b", line) for line in lines)
 
 
 class _CRoutineEmitter:
@@ -200,37 +178,20 @@ class _CRoutineEmitter:
     def __init__(self, linked: LinkedFunction, routine: Routine):
         self._linked, self._routine = linked, routine
         self._lines: list[str] = []
-        self._indent = 1
+        self._indent = 0
 
     def text(self) -> str:
         """The routine as a function."""
-        routine, linked = self._routine, self._linked
+        routine, linked, read = self._routine, self._linked, variables_read(self._routine)
         self._emit_block(routine.statements)
-        read = variables_read(routine)
-        # compilers do not see that arrays are filled before they are read
-        arrays = routine.local_arrays.items()
-        declarations = [f"real {name}[{max(1, n)}] = {{0}};" for name, n in arrays]
+        arrays = [(x, n) for x, n in routine.local_arrays.items() if _has_word(self._lines, x)]
         names = [(_TYPES[x.kind], x.operands[0]) for x in routine.variables]
-        declarations += [f"{kind} {name};" for kind, name in names]
-        unread = [f"(void){name};" for _, name in names if name not in read]
-        body = "\n".join(self._lines)
-        unread += [
-            f"(void){name};"
-            for name in (*linked.arguments, *routine.local_arrays)
-            if not _has_word(body, name)
-        ]
-        return "\n".join(
-            [
-                f"static int {linked.name}({c_parameters(linked)})",
-                "{",
-                *(f"    {x}" for x in declarations),
-                *self._lines,
-                *(f"    {x}" for x in unread),
-                "    return 0;",
-                "}",
-                "",
-            ]
-        )
+        lines = [f"real {name}[{max(1, n)}];" for name, n in arrays]
+        lines += [f"{kind} {name};" for kind, name in names]
+        lines += self._lines
+        lines += [f"(void){name};" for _, name in names if name not in read]
+        head = f"int {linked.name}({c_parameters(linked)})"
+        return _function_text(head, linked.arguments, [*lines, "return 0;"])
 
     def _emit_block(self, statements: Sequence[RoutineStatement]) -> None:
         for statement in statements:
@@ -246,55 +207,35 @@ class _CRoutineEmitter:
         self._indent -= 1
         self._line("}")
 
-    @singledispatchmethod
     def _emit(self, statement: RoutineStatement) -> None:
-        raise TypeError(f"no statement: {statement!r}")
-
-    @_emit.register
-    def _(self, statement: AssignmentStatement) -> None:
-        self._line(f"{statement.variable.operands[0]} = {_value(statement.value)};")
-
-    @_emit.register
-    def _(self, statement: StoreStatement) -> None:
-        self._line(f"{_element(statement.pointer)} = {_value(statement.value)};")
-
-    @_emit.register
-    def _(self, statement: CopyStatement) -> None:
-        if statement.count:
-            target, source = _pointer(statement.target), _pointer(statement.source)
-            self._line(f"memcpy({target}, {source}, {statement.count} * sizeof(real));")
-
-    @_emit.register
-    def _(self, statement: CallStatement) -> None:
-        callee = self._linked.callees[statement.function]
-        passed = callee.passed(statement.arguments)
-        words = [_pointer(x) if isinstance(x, ArrayPointer) else _value(x) for x in passed]
-        call = f"{callee.name}({', '.join(words)});"
-        result = statement.result
-        self._line(call if result is None else f"{result.operands[0]} = {call}")
-
-    @_emit.register
-    def _(self, statement: LoopStatement) -> None:
-        if statement.index is None or statement.count is None:
-            self._emit_body("for (;;)", statement.body)
-            return
-        x = statement.index.operands[0]
-        head = f"for ({x} = 0; {x} < {_value(statement.count)}; ++{x})"
-        self._emit_body(head, statement.body)
-
-    @_emit.register
-    def _(self, statement: ConditionStatement) -> None:
-        self._emit_body(f"if ({_value(statement.test)})", statement.body)
-        if statement.otherwise:
-            self._emit_body("else", statement.otherwise)
-
-    @_emit.register
-    def _(self, statement: BreakStatement) -> None:
-        self._line("break;")
-
-    @_emit.register
-    def _(self, statement: ReturnStatement) -> None:
-        self._line(f"return {_value(statement.value)};")
+        match statement:
+            case AssignmentStatement(variable, value):
+                self._line(f"{variable.operands[0]} = {_value(value)};")
+            case StoreStatement(pointer, value):
+                self._line(f"{_element(pointer)} = {_value(value)};")
+            case CopyStatement(target, source, count) if count:
+                size = f"{count} * sizeof(real)"
+                self._line(f"memcpy({_pointer(target)}, {_pointer(source)}, {size});")
+            case CallStatement(function, arguments, result):
+                callee = self._linked.callees[function]
+                passed = callee.passed(arguments)
+                words = [_pointer(x) if isinstance(x, ArrayPointer) else _value(x) for x in passed]
+                call = f"{callee.name}({', '.join(words)});"
+                self._line(call if result is None else f"{result.operands[0]} = {call}")
+            case LoopStatement(index, count, body):
+                head = "for (;;)"
+                if index is not None and count is not None:
+                    x = index.operands[0]
+                    head = f"for ({x} = 0; {x} < {_value(count)}; ++{x})"
+                self._emit_body(head, body)
+            case ConditionStatement(test, body, otherwise):
+                self._emit_body(f"if ({_value(test)})", body)
+                if otherwise:
+                    self._emit_body("else", otherwise)
+            case BreakStatement():
+                self._line("break;")
+            case ReturnStatement(value):
+                self._line(f"return {_value(value)};")
 
 
 def _pointer(array: ArrayPointer) -> str:
@@ -330,7 +271,3 @@ def _routine_constant(value: float) -> str:
     single = single_precision_tolerance(value)
     same = single == value or math.isnan(value)
     return format_c_real(value) if same else f"TOLERANCE({value!r}, {single:.8g})"
-
-
-def _has_word(text: str, word: str) -> bool:
-    return any(f"{word}{end}" in text for end in "[,) +;")

@@ -1,8 +1,9 @@
 """Layouts: names of the parts of a vector; formulas, which compute one."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 from crane.codegen.symbolic import Scalar, SymbolicExpression, required_operations
@@ -89,9 +90,54 @@ class Formula:
         return tuple("array" for _ in range(self.input_count + 1))
 
     @property
+    def operations(self) -> Sequence[tuple]:
+        """All operations of its tape."""
+        tapes = (x.tape for x in self.outputs if isinstance(x, SymbolicExpression))
+        return next((tape.operations for tape in tapes), ())
+
+    @cached_property
+    def order(self) -> list[int]:
+        """Indices of the operations that it computes, in order."""
+        operations = self.operations
+        return [i for i in required_operations(self.outputs) if operations[i][0] != "load"]
+
+    @property
     def loads(self) -> set[tuple[int, int]]:
         """Elements that it reads: indices of the input argument and in it."""
-        tapes = [x.tape for x in self.outputs if isinstance(x, SymbolicExpression)]
-        operations = tapes[0].operations if tapes else []
+        operations = self.operations
         used = [operations[i] for i in required_operations(self.outputs)]
         return {(x[1], x[2]) for x in used if x[0] == "load"}
+
+
+def operand_indices(operation: tuple) -> list[int]:
+    """Indices of the operations whose values an operation takes."""
+    return [] if operation[0] == "load" else [x for x in operation[1:] if isinstance(x, int)]
+
+
+def assign_memory_slots(
+    pieces: Sequence[Collection[int]], operations: Sequence[tuple]
+) -> dict[int, int]:
+    """Memory slots of values that later pieces of a formula need, reused after the last use.
+
+    Args:
+        pieces: Indices of the operations of each piece.
+        operations: All operations.
+    """
+    piece_of = {index: number for number, piece in enumerate(pieces) for index in piece}
+    last = {
+        x: number
+        for number, piece in enumerate(pieces)
+        for index in piece
+        for x in operand_indices(operations[index])
+        if piece_of.get(x, number) < number
+    }
+    slots: dict[int, int] = {}
+    free: list[int] = []
+    count = 0
+    for number, piece in enumerate(pieces):
+        for index in sorted(last.keys() & piece):
+            if not free:
+                free, count = [count], count + 1
+            slots[index] = free.pop()
+        free += sorted(slots[x] for x, end in last.items() if end == number)
+    return slots

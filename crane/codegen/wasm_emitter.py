@@ -8,7 +8,6 @@ sin, cos, exp, log and tanh.
 import struct
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from functools import singledispatchmethod
 
 from crane.codegen.linked_functions import LinkedFunction
 from crane.codegen.routine_statements import (
@@ -25,8 +24,8 @@ from crane.codegen.routine_statements import (
     RoutineValue,
     StoreStatement,
 )
-from crane.codegen.symbolic import SymbolicExpression, required_operations
-from crane.codegen.vector_layout import Formula
+from crane.codegen.symbolic import SymbolicExpression
+from crane.codegen.vector_layout import Formula, operand_indices
 
 IMPORTED_FUNCTIONS = ("sin", "cos", "exp", "log", "tanh")
 PAGE_SIZE = 65_536
@@ -164,26 +163,22 @@ class _FormulaEmitter:
     def __init__(self, linked: LinkedFunction, formula: Formula):
         self._arguments = {name: unsigned(i) for i, name in enumerate(linked.arguments)}
         self._formula = formula
-        symbolic = [x for x in formula.outputs if isinstance(x, SymbolicExpression)]
-        self._operations = symbolic[0].tape.operations if symbolic else []
-        self._order = required_operations(formula.outputs)
-        uses = Counter(x.index for x in symbolic)
-        for index in self._order:
-            kind, *operands = self._operations[index]
-            if kind != "load":
-                uses.update(x for x in operands if type(x) is int)
+        self._operations = formula.operations
+        uses = Counter(x.index for x in formula.outputs if isinstance(x, SymbolicExpression))
+        for index in formula.order:
+            uses.update(operand_indices(self._operations[index]))
         self._uses, self._depth = uses, dict[int, int]()
         self._local_of: dict[int, bytes] = {}
 
     def body(self) -> bytes:
         """Local variables and instructions."""
         code, first = bytearray(), len(self._arguments)
-        for index in self._order:
-            kind, *operands = self._operations[index]
-            inner = [self._depth.get(x, 0) for x in operands if type(x) is int]
-            self._depth[index] = 0 if kind == "load" else 1 + max(inner, default=0)
-            repeated = self._uses[index] > 1 and kind != "load"
-            if repeated or self._depth[index] > _MAX_DEPTH or kind == "positive":
+        for index in self._formula.order:
+            operation = self._operations[index]
+            inner = [self._depth.get(x, 0) for x in operand_indices(operation)]
+            self._depth[index] = 1 + max(inner, default=0)
+            is_deep = self._depth[index] > _MAX_DEPTH
+            if self._uses[index] > 1 or is_deep or operation[0] == "positive":
                 code += self._compute(index)
                 self._local_of[index] = unsigned(first + len(self._local_of))
                 code += _SET + self._local_of[index]
@@ -257,67 +252,50 @@ class _WasmRoutineEmitter:
         for statement in statements:
             self._emit(statement)
 
-    @singledispatchmethod
     def _emit(self, statement: RoutineStatement) -> None:
-        raise TypeError(f"no statement: {statement!r}")
-
-    @_emit.register
-    def _(self, statement: AssignmentStatement) -> None:
-        self._code += self._value(statement.value) + self._set(statement.variable)
-
-    @_emit.register
-    def _(self, statement: StoreStatement) -> None:
-        self._code += self._pointer(statement.pointer) + self._value(statement.value) + _store(0)
-
-    @_emit.register
-    def _(self, statement: CopyStatement) -> None:
-        pointers = self._pointer(statement.target) + self._pointer(statement.source)
-        self._code += pointers + _integer(_NUMBER_SIZE * statement.count) + _MEMORY_COPY
-
-    @_emit.register
-    def _(self, statement: CallStatement) -> None:
-        callee = self._linked.callees[statement.function]
-        for x in callee.passed(statement.arguments):
-            self._code += self._pointer(x) if isinstance(x, ArrayPointer) else self._value(x)
-        self._code += _CALL + unsigned(self._indices[callee.name])
-        if statement.result is not None:
-            self._code += self._set(statement.result)
-
-    @_emit.register
-    def _(self, statement: LoopStatement) -> None:
-        index, count = statement.index, statement.count
-        if index is not None:
-            self._code += _integer(0) + self._set(index)
-        self._code += _BLOCK + _EMPTY + _LOOP + _EMPTY
-        self._depth += 2
-        self._loop_ends.append(self._depth - 2)
-        if index is not None and count is not None:
-            self._code += self._value(index < count) + _IS_ZERO + _BRANCH_IF + unsigned(1)
-        self._emit_block(statement.body)
-        if index is not None:
-            self._code += self._value(index + 1) + self._set(index)
-        self._code += _BRANCH + unsigned(0) + _END + _END
-        self._loop_ends.pop()
-        self._depth -= 2
-
-    @_emit.register
-    def _(self, statement: ConditionStatement) -> None:
-        self._code += self._value(statement.test) + _IF + _EMPTY
-        self._depth += 1
-        self._emit_block(statement.body)
-        if statement.otherwise:
-            self._code += _ELSE
-            self._emit_block(statement.otherwise)
-        self._code += _END
-        self._depth -= 1
-
-    @_emit.register
-    def _(self, statement: BreakStatement) -> None:
-        self._code += _BRANCH + unsigned(self._depth - self._loop_ends[-1] - 1)
-
-    @_emit.register
-    def _(self, statement: ReturnStatement) -> None:
-        self._emit_return(self._value(statement.value))
+        match statement:
+            case AssignmentStatement(variable, value):
+                self._code += self._value(value) + self._set(variable)
+            case StoreStatement(pointer, value):
+                self._code += self._pointer(pointer) + self._value(value) + _store(0)
+            case CopyStatement(target, source, count):
+                pointers = self._pointer(target) + self._pointer(source)
+                self._code += pointers + _integer(_NUMBER_SIZE * count) + _MEMORY_COPY
+            case CallStatement(function, arguments, result):
+                callee = self._linked.callees[function]
+                for x in callee.passed(arguments):
+                    word = self._pointer(x) if isinstance(x, ArrayPointer) else self._value(x)
+                    self._code += word
+                self._code += _CALL + unsigned(self._indices[callee.name])
+                if result is not None:
+                    self._code += self._set(result)
+            case LoopStatement(index, count, body):
+                if index is not None:
+                    self._code += _integer(0) + self._set(index)
+                self._code += _BLOCK + _EMPTY + _LOOP + _EMPTY
+                self._depth += 2
+                self._loop_ends.append(self._depth - 2)
+                if index is not None and count is not None:
+                    self._code += self._value(index < count) + _IS_ZERO + _BRANCH_IF + unsigned(1)
+                self._emit_block(body)
+                if index is not None:
+                    self._code += self._value(index + 1) + self._set(index)
+                self._code += _BRANCH + unsigned(0) + _END + _END
+                self._loop_ends.pop()
+                self._depth -= 2
+            case ConditionStatement(test, body, otherwise):
+                self._code += self._value(test) + _IF + _EMPTY
+                self._depth += 1
+                self._emit_block(body)
+                if otherwise:
+                    self._code += _ELSE
+                    self._emit_block(otherwise)
+                self._code += _END
+                self._depth -= 1
+            case BreakStatement():
+                self._code += _BRANCH + unsigned(self._depth - self._loop_ends[-1] - 1)
+            case ReturnStatement(value):
+                self._emit_return(self._value(value))
 
     def _set(self, variable: RoutineValue) -> bytes:
         return _SET + self._local_of[variable.operands[0]]

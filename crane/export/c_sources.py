@@ -1,7 +1,7 @@
 """C99 sources of a machine: header, functions, self-test with recorded vectors, examples."""
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib.resources import files
 from pathlib import Path
 from types import MappingProxyType
@@ -11,7 +11,6 @@ import numpy as np
 import crane
 from crane.codegen.c_emitter import C_PRELUDE, c_parameters, emit_c_function
 from crane.codegen.linked_functions import LinkedFunction
-from crane.codegen.symbolic import SymbolicExpression, required_operations
 from crane.codegen.vector_layout import Formula
 from crane.common.atomic_output import check_folder_is_writable, replace_folder
 from crane.common.samples import Array
@@ -128,10 +127,11 @@ class FunctionSources:
     def __init__(self, program: InstanceProgram | KinematicsProgram, name: str = ""):
         self._program, self.name = program, c_identifier(name or program.machine.name)
         self._values = [
-            _number(x) if x == y else f"sizeof({self.name}_real) < 8 ? {_number(y)} : {_number(x)}"
+            c_number(x)
+            if x == y
+            else f"sizeof({self.name}_real) < 8 ? {c_number(y)} : {c_number(x)}"
             for x, y in zip(program.defaults, program.single_precision_defaults, strict=True)
         ]
-        self._loads = instance_loads(program)
 
     def fill(self, template: str, further: Mapping[str, str] = MappingProxyType({})) -> str:
         """The text of a template with the values of the machine in place of @VALUE@."""
@@ -183,7 +183,7 @@ class FunctionSources:
                     yield f"{self.name}_real {part}[{size}];", f"{{{values}}}"
                 continue
             for i in range(start, start + size):
-                if part in _PARAMETERS and i not in self._loads:
+                if part in _PARAMETERS and i not in self._program.loads:
                     unused.append(i)
                     continue
                 yield from padding()
@@ -267,7 +267,7 @@ class CSources(FunctionSources):
             # rounding errors of n operations grow as sqrt(n) where they are independent
             growth = np.sqrt(_costs(program.entries[key])[0])
             bounds[f"bound_of_{key}"] = growth * vectors.changes[key]
-            scale = _number(float(np.abs(rows).max()) or 1.0)
+            scale = c_number(float(np.abs(rows).max()) or 1.0)
             arguments = f'"{key}", found, {key}[i], {sizes[key]}, {scale}, bound_of_{key}[i][0]'
             checks += [f"{name}_{key}(&m, q, v, x, found);", f"compare({arguments});"]
         inputs = _inputs_of(program)
@@ -291,21 +291,19 @@ def _join(lines: list[str]) -> str:
     return "\n    ".join(lines)
 
 
-def _number(value: float) -> str:
-    if np.isposinf(value):
-        return "1e300"
-    return repr(float(value))
+def c_number(value: float) -> str:
+    """A number in C."""
+    return repr(value if isinstance(value, int) else float(value)).replace("inf", "INFINITY")
+
+
+def c_numbers(values: Iterable[float]) -> str:
+    """Numbers of C in a list."""
+    return ", ".join(map(c_number, values))
 
 
 def _inputs_of(program: InstanceProgram | KinematicsProgram) -> range:
     start = program.layout.start_index("inputs")
     return range(start, start + program.layout.parts["inputs"])
-
-
-def instance_loads(program: InstanceProgram | KinematicsProgram) -> frozenset[int]:
-    """Elements of an instance that formulas read."""
-    entries = program.entries.values()
-    return frozenset().union(*(x.loads.get("instance", frozenset()) for x in entries))
 
 
 def _costs(linked: LinkedFunction) -> tuple[int, int]:
@@ -314,7 +312,7 @@ def _costs(linked: LinkedFunction) -> tuple[int, int]:
 
     def memory(function: LinkedFunction) -> int:
         if isinstance(function.function, Formula):
-            seen[function.name] = len(_operations(function.function))
+            seen[function.name] = len(function.function.order)
             return 0
         own = 8 * sum(function.function.local_arrays.values())
         return own + max((memory(x) for x in function.callees.values()), default=0)
@@ -323,15 +321,8 @@ def _costs(linked: LinkedFunction) -> tuple[int, int]:
     return sum(seen.values()), size
 
 
-def _operations(formula: Formula) -> list[int]:
-    tapes = [x.tape for x in formula.outputs if isinstance(x, SymbolicExpression)]
-    required = required_operations(formula.outputs)
-    return [i for i in required if tapes[0].operations[i][0] != "load"]
-
-
 def _table(name: str, rows: Array) -> str:
     """A constant table; of one number where it would be empty."""
     flat = rows.reshape(len(rows), -1) if rows.size else np.zeros((1, 1))
-    lines = ["{" + ", ".join(_number(x) for x in row) + "}" for row in flat.tolist()]
-    body = ",\n    ".join(lines)
+    body = ",\n    ".join(f"{{{c_numbers(row)}}}" for row in flat.tolist())
     return f"static const double {name}[{flat.shape[0]}][{flat.shape[1]}] = {{\n    {body}}};"

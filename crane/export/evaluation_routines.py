@@ -6,8 +6,8 @@ from crane.closure.compiled_closure import CompiledClosure
 from crane.codegen import ArrayPointer, Layout, Program, Routine
 from crane.codegen.vector_layout import Formula
 from crane.export.dead_times import DeadTimes
-from crane.export.kinematics_program import DONE, KinematicsRoutines
-from crane.simulation.integration.machine_code_stepper import HELD_INDEX
+from crane.export.kinematics_program import BEYOND_CHART, DONE, KinematicsRoutines
+from crane.simulation.integration.machine_code_stepper import HELD_INDEX, exceeds_chart_limits
 from crane.simulation.integration.machine_formulas import AT_REST_SUFFIX
 
 
@@ -32,8 +32,9 @@ class EvaluationRoutines(KinematicsRoutines):
         self._programs, self._k = programs, stick_slip_count
         self._dead_times = DeadTimes(layout) if layout.parts["delays"] else None
 
-    def _machine_arguments(self, instance: ArrayPointer) -> tuple[ArrayPointer, ...]:
-        return tuple(self._part(instance, x) for x in ("geometry", "dynamics", "settings"))
+    @property
+    def _machine_arguments(self) -> tuple[ArrayPointer, ...]:
+        return tuple(self._part(x) for x in ("geometry", "dynamics", "settings"))
 
     def add_evaluations(self, program: Program) -> None:
         """Add update_outputs(instance) and derivatives(instance, rate) of the state.
@@ -42,8 +43,9 @@ class EvaluationRoutines(KinematicsRoutines):
         result) of rate and outputs.
         """
         with program.add_routine("update_outputs", arrays=("instance",)) as r:
-            self._write_evaluation(r, "steps_observe", ["outputs"], self._part(r.instance, "tau"))
+            self._write_evaluation(r, "steps_observe", ["outputs"], self._part("tau"))
         with program.add_routine("derivatives", arrays=("instance", "rate")) as r:
+            self._write_chart_check(r)
             self._write_evaluation(r, "steps_rate", ["rate"], r.rate)
         if self.event_parts:
             with program.add_routine("event_indicators", arrays=("instance", "indicators")) as r:
@@ -52,6 +54,14 @@ class EvaluationRoutines(KinematicsRoutines):
             arrays = "instance", "direction", "result"
             with program.add_routine("directional_derivatives", arrays=arrays) as r:
                 self._write_evaluation(r, "tangent_rate", ["all"], r.result, r.direction)
+
+    def _write_chart_check(self, r: Routine) -> None:
+        """Write a return where the active joints do not determine the motion, see `Chart`."""
+        result = r.local_array("result", self._closure.formula_outputs("newton"))
+        geometry, state, bounds = (self._part(x) for x in ("geometry", "q", "bounds"))
+        r.call("loops_newton", geometry, state, result)
+        with r.if_then(exceeds_chart_limits(bounds, result)):
+            r.return_value(BEYOND_CHART)
 
     @property
     def step_functions(self) -> Mapping[str, Formula | Routine]:
@@ -77,15 +87,17 @@ class EvaluationRoutines(KinematicsRoutines):
         program, own_name = formula.split("_")
         layout = self._programs[program].formula_outputs(own_name)
         values = r.local_array("values", layout)
-        inputs, state = (self._part(r.instance, x) for x in ("inputs", "q"))
+        inputs, state = (self._part(x) for x in ("inputs", "q"))
         if self._dead_times is not None:
-            row = r.local_array("row", self.layout.parts["inputs"])
+            row, now = r.local_array("row", self.layout.parts["inputs"]), r.local_array("now", 2)
             r.copy(row, inputs, self.layout.parts["inputs"])
-            r.call("delay_signals", r.instance, self._part(r.instance, "time"), row)
+            for i in range(2):
+                r.store(now, i, self._element("time"))
+            r.call("delay_signals", r.instance, now, row)
             inputs = row
-        arguments = *self._machine_arguments(r.instance), inputs, state, *further, values
+        arguments = *self._machine_arguments, inputs, state, *further, values
         if self._k:
-            with r.if_then(self._element(r.instance, "bounds", HELD_INDEX) > 0.5):
+            with r.if_then(self._element("bounds", HELD_INDEX) > 0.5):
                 r.call(formula + AT_REST_SUFFIX, *arguments)
             with r.if_else():
                 r.call(formula, *arguments)

@@ -1,8 +1,8 @@
 """A machine as a Functional Mock-up Unit (FMU) of FMI 3 or 2."""
 
 import hashlib
+import warnings
 import zipfile
-from collections.abc import Iterable
 from functools import cached_property
 from html import escape
 from math import inf
@@ -11,8 +11,10 @@ from xml.etree import ElementTree as ET
 
 import crane
 from crane.common.atomic_output import check_file_is_writable, replace_file
-from crane.common.errors import InputError, check_name
-from crane.export.c_sources import CSources
+from crane.common.errors import CraneWarning, check_name
+from crane.control.control_law import Controller
+from crane.control.valve_commands import ValveCommand
+from crane.export.c_sources import CSources, c_numbers
 from crane.export.fmu_libraries import PLATFORMS, compile_libraries, library_compilers
 from crane.export.fmu_variables import (
     FIXED,
@@ -62,19 +64,22 @@ def write_fmu(
     path: str | Path,
     fmi: int = 3,
     *,
+    controller: Controller | ValveCommand | None = None,
     overwrite: bool = True,
     icon: bytes = b"",
     about: str = "",
 ) -> Path:
     """Write a machine as an FMU for model exchange and co-simulation, with its C sources.
 
-    Inputs are those of `InstanceProgram`. With ziglang it has libraries for Windows and Linux,
+    Inputs are those of `InstanceProgram`. Valves with dead times have co-simulation alone. With
+    ziglang it has libraries for Windows and Linux,
     else one for this computer, by its C compiler.
 
     Args:
         machine: The machine, or what `crane.load` takes.
         path: The .fmu file.
         fmi: Version of FMI, 3 or 2.
+        controller: See `InstanceProgram`; the inputs are forces or valve signals without it.
         overwrite: Whether the file is replaced.
         icon: A PNG file of the machine.
         about: HTML about the machine, for its documentation.
@@ -90,11 +95,13 @@ def write_fmu(
     check_file_is_writable(Path(path), overwrite)
     compilers = library_compilers()
     loaded = machine if isinstance(machine, Machine) else load(machine)
-    program = InstanceProgram(loaded, (), has_derivatives=True)
-    if program.layout.parts["delays"]:
-        raise InputError(
-            f"valves of '{loaded.name}' have a dead time, which an FMU has not: set delay to 0 "
-            "or delay the signals before"
+    program = InstanceProgram(loaded, (), controller=controller, has_derivatives=True)
+    if program.has_dead_times:
+        warnings.warn(
+            f"valves of '{loaded.name}' have a dead time: the FMU has co-simulation, and no model "
+            "exchange, whose states cannot remember signals",
+            CraneWarning,
+            stacklevel=2,
         )
     files = FmuFiles(program, fmi)
     members = files.texts(about) | files.icon_members(icon)
@@ -170,7 +177,8 @@ class FmuFiles:
         starts = {
             name.upper(): layout.start_index(name)
             for name in ("time", "step", "inputs_start", "inputs", "q", "lengths", "cursor",
-                         "derivatives", "event", "tip_position", "unladen", "payload")
+                         "derivatives", "event", "tip_position", "unladen", "payload", "delays",
+                         "history")
         }  # fmt: skip
         indices = starts | {
             "SIZE": layout.size, "INPUT_COUNT": layout.parts["inputs"],
@@ -182,7 +190,8 @@ class FmuFiles:
         }  # fmt: skip
         stubs = {
             "event_indicators": "(m, x) 1", "tip": "(m, q, v, tip) ((void)(m), 1)",
-            "set_payload": "(m, payload) 1", "directional_derivatives": "(m, direction, x) (-3)",
+            "set_payload": "(m, payload) ((void)(payload), 1)",
+            "directional_derivatives": "(m, direction, x) (-3)",
         }  # fmt: skip
         further = {
             **_WORDS[self._fmi], "FMI": str(self._fmi), "ID": f"0x{self._token[:16]}",
@@ -193,9 +202,9 @@ class FmuFiles:
                 for x, text in stubs.items() if x not in program.entries
             ),
             "NAMES": "\n    ".join(self._names),
-            "ACTIVE": _numbers(machine.closure.active.tolist()),
-            "STATES": _numbers(values.states), "NOMINALS": _numbers(values.nominals.tolist()),
-            "LIMITS": ",\n    ".join(f"{{{_numbers(row)}}}" for row in _limits(machine)),
+            "ACTIVE": c_numbers(machine.closure.active.tolist()),
+            "STATES": c_numbers(values.states), "NOMINALS": c_numbers(values.nominals.tolist()),
+            "LIMITS": ",\n    ".join(f"{{{c_numbers(row)}}}" for row in _limits(machine)),
             "REASONS": ", ".join(f'"{text}"' for text in STATUS_TEXTS.values()),
             "ROTATIONS": "".join(f"{x}, " for x in machine.coordinates.rotation_columns),
         }  # fmt: skip
@@ -221,7 +230,8 @@ class FmuFiles:
         }  # fmt: skip
         steps = {"canHandleVariableCommunicationStepSize": "true"}
         steps |= {"canInterpolateInputs": "true"} if fmi == 2 else {}
-        for kind, further in (("ModelExchange", {}), ("CoSimulation", steps)):
+        kinds = {"ModelExchange": {}, "CoSimulation": steps}
+        for kind, further in [*kinds.items()][self._program.has_dead_times :]:
             element = ET.SubElement(root, kind, {**abilities, **further})
             if fmi == 2:
                 files = ET.SubElement(element, "SourceFiles")
@@ -318,15 +328,6 @@ def _limits(machine: Machine) -> list[list[float]]:
                       upper + cylinder.hose_b / cylinder.area_b]  # fmt: skip
         rows.append([*start, *([-inf, inf] if joint in stops else start), *piston])
     return rows
-
-
-def _numbers(values: Iterable[float]) -> str:
-    """Numbers of C in a list."""
-    return ", ".join(repr(x).replace("inf", "INFINITY") for x in map(_plain, values))
-
-
-def _plain(value: float) -> float:
-    return value if isinstance(value, int) else float(value)
 
 
 def _xml(root: ET.Element) -> str:

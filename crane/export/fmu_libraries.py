@@ -37,7 +37,9 @@ PLATFORMS = {
     "x86_64-darwin": LibraryPlatform("darwin64", ".dylib"),
     "aarch64-darwin": LibraryPlatform("aarch64-darwin", ".dylib"),
 }
-_FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-shared")
+_FLAGS = (
+    "-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden", "-shared",
+)  # fmt: skip
 
 
 def library_compilers() -> dict[str, list[str]]:

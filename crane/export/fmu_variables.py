@@ -13,7 +13,6 @@ from crane.codegen.vector_layout import Formula, Layout
 from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.control.valve_drive import ValveDrive
-from crane.export.c_sources import instance_loads
 from crane.export.instance_program import InstanceProgram
 from crane.hydraulics.circuit_states import BALANCE_UNITS
 from crane.simulation.integration.error_controlled_stepper import characteristic_energy
@@ -25,7 +24,7 @@ _KINDS = {
     "work": OUTPUT, "dissipated": OUTPUT, "tau": OUTPUT, "friction": OUTPUT, "kinetic": OUTPUT,
     "potential": OUTPUT, "friction_at_rest": OUTPUT, "external": OUTPUT, "a": OUTPUT,
     "channels": OUTPUT, "derivatives": LOCAL, "event": LOCAL, "tip_position": OUTPUT,
-    "payload": TUNABLE,
+    "delays": TUNABLE, "payload": TUNABLE,
 }  # fmt: skip
 _TUNABLE_DYNAMICS = ("inertias", "joint_laws", "gravity", "rotor_inertias", "distances")
 _STATE_ACCURACY = 1e-8  # share of a state of a circuit that its scale stands for
@@ -107,15 +106,13 @@ class FmuVariables:
         kinds |= dict(self._parameters())
         own = [i for i in kinds if i < program.layout.size]
         settings = self._indices("settings")
-        units = [_setting_unit(names[i]) if i in settings else x for i, x in enumerate(units)]
+        for i in settings:
+            units[i] = units[i] or _setting_unit(names[i])
         for i in own:
             yield FmuVariable(i, names[i], units[i], kinds[i], float(self.start[i]))
         for i, state in enumerate(self.states):
-            numerator, _, denominator = (units[state] or "1").partition("/")
-            unit = f"{numerator}/{denominator}{'/' if denominator else ''}s".replace("s/s", "s2")
-            yield FmuVariable(
-                at("derivatives") + i, f"der({names[state]})", unit, LOCAL, 0.0, state
-            )
+            name, unit = f"der({names[state]})", _rate_unit(units[state])
+            yield FmuVariable(at("derivatives") + i, name, unit, LOCAL, 0.0, state)
         for i, reference in enumerate(self._indices("event")):
             yield FmuVariable(reference, f"event_indicator[{i + 1}]", "", LOCAL)
         for axis, reference in zip("xyz", self._indices("tip_position"), strict=False):
@@ -142,7 +139,7 @@ class FmuVariables:
 
     def _parameters(self) -> Iterator[tuple[int, str]]:
         """Indices and kinds of the parameters that formulas read."""
-        program, loads = self.program, instance_loads(self.program)
+        program, loads = self.program, self.program.loads
         dynamics = program.chart.dynamics.formula_structure.constants_layout
         start, tip = program.layout.start_index("dynamics"), self._tip_inertia
         for i in self._indices("geometry"):
@@ -178,7 +175,7 @@ class FmuVariables:
         machine, layout = self.program.machine, self.program.chart.state_layout
         closure, control = machine.closure, self.program.control
         units, energy = closure.units[closure.active], characteristic_energy(machine)
-        sizes = np.empty(0)
+        sizes = np.ones(layout.parts["controller"])
         if isinstance(control, ValveDrive):
             sizes = np.array(control.scales) / _STATE_ACCURACY
             balances = [energy if unit == "J" else 1e-3 for unit in BALANCE_UNITS.values()]
@@ -223,10 +220,9 @@ class FmuVariables:
 def _formula_loads(formula: Formula, size: int) -> list[set[tuple[int, int]]]:
     """Elements of the arguments 3 and 4 that each of the first outputs depends on."""
     outputs = formula.outputs[:size]
-    tape = next(x.tape for x in outputs if isinstance(x, SymbolicExpression))
     places: list[tuple[int, int]] = []
     masks: list[int] = []  # sets as bits, one for each element
-    for kind, *operands in tape.operations:
+    for kind, *operands in formula.operations:
         is_load = kind == "load"
         mask = reduce(or_, (masks[x] for x in operands if type(x) is int and not is_load), 0)
         if is_load and operands[0] in (3, 4):
@@ -242,6 +238,13 @@ def _setting_unit(name: str) -> str:
     return _SETTING_UNITS.get(next(ends, ""), "")
 
 
+def _rate_unit(unit: str) -> str:
+    """The unit of a derivative: m/s2 of m/s, 1/s of "", m of m s."""
+    if unit.endswith(" s"):
+        return unit.removesuffix(" s")
+    return f"{unit[:-2]}/s2" if unit.endswith("/s") else f"{unit or 1}/s"
+
+
 def _identifier(name: str) -> str:
     """A part of a structured name, in quotes where it is no identifier."""
     if re.fullmatch(r"[A-Za-z_]\w*", name, flags=re.ASCII):
@@ -251,13 +254,17 @@ def _identifier(name: str) -> str:
 
 
 def base_unit(unit: str) -> dict[str, int]:
-    """Exponents of SI base units (and rad) of a unit such as `N m s/rad`.
+    """Exponents of SI base units (and rad) of a unit such as `N m s/rad` or `N/(m s)`.
 
     Raises:
         InputError: It is unknown.
     """
     total: dict[str, int] = {}
-    words = [(word, -1 if i else 1) for i, x in enumerate(unit.split("/")) for word in x.split()]
+    words = [
+        (word, -1 if i else 1)
+        for i, x in enumerate(unit.split("/"))
+        for word in x.strip("()").split()
+    ]
     for word, sign in words:
         match = re.fullmatch(r"([A-Za-z]+|1)(\d*)", word)
         if match is None or match[1] not in _DERIVED_UNITS:

@@ -13,13 +13,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from crane.codegen import (
-    FormulaTooLongError,
-    Layout,
-    Program,
-    Scalar,
-    SymbolicExpression,
-)
+from crane.codegen import FormulaTooLongError, Layout, Program, Scalar, SymbolicExpression
 from crane.codegen.differentiation import directional_derivative
 from crane.codegen.vector_layout import Formula
 from crane.common.errors import CraneWarning, InputError
@@ -33,15 +27,9 @@ from crane.dynamics.compiled_dynamics import DERIVATIVES_OF, build_quantity
 from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.formula_structure import BODY_SIZE, FormulaStructure
 from crane.dynamics.joint_forces import LAW_PARAMETER_NAMES, PARAMETER_COUNT
-from crane.export.instance_routines import INNER_ROUTINES, InstanceRoutines
-from crane.export.kinematics_program import (
-    SINGLE_PRECISION_BOUNDS,
-    Linked,
-    LinkedProgram,
-    check_formulas,
-    joined_program,
-    link_entries,
-)
+from crane.export.dead_times import dead_time_row
+from crane.export.instance_routines import InstanceRoutines
+from crane.export.kinematics_program import SINGLE_PRECISION_BOUNDS, LinkedProgram, check_formulas
 from crane.export.parameter_names import parameter_names
 from crane.machine.machine import Machine
 from crane.motion.frame_kinematics import CompiledFrame
@@ -129,7 +117,7 @@ class InstanceProgram(LinkedProgram):
         control: What turns the inputs into forces.
         chart: The machine with `control`.
         stepper: The method of `advance`.
-        layout: Parts of an instance, see `part_texts`.
+        layout: Parts of an instance.
         names: Name of each element of an instance.
         units: Unit of each.
         defaults: An instance at home, not initialized.
@@ -196,7 +184,7 @@ class InstanceProgram(LinkedProgram):
             tolerances=stepper.tolerance.size, max_events=1,
             geometry=self._closure.geometry.constants.size,
             dynamics=self.chart.dynamics.formula_constants.size,
-            settings=control.settings.size, delays=spools, history=rows * (1 + spools),
+            settings=control.settings.size, delays=spools, history=rows * dead_time_row(spools),
             unladen=BODY_SIZE if _tip_inertia(self.chart.dynamics.formula_structure) else 0,
         )  # fmt: skip
 
@@ -222,8 +210,8 @@ class InstanceProgram(LinkedProgram):
         at.inputs[: len(references)] = at.inputs_start[: len(references)] = references
         if at.delays.size:
             at.delays[:] = chart.control.delays
-            nodes = at.history.reshape(-1, 1 + at.delays.size)
-            nodes[1:, 0], nodes[0, 1:] = np.inf, references
+            calls = at.history.reshape(-1, dead_time_row(at.delays.size))
+            calls[1:, 0], calls[0, 1:] = np.inf, np.tile(references, 2)
         return values
 
     @cached_property
@@ -261,7 +249,8 @@ class InstanceProgram(LinkedProgram):
                 continue
             programs[name] = program
         programs["steps"] = self.stepper.new_program()
-        if self._has_derivatives and not self.machine.coordinates.rotation_columns:
+        excluded = self.has_dead_times or self.machine.coordinates.rotation_columns
+        if self._has_derivatives and not excluded:
             with suppress(FormulaTooLongError):
                 programs["tangent"] = self._trace_derivatives(programs["steps"])
         if self.tip_frame is not None:
@@ -299,13 +288,10 @@ class InstanceProgram(LinkedProgram):
             self.chart, self.stepper, self.layout, self._programs, quantities, offset
         )
 
-    @cached_property
-    def _linked(self) -> Linked:
-        parts = {name: dict(program.functions) for name, program in self._programs.items()}
-        own = joined_program(parts)
-        known = {*own.functions, *INNER_ROUTINES}
-        self.routines.add_to(own)
-        return link_entries(parts, own, known, self._closure)
+    @property
+    def has_dead_times(self) -> bool:
+        """Whether valves have dead times."""
+        return self.layout.parts["delays"] > 0
 
     @property
     def output_count(self) -> int:

@@ -17,11 +17,7 @@ from crane.codegen import (
     select,
 )
 from crane.codegen.routine_statements import as_value
-from crane.codegen.symbolic import (
-    add_vectors,
-    scale_vector,
-    subtract_vectors,
-)
+from crane.codegen.symbolic import add_vectors, scale_vector, subtract_vectors
 from crane.common.samples import Array
 from crane.control.valve_drive import ValveDrive
 from crane.dynamics.formula_structure import BODY_SIZE
@@ -46,7 +42,8 @@ STATUS_TEXTS = MappingProxyType(
     {
         DONE: "done",
         NOT_CLOSED: "the loops do not close",
-        BEYOND_CHART: "the active joints do not determine the motion: a dead centre",
+        BEYOND_CHART: "a dead centre: the active joints do not determine the motion, make others "
+        "active",
         HALTED: "the step failed: the motion diverges, or too many steps were needed",
         TOO_MANY_EVENTS: "joints stick and slip too often",
         TOO_MANY_CALLS: "the dead time of a valve takes more calls than are kept: longer steps",
@@ -55,10 +52,6 @@ STATUS_TEXTS = MappingProxyType(
 _FIRST_STEP_SHARE, _LONGEST_FIRST_STEP = 0.01, 5e-4  # as `ErrorControlledStepper.run`
 _STEP_REDUCTION_AFTER_EVENT = 0.2
 _TIME_TOLERANCE = 1e-9  # of a step
-INNER_ROUTINES = (
-    "find_modes", "orthogonalize", "least_squares", "transposed_least_squares",
-    "bounded_least_squares", *DEAD_TIME_ROUTINES,
-)  # fmt: skip
 
 
 class InstanceRoutines(EvaluationRoutines):
@@ -72,6 +65,11 @@ class InstanceRoutines(EvaluationRoutines):
         quantities: Names of the routines of dynamics.
         tip_offset: Origin of the tip in its body; None without a tip.
     """
+
+    inner_routines = (
+        "find_modes", "orthogonalize", "least_squares", "transposed_least_squares",
+        "bounded_least_squares", *DEAD_TIME_ROUTINES,
+    )  # fmt: skip
 
     def __init__(
         self,
@@ -98,7 +96,7 @@ class InstanceRoutines(EvaluationRoutines):
         self._add_initialize(program)
         self._add_advance(program)
         self.add_evaluations(program)
-        self.add_kinematics(program)
+        super().add_to(program)
         self._add_tip(program)
         self._add_dynamics(program)
         if self.layout.parts["unladen"]:
@@ -117,11 +115,8 @@ class InstanceRoutines(EvaluationRoutines):
         first += self.chart.dynamics.formula_structure.constants_layout.start_index("inertias")
         with program.add_routine("set_payload", arrays=("instance", "payload")) as r:
             inertia = ArrayPointer("instance").element_pointer(first + BODY_SIZE * (body - 1))
-            r.call("laden", self._part(r.instance, "unladen"), r.payload, inertia)
+            r.call("laden", self._part("unladen"), r.payload, inertia)
             r.return_value(DONE)
-
-    def _store(self, r: Routine, name: str, value: RoutineValue | float, index: int = 0) -> None:
-        r.store(ArrayPointer("instance"), self.layout.start_index(name) + index, value)
 
     def _add_stiction(self, program: Program) -> None:
         """find_modes, see `add_stick_slip_routines`."""
@@ -152,13 +147,13 @@ class InstanceRoutines(EvaluationRoutines):
         """Write `find_modes` at the state, and whether joints are held."""
         if not self._k:
             return
-        arguments = *self._machine_arguments(r.instance), refs, self._part(r.instance, "q")
+        arguments = *self._machine_arguments, refs, self._part("q")
         with r.if_then(r.call("find_modes", *arguments) < 1):
             r.return_value(HALTED)
         held = r.new_variable(0.0)
         *places, _ = self.chart.dynamics.formula_structure.stick_slip_mode_indices
         for place in places[1::3]:
-            is_held = self._element(r.instance, "dynamics", place)
+            is_held = self._element("dynamics", place)
             r.assign(held, select(is_held > 0.5, 1.0, held))
         self._store(r, "bounds", held, HELD_INDEX)
 
@@ -178,24 +173,24 @@ class InstanceRoutines(EvaluationRoutines):
         program.add_formula("start", 5, {"state": list(self.control.initial_state(inputs))})
         with program.add_routine("initialize", arrays=("instance",)) as r:
             result = r.local_array("result", self._closure.formula_outputs("newton"))
-            state, states = self._part(r.instance, "q"), layout.parts["controller"]
+            state, states = self._part("q"), layout.parts["controller"]
             values = r.local_array("values", max(1, states))
             size = self._closure.formula_outputs("newton").parts["gamma"]
-            bounds = self._part(r.instance, "bounds")
-            arguments = self._part(r.instance, "geometry"), state, result, bounds
+            bounds = self._part("bounds")
+            arguments = self._part("geometry"), state, result, bounds
             with r.if_then(r.call(self._close_name, *arguments) < 1):
                 r.return_value(NOT_CLOSED)
             with r.loop(as_value(layout.size - self._nq, "integer")) as i:
                 r.store(state, i + self._nq, 0.0)
-            refs = self._part(r.instance, "inputs")
+            refs = self._part("inputs")
             if states:
-                r.call("start", *self._machine_arguments(r.instance), refs, state, values)
+                r.call("start", *self._machine_arguments, refs, state, values)
                 start = layout.start_index("controller")
                 r.copy(state.element_pointer(start), values, states)
-            r.copy(self._part(r.instance, "inputs_start"), refs, self.layout.parts["inputs"])
+            r.copy(self._part("inputs_start"), refs, self.layout.parts["inputs"])
             if self._dead_times is not None:
                 self._dead_times.write_start(r)
-            cursor = self._part(r.instance, "cursor")
+            cursor = self._part("cursor")
             r.copy(cursor, state, self._nq)
             r.copy(cursor.element_pointer(self._nq), result.element_pointer("gamma"), size)
             self._store(r, "time", 0.0)
@@ -205,12 +200,12 @@ class InstanceRoutines(EvaluationRoutines):
         with program.add_routine("update_modes", arrays=("instance",)) as r:
             self._store(r, "lengths", 0.0)
             if self.stepper.has_rotation_vectors:
-                state = self._part(r.instance, "q")
+                state = self._part("q")
                 wrapped = r.local_array("wrapped", layout.size)
                 r.call("steps_wrap", state, wrapped)
                 r.copy(state, wrapped, self._nq)
-                r.copy(self._part(r.instance, "cursor"), state, self._nq)
-            self._write_find_modes(r, self._part(r.instance, "inputs"))
+                r.copy(self._part("cursor"), state, self._nq)
+            self._write_find_modes(r, self._part("inputs"))
             r.return_value(DONE)
 
     @property
@@ -241,13 +236,13 @@ class InstanceRoutines(EvaluationRoutines):
     def _write_advance(self, r: Routine) -> None:
         columns = self.stepper.reference_columns
         refs, row = r.local_array("refs", max(1, 3 * columns)), r.local_array("row", 1)
-        state, lengths = self._part(r.instance, "q"), self._part(r.instance, "lengths")
-        bounds, tolerances = (self._part(r.instance, x) for x in ("bounds", "tolerances"))
-        step = r.new_variable(self._element(r.instance, "step"))
+        state, lengths = self._part("q"), self._part("lengths")
+        bounds, tolerances = (self._part(x) for x in ("bounds", "tolerances"))
+        step = r.new_variable(self._element("step"))
         with r.if_then(~(step > 0.0)):
             r.return_value(HALTED)
         if self._dead_times is not None:
-            with r.if_then(r.call("append_node", r.instance) < 1):
+            with r.if_then(r.call("append_call", r.instance) < 1):
                 r.return_value(TOO_MANY_CALLS)
         # a run that goes on to the next output instant, see `ErrorControlledStepper.run`
         with r.if_then(~((lengths[0] >= step) & (lengths[0] <= step))):
@@ -263,24 +258,29 @@ class InstanceRoutines(EvaluationRoutines):
             r.store(lengths, 4, end)
             r.store(lengths, 6, 0.0)
             r.call(
-                "steps_run", 1, *self._machine_arguments(r.instance), refs, state, row, lengths,
+                "steps_run", 1, *self._machine_arguments, refs, state, row, lengths,
                 bounds, tolerances,
             )  # fmt: skip
             r.assign(time, lengths[2])
             with r.if_then((lengths[6] > 0.0) & (time <= 0.0)):
                 r.store(lengths, 1, lengths[1] * _STEP_REDUCTION_AFTER_EVENT)
                 r.assign(events, events + 1.0)
-                with r.if_then(events > self._element(r.instance, "max_events")):
+                with r.if_then(events > self._element("max_events")):
+                    self._write_elapsed(r, step + time)
                     r.return_value(TOO_MANY_EVENTS)
                 write_references(time, end)
                 self._write_find_modes(r, refs)
             with r.if_else(), r.if_then(time < end - step * _TIME_TOLERANCE):
-                self._write_halt(r, state)
+                self._write_elapsed(r, step + time)
+                self._write_halt(r)
             with r.if_then(~(time < step * -_TIME_TOLERANCE)):
                 r.break_loop()
-        self._store(r, "time", self._element(r.instance, "time") + step)
-        r.copy(self._part(r.instance, "inputs_start"), self._part(r.instance, "inputs"), columns)
+        self._write_elapsed(r, step)
+        r.copy(self._part("inputs_start"), self._part("inputs"), columns)
         r.return_value(DONE)
+
+    def _write_elapsed(self, r: Routine, elapsed: RoutineValue) -> None:
+        self._store(r, "time", self._element("time") + elapsed)
 
     def _references_writer(
         self, r: Routine, refs: ArrayPointer, step: RoutineValue
@@ -290,9 +290,9 @@ class InstanceRoutines(EvaluationRoutines):
         It sets `end` to the next change of a slope, or 0, where valves have dead times.
         """
         columns, shares = self.stepper.reference_columns, r.local_array("shares", 2)
-        now, kink = (r.local_array(x, 1) for x in ("now", "kink"))
-        inputs, start = (self._part(r.instance, x) for x in ("inputs", "inputs_start"))
-        goal = r.new_variable(self._element(r.instance, "time") + step)
+        now, kink = r.local_array("now", 2), r.local_array("kink", 1)
+        inputs, start = (self._part(x) for x in ("inputs", "inputs_start"))
+        goal = r.new_variable(self._element("time") + step)
 
         def write(time: RoutineValue, end: RoutineValue) -> None:
             if self._dead_times is not None:
@@ -303,30 +303,28 @@ class InstanceRoutines(EvaluationRoutines):
             r.store(shares, 0, (time + step) / step)
             r.store(shares, 1, (end + step) / step)
             r.call("ramp", start, inputs, shares, refs)
-            for i, share in enumerate((0.0, 0.5, 1.0) if self._dead_times is not None else ()):
+            if self._dead_times is None:
+                return
+            r.store(now, 1, goal + time + (end - time) * 0.5)
+            for i, share in enumerate((0.0, 0.5, 1.0)):
                 r.store(now, 0, goal + time + (end - time) * share)
                 r.call("delay_signals", r.instance, now, refs.row_pointer(i, columns))
 
         return write
 
-    def _write_halt(self, r: Routine, state: ArrayPointer) -> None:
+    def _write_halt(self, r: Routine) -> None:
         """Return why a step failed."""
-        r.store(self._part(r.instance, "lengths"), 0, 0.0)
-        result = r.local_array("result", self._closure.formula_outputs("newton"))
-        r.call("loops_newton", self._part(r.instance, "geometry"), state, result)
-        bounds = self._part(r.instance, "bounds")
-        beyond = (result["largest_gamma"] > bounds[3]) | (result["determinant"] < bounds[4])
-        with r.if_then(beyond):
-            r.return_value(BEYOND_CHART)
+        r.store(self._part("lengths"), 0, 0.0)
+        self._write_chart_check(r)
         r.return_value(HALTED)
 
     def _write_fixed_step(self, r: Routine) -> None:
         columns, size = self.stepper.reference_columns, self.chart.row_layout.size
         refs, shares = r.local_array("refs", max(1, 3 * columns)), r.local_array("shares", 2)
         row, sizes = r.local_array("row", size), r.local_array("sizes", 3)
-        state, bounds = self._part(r.instance, "q"), self._part(r.instance, "bounds")
-        inputs, start = (self._part(r.instance, x) for x in ("inputs", "inputs_start"))
-        step = r.new_variable(self._element(r.instance, "step"))
+        state, bounds = self._part("q"), self._part("bounds")
+        inputs, start = (self._part(x) for x in ("inputs", "inputs_start"))
+        step = r.new_variable(self._element("step"))
         r.store(shares, 0, 0.0)
         r.store(shares, 1, 1.0)
         r.call("ramp", start, inputs, shares, refs)
@@ -334,15 +332,15 @@ class InstanceRoutines(EvaluationRoutines):
         r.store(sizes, 1, step * 0.5)
         r.store(sizes, 2, 0.0)
         arguments = refs, state, row, sizes, bounds
-        done = r.call("fixed_run", 1, *self._machine_arguments(r.instance), *arguments)
+        done = r.call("fixed_run", 1, *self._machine_arguments, *arguments)
         with r.if_then((done < 1) & (sizes[2] > 0.0)):  # joints begin to slip, or stop
             self._write_find_modes(r, refs)
             r.store(sizes, 2, 0.0)
-            again = r.call("fixed_run", 1, *self._machine_arguments(r.instance), *arguments)
+            again = r.call("fixed_run", 1, *self._machine_arguments, *arguments)
             r.assign(done, again)
         with r.if_then(done < 1):
-            self._write_halt(r, state)
-        self._store(r, "time", self._element(r.instance, "time") + step)
+            self._write_halt(r)
+        self._write_elapsed(r, step)
         r.copy(start, inputs, columns)
         r.return_value(DONE)
 
@@ -354,7 +352,7 @@ class InstanceRoutines(EvaluationRoutines):
             offset = r.local_array("offset", 3)
             for i, x in enumerate(self._tip_offset.tolist()):
                 r.store(offset, i, x)
-            geometry = self._part(r.instance, "geometry")
+            geometry = self._part("geometry")
             r.call("tip_formula", geometry, offset, r.q, r.v_a, r.tip)
             r.return_value(DONE)
 
@@ -365,6 +363,6 @@ class InstanceRoutines(EvaluationRoutines):
                 inputs = r.local_array("values", 2 * self._n)
                 r.copy(inputs, r.v_a, self._n)
                 r.copy(inputs.element_pointer(self._n), r.x, self._n)
-                geometry, dynamics = (self._part(r.instance, x) for x in ("geometry", "dynamics"))
+                geometry, dynamics = (self._part(x) for x in ("geometry", "dynamics"))
                 r.call(f"{name}_formula", geometry, dynamics, r.q, inputs, r.result)
                 r.return_value(DONE)

@@ -9,6 +9,7 @@ import numpy as np
 from crane.closure.compiled_closure import CompiledClosure
 from crane.codegen import ArrayPointer, Layout, Program, Routine, RoutineValue
 from crane.codegen.linked_functions import LinkedFunction, link_functions
+from crane.codegen.routine_statements import Operand
 from crane.common.errors import InputError
 from crane.export.parameter_names import geometry_names
 from crane.machine.machine import Machine
@@ -17,16 +18,44 @@ from crane.machine.machine import Machine
 DONE, NOT_CLOSED, BEYOND_CHART, HALTED, TOO_MANY_EVENTS, TOO_MANY_CALLS = 1, -1, -2, -3, -4, -5
 # over those of double precision: residuals of rounding, of closed loops; last step of Newton
 SINGLE_PRECISION_BOUNDS = np.array([1e9, 1e8, 1e6])
-Linked = tuple[dict[str, LinkedFunction], list[LinkedFunction]]
 
 
 class LinkedProgram(ABC):
-    """A program whose routines are linked with all that they call."""
+    """A program of a machine whose routines are linked with all that they call."""
+
+    machine: Machine
 
     @property
     @abstractmethod
-    def _linked(self) -> Linked:
-        """Routines, and all functions."""
+    def _programs(self) -> Mapping[str, Program]:
+        """Programs that the routines call, by the prefix of their functions."""
+
+    @property
+    @abstractmethod
+    def routines(self) -> "KinematicsRoutines":
+        """The writer of its routines."""
+
+    @cached_property
+    def _linked(self) -> tuple[dict[str, LinkedFunction], list[LinkedFunction]]:
+        parts = {name: dict(program.functions) for name, program in self._programs.items()}
+        own = Program()
+        for prefix, functions in parts.items():
+            own.functions |= {f"{prefix}_{name}": x for name, x in functions.items()}
+        known = {*own.functions, *self.routines.inner_routines}
+        self.routines.add_to(own)
+        entries = [
+            name
+            for name, function in own.functions.items()
+            if name not in known and isinstance(function, Routine)
+        ]
+        has_projection = self.machine.closure.compiled_closure.has_partly_active_rotations
+        close = "project" if has_projection else "close"
+        bindings = {"close": ("loops", close), "follow": ("loops", "follow")}
+        linked = link_functions(
+            {**parts, "machine": own.functions}, [("machine", x) for x in entries], bindings
+        )
+        by_name = {x.name: x for x in linked}
+        return {x: by_name[f"machine_{x}"] for x in entries}, linked
 
     @property
     def entries(self) -> dict[str, LinkedFunction]:
@@ -37,6 +66,12 @@ class LinkedProgram(ABC):
     def functions(self) -> list[LinkedFunction]:
         """All linked functions, each after what it calls."""
         return self._linked[1]
+
+    @cached_property
+    def loads(self) -> frozenset[int]:
+        """Elements of an instance that formulas read."""
+        entries = self.entries.values()
+        return frozenset().union(*(x.loads.get("instance", frozenset()) for x in entries))
 
 
 class KinematicsProgram(LinkedProgram):
@@ -77,50 +112,65 @@ class KinematicsProgram(LinkedProgram):
         )
 
     @cached_property
-    def _linked(self) -> Linked:
-        parts = {"loops": dict(self._closure.new_program().functions)}
-        own = joined_program(parts)
-        known = {*own.functions}
-        KinematicsRoutines(self.layout, self._closure).add_kinematics(own)
-        return link_entries(parts, own, known, self._closure)
+    def _programs(self) -> Mapping[str, Program]:
+        return {"loops": self._closure.new_program()}
+
+    @property
+    def routines(self) -> "KinematicsRoutines":
+        """The writer of its routines."""
+        return KinematicsRoutines(self.layout, self._closure)
 
 
-class KinematicsRoutines:
+class InstanceWriter:
+    """Writer of routines whose argument `instance` is an instance of a layout."""
+
+    def __init__(self, layout: Layout):
+        self.layout = layout
+
+    def _part(self, name: str) -> ArrayPointer:
+        return ArrayPointer("instance").element_pointer(self.layout.start_index(name))
+
+    def _element(self, name: str, index: int = 0) -> RoutineValue:
+        return self._part(name)[index]
+
+    def _store(self, r: Routine, name: str, value: Operand, index: int = 0) -> None:
+        r.store(self._part(name), index, value)
+
+
+class KinematicsRoutines(InstanceWriter):
     """Writer of the routines that need only the loops.
 
     Args:
         layout: Layout of an instance.
         closure: The loops.
+
+    Attributes:
+        inner_routines: Names of routines that are only called by others.
     """
 
+    inner_routines: tuple[str, ...] = ()
+
     def __init__(self, layout: Layout, closure: CompiledClosure):
-        self.layout, self._closure = layout, closure
+        super().__init__(layout)
+        self._closure = closure
 
-    def _part(self, instance: ArrayPointer, name: str) -> ArrayPointer:
-        return ArrayPointer(instance.name).element_pointer(self.layout.start_index(name))
-
-    def _element(self, instance: ArrayPointer, name: str, index: int = 0) -> RoutineValue:
-        return ArrayPointer(instance.name)[self.layout.start_index(name) + index]
-
-    def add_kinematics(self, program: Program) -> None:
+    def add_to(self, program: Program) -> None:
         """Add close_loops, follow_loops and gamma."""
         newton = self._closure.formula_outputs("newton")
         with program.add_routine("close_loops", arrays=("instance", "q")) as r:
             result = r.local_array("result", newton)
-            geometry, bounds = (self._part(r.instance, x) for x in ("geometry", "bounds"))
+            geometry, bounds = (self._part(x) for x in ("geometry", "bounds"))
             with r.if_then(r.call("loops_close", geometry, r.q, result, bounds) < 1):
                 r.return_value(NOT_CLOSED)
             r.return_value(DONE)
         with program.add_routine("follow_loops", arrays=("instance", "q_a", "q")) as r:
-            geometry, cursor, bounds = (
-                self._part(r.instance, x) for x in ("geometry", "cursor", "bounds")
-            )
+            geometry, cursor, bounds = (self._part(x) for x in ("geometry", "cursor", "bounds"))
             done = r.call("loops_follow", 1, geometry, r.q_a, cursor, r.q, bounds)
             with r.if_then(done < 1):
                 r.return_value(NOT_CLOSED)
             r.return_value(DONE)
         with program.add_routine("gamma", arrays=("instance", "q", "gamma")) as r:
-            geometry = self._part(r.instance, "geometry")
+            geometry = self._part("geometry")
             with r.if_then(r.call("loops_gamma_each", 1, geometry, r.q, r.gamma) < 1):
                 r.return_value(BEYOND_CHART)
             r.return_value(DONE)
@@ -134,33 +184,3 @@ def check_formulas(machine: Machine) -> None:
     """
     if not machine.closure.is_compiled:
         raise InputError(f"the loops of '{machine.name}' have no formulas to export")
-
-
-def joined_program(parts: Mapping[str, dict]) -> Program:
-    """A program with the functions of several, each with the name of its program before it."""
-    own = Program()
-    for prefix, functions in parts.items():
-        own.functions |= {f"{prefix}_{name}": x for name, x in functions.items()}
-    return own
-
-
-def link_entries(
-    parts: dict[str, dict], own: Program, known: set[str], closure: CompiledClosure
-) -> Linked:
-    """The routines of a program that are not known yet, linked with the parts that they call.
-
-    Returns:
-        These routines by name, and all functions, each after what it calls.
-    """
-    entries = [
-        name
-        for name, function in own.functions.items()
-        if name not in known and isinstance(function, Routine)
-    ]
-    close = "project" if closure.has_partly_active_rotations else "close"
-    bindings = {"close": ("loops", close), "follow": ("loops", "follow")}
-    functions = link_functions(
-        {**parts, "machine": own.functions}, [("machine", x) for x in entries], bindings
-    )
-    by_name = {x.name: x for x in functions}
-    return {x: by_name[f"machine_{x}"] for x in entries}, functions

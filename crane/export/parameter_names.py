@@ -1,6 +1,6 @@
 """Names and units of the elements of an instance, in the order of `InstanceProgram.layout`."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,11 +17,9 @@ if TYPE_CHECKING:
 
 _ROTATION = [f"rotation_{i}{j}" for i in "xyz" for j in "xyz"]
 _POSITION = ["position_x", "position_y", "position_z"]
-_INERTIA = ["mass", *(f"com_{x}" for x in "xyz")] + [
-    f"inertia_{x}" for x in ("xx", "xy", "xz", "yy", "yz", "zz")
-]
-_INERTIA_UNITS = ("kg", "m", "m", "m", *("kg m2",) * 6)
-_WRENCH_UNITS = ("N", "N", "N", "N m", "N m", "N m")
+_INERTIA = {"mass": "kg"} | {f"com_{x}": "m" for x in "xyz"}
+_INERTIA |= {f"inertia_{x}": "kg m2" for x in ("xx", "xy", "xz", "yy", "yz", "zz")}
+_WRENCH = [*zip(WRENCH_COMPONENTS, ("N", "N", "N", "N m", "N m", "N m"), strict=True)]
 
 
 def parameter_names(program: "InstanceProgram") -> tuple[list[str], list[str]]:
@@ -81,20 +79,15 @@ def _elements(program: "InstanceProgram") -> Iterator[tuple[str, str, str]]:
     for column in chart.stick_slip.columns:
         yield "friction_at_rest", f"rest_{machine.joints[column]}", ""
     for force in machine.external_forces:
-        pairs = zip(WRENCH_COMPONENTS, _WRENCH_UNITS, strict=True)
-        yield from (("external", f"load_{force.name}_{x}", unit) for x, unit in pairs)
-        yield from (("external", f"load_{force.name}_{x}", unit) for x, unit in force.channels)
+        for x, unit in (*_WRENCH, *force.channels):
+            yield "external", f"load_{force.name}_{x}", unit
     if machine.supports:
         for joint in machine.joints:
             yield "a", f"a_{joint}", f"{machine.unit(joint)}/s2"
     yield from (("geometry", name, unit) for name, unit in geometry_names(program.machine))
-    units = _dynamics_units(program)
-    yield from (
-        ("dynamics", name, unit) for name, unit in zip(_dynamics(program), units, strict=True)
-    )
+    yield from (("dynamics", name, unit) for name, unit in _dynamics(program))
     if program.layout.parts["unladen"]:
-        for name, unit in zip(_INERTIA, _INERTIA_UNITS, strict=True):
-            yield "unladen", f"unladen_{name}", unit
+        yield from (("unladen", f"unladen_{name}", unit) for name, unit in _INERTIA.items())
 
 
 def _inputs(program: "InstanceProgram") -> Iterator[tuple[str, str]]:
@@ -106,8 +99,7 @@ def _inputs(program: "InstanceProgram") -> Iterator[tuple[str, str]]:
     yield from names.items()
     for force in machine.external_forces:
         count = reference_counts([force])[0]
-        pairs = zip(WRENCH_COMPONENTS, _WRENCH_UNITS, strict=True)
-        components = list(pairs) if count == len(WRENCH_COMPONENTS) else []
+        components = list(_WRENCH) if count == len(_WRENCH) else []
         components += [(f"reference_{i}", "") for i in range(count - len(components))]
         yield from ((f"{force.name}_{name}", unit) for name, unit in components)
 
@@ -123,31 +115,35 @@ def geometry_names(machine: Machine) -> Iterator[tuple[str, str]]:
     yield "inverse_characteristic_length", "1/m"
 
 
-def _dynamics(program: "InstanceProgram") -> Iterator[str]:
+def _dynamics(program: "InstanceProgram") -> Iterator[tuple[str, str]]:
+    """Names and units of `formula_constants`; none where they depend on another parameter."""
     machine, dynamics = program.machine, program.chart.dynamics
-    for part, names in (
-        ("inertias", [f"{joint}_{x}" for joint in machine.joints for x in _INERTIA]),
-        ("joint_laws", [f"{joint}_{x}" for joint in machine.joints for x in LAW_PARAMETER_NAMES]),
-        ("gravity", ["gravity_x", "gravity_y", "gravity_z"]),
-        ("rotor_inertias", [f"{joint}_rotor_inertia" for joint in machine.joints]),
-        ("distances", _distance_names(f"{a}_{b}" for a, b in dynamics.forces.lengths.pairs)),
-        ("moving_factor", ["moving_factor"]),
-        ("circuit_friction", [f"{machine.joints[i]}_circuit_friction"
-                              for i in dynamics.forces.circuit_friction_columns]),
-        ("fixed_inertia", [f"fixed_{x}" for x in ("mass", "moment_x", "moment_y", "moment_z")]),
-        ("tip_point", ["tip_x", "tip_y", "tip_z"]),
-        ("least_inertias", [f"{joint}_least_inertia" for joint in machine.joints]),
-    ):  # fmt: skip
-        size = dynamics.formula_structure.constants_layout.parts[part]
-        yield from names[:size]
+    joints, forces = machine.joints, dynamics.forces
+    pairs = [f"{a}_{b}" for a, b in forces.lengths.pairs]
+    ends = [f"{end}_{x}" for end in ("first", "second") for x in "xyz"]
+    parts: dict[str, list[tuple[str, str]]] = {
+        "inertias": [(f"{x}_{name}", unit) for x in joints for name, unit in _INERTIA.items()],
+        "joint_laws": [law for x in joints for law in _laws(x, machine.unit(x))],
+        "gravity": [(f"gravity_{x}", "m/s2") for x in "xyz"],
+        "rotor_inertias": [(f"{x}_rotor_inertia", "") for x in joints],
+        "distances": [y for x in pairs
+                      for y in (*_laws(x, "m"), *((f"{x}_{end}", "m") for end in ends))],
+        "moving_factor": [("moving_factor", "")],
+        "circuit_friction": [(f"{joints[i]}_circuit_friction", "")
+                             for i in forces.circuit_friction_columns],
+        "fixed_inertia": [(f"fixed_{x}", "")
+                          for x in ("mass", "moment_x", "moment_y", "moment_z")],
+        "tip_point": [(f"tip_{x}", "m") for x in "xyz"],
+        "least_inertias": [(f"{x}_least_inertia", "") for x in joints],
+    }  # fmt: skip
+    for part, size in dynamics.formula_structure.constants_layout.parts.items():
+        yield from parts[part][:size]
 
 
-def _distance_names(pairs: Iterable[str]) -> list[str]:
-    names = []
-    for pair in pairs:
-        names += [f"{pair}_{x}" for x in LAW_PARAMETER_NAMES]
-        names += [f"{pair}_{end}_{x}" for end in ("first", "second") for x in "xyz"]
-    return names
+def _laws(owner: str, unit: str) -> list[tuple[str, str]]:
+    """Names and units of the parameters of a force law along a coordinate of a unit."""
+    units = _law_units(unit)
+    return [(f"{owner}_{name}", units.get(name, "")) for name in LAW_PARAMETER_NAMES]
 
 
 def _setting_names(control: ValveDrive) -> list[str]:
@@ -157,23 +153,6 @@ def _setting_names(control: ValveDrive) -> list[str]:
     names += [f"{joint}_lower_limit" for joint in circuit.hydraulics.joints]
     count = len(control.settings) - len(names) - len(control.command.setting_units)
     return names + [f"signal_setting_{i}" for i in range(count)]
-
-
-def _dynamics_units(program: "InstanceProgram") -> Iterator[str]:
-    """Units of `_dynamics`; none where they depend on another parameter."""
-    machine, dynamics = program.machine, program.chart.dynamics
-    laws = [_law_units(machine.unit(joint)) for joint in machine.joints]
-    pairs = len(dynamics.forces.lengths.pairs)
-    known = {
-        "inertias": _INERTIA_UNITS * len(machine.joints),
-        "joint_laws": [units.get(name, "") for units in laws for name in LAW_PARAMETER_NAMES],
-        "distances": [
-            *(_law_units("m").get(name, "") for name in LAW_PARAMETER_NAMES), *("m",) * 6,
-        ] * pairs,
-        "gravity": ("m/s2",) * 3,
-    }  # fmt: skip
-    for part, size in dynamics.formula_structure.constants_layout.parts.items():
-        yield from known.get(part, ("m" if part == "tip_point" else "",) * size)
 
 
 def _law_units(unit: str) -> dict[str, str]:

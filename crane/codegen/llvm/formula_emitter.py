@@ -11,8 +11,8 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from crane.codegen.llvm.vector_functions import MAX_VECTOR_WIDTH, VECTOR_FUNCTIONS, format_real
-from crane.codegen.symbolic import Scalar, SymbolicExpression, required_operations
-from crane.codegen.vector_layout import Formula
+from crane.codegen.symbolic import Scalar, SymbolicExpression
+from crane.codegen.vector_layout import Formula, assign_memory_slots, operand_indices
 
 # Allows fused multiply-add; reordering sums would gain nothing and could cancel NaN.
 FAST_MATH_FLAGS = "nsz arcp contract"
@@ -123,8 +123,7 @@ _FUNCTION_END = "  ret void\n}"
 
 def emit_formula(formula: Formula, functions: set[tuple[str, int]]) -> str:
     """A formula as a function; adds the vector functions that it calls to `functions`."""
-    tapes = {value.tape for value in formula.outputs if isinstance(value, SymbolicExpression)}
-    operations = tapes.pop().operations if tapes else []
+    operations = formula.operations
     steps = _group_operations(operations, formula)
     # pieces of about equal length; a short formula is a single piece
     count = round(len(steps) / PIECE_LENGTH) if len(steps) > MAX_SINGLE_FUNCTION_LENGTH else 1
@@ -133,7 +132,7 @@ def emit_formula(formula: Formula, functions: set[tuple[str, int]]) -> str:
         _FormulaPiece(operations, steps[start : start + size])
         for start in range(0, max(1, len(steps)), size)
     ]
-    memory_slots = _assign_memory_slots(pieces)
+    memory_slots = assign_memory_slots([piece.computed for piece in pieces], operations)
     targets: dict[int, list[int]] = {}
     copied_outputs: list[list[str]] = []
     for i, value in enumerate(formula.outputs):
@@ -175,9 +174,9 @@ def _group_operations(operations: Sequence[tuple], formula: Formula) -> list[lis
     # by the largest number of `_VECTORIZED` operations on a path to them
     level_of: dict[int, int] = {}
     levels: list[list[int]] = []
-    for index in required_operations(formula.outputs):
+    for index in formula.order:
         operation = operations[index]
-        before = max((level_of[x] for x in _operand_indices(operation)), default=0)
+        before = max((level_of.get(x, 0) for x in operand_indices(operation)), default=0)
         level_of[index] = before + (operation[0] in _VECTORIZED)
         while len(levels) <= level_of[index]:
             levels.append([])
@@ -195,7 +194,7 @@ def _group_operations(operations: Sequence[tuple], formula: Formula) -> list[lis
                 indices[start : start + MAX_VECTOR_WIDTH]
                 for start in range(0, len(indices), MAX_VECTOR_WIDTH)
             ]
-        steps += [[i] for i in level if operations[i][0] not in _VECTORIZED | {"load"}]
+        steps += [[i] for i in level if operations[i][0] not in _VECTORIZED]
     return steps
 
 
@@ -208,18 +207,11 @@ class _FormulaPiece:
 
     Attributes:
         computed: Indices of its operations.
-        required: Indices of operations of earlier pieces that it needs.
     """
 
     def __init__(self, operations: Sequence[tuple], steps: list[list[int]]):
         self._operations, self._steps = operations, steps
         self.computed = {index for step in steps for index in step}
-        self.required = {
-            x
-            for index in self.computed
-            for x in _operand_indices(operations[index])
-            if x not in self.computed and operations[x][0] != "load"
-        }
 
     def emit(
         self,
@@ -238,7 +230,7 @@ class _FormulaPiece:
         vectors: set[str] = set()
         for step in self._steps:
             for x in sorted(
-                {x for index in step for x in _operand_indices(self._operations[index])}
+                {x for index in step for x in operand_indices(self._operations[index])}
             ):
                 if x not in available:
                     available.add(x)
@@ -295,27 +287,6 @@ def _emit_store(name: str, array: str, at: int, word: str) -> list[str]:
         f"  %{name} = getelementptr double, ptr %{array}, i64 {at}",
         f"  store double {word}, ptr %{name}",
     ]
-
-
-def _operand_indices(operation: tuple) -> list[int]:
-    if operation[0] == "load":
-        return []
-    return [x for x in operation[1:] if isinstance(x, int)]
-
-
-def _assign_memory_slots(pieces: Sequence[_FormulaPiece]) -> dict[int, int]:
-    """Memory slots of values for later pieces, reused after the last use."""
-    last = {index: number for number, piece in enumerate(pieces) for index in piece.required}
-    memory_slots: dict[int, int] = {}
-    free: list[int] = []
-    count = 0
-    for number, piece in enumerate(pieces):
-        for index in sorted(piece.computed & last.keys()):
-            if not free:
-                free, count = [count], count + 1
-            memory_slots[index] = free.pop()
-        free += sorted(memory_slots[index] for index in piece.required if last[index] == number)
-    return memory_slots
 
 
 def _emit_vector_call(name: str, width: int, calls: list[tuple[int, Any]]) -> list[str]:

@@ -1,7 +1,6 @@
 """Routines in LLVM IR; variables live in memory, and LLVM moves them to registers."""
 
 from collections.abc import Sequence
-from functools import singledispatchmethod
 
 from crane.codegen.llvm.vector_functions import format_real
 from crane.codegen.routine_statements import (
@@ -68,79 +67,59 @@ class _RoutineEmitter:
         for statement in statements:
             self._emit(statement)
 
-    @singledispatchmethod
     def _emit(self, statement: RoutineStatement) -> None:
-        raise TypeError(f"no statement: {statement!r}")
-
-    @_emit.register
-    def _(self, statement: AssignmentStatement) -> None:
-        self._emit_assignment(statement.variable, self._evaluate(statement.value))
-
-    @_emit.register
-    def _(self, statement: StoreStatement) -> None:
-        word = self._evaluate(statement.value)
-        self._emit_line(f"store double {word}, ptr {self._emit_pointer(statement.pointer)}")
-
-    @_emit.register
-    def _(self, statement: CopyStatement) -> None:
-        pointers = ", ".join(
-            f"ptr {self._emit_pointer(array)}" for array in (statement.target, statement.source)
-        )
-        size = 8 * statement.count
-        self._emit_line(f"call void @llvm.memcpy.p0.p0.i64({pointers}, i64 {size}, i1 false)")
-
-    @_emit.register
-    def _(self, statement: CallStatement) -> None:
-        words = [
-            f"ptr {self._emit_pointer(x)}"
-            if isinstance(x, ArrayPointer)
-            else f"i64 {self._evaluate(x)}"
-            for x in statement.arguments
-        ]
-        sigil = "%" if statement.is_argument else "@"
-        call = f"{sigil}{statement.function}({', '.join(words)})"
-        if statement.result is None:
-            self._emit_line(f"call void {call}")
-        else:
-            self._emit_assignment(statement.result, self._emit_value(f"call i64 {call}"))
-
-    @_emit.register
-    def _(self, statement: LoopStatement) -> None:
-        index, count = statement.index, statement.count
-        start, end = self._new_label(), self._new_label()
-        if index is not None:
-            self._emit_assignment(index, "0")
-        self._end_block(f"br label %{start}", start)
-        if index is not None and count is not None:
-            inside = self._new_label()
-            more = self._evaluate(index < count)
-            self._end_block(f"br i1 {more}, label %{inside}, label %{end}", inside)
-        self._loop_end_labels.append(end)
-        self._emit_block(statement.body)
-        self._loop_end_labels.pop()
-        if index is not None:
-            self._emit_assignment(index, self._evaluate(index + 1))
-        self._end_block(f"br label %{start}", end)
-
-    @_emit.register
-    def _(self, statement: ConditionStatement) -> None:
-        yes, no, end = self._new_label(), self._new_label(), self._new_label()
-        test = self._evaluate(statement.test)
-        self._end_block(f"br i1 {test}, label %{yes}, label %{no}", yes)
-        self._emit_block(statement.body)
-        self._end_block(f"br label %{end}", no)
-        self._emit_block(statement.otherwise)
-        self._end_block(f"br label %{end}", end)
-
-    @_emit.register
-    def _(self, statement: BreakStatement) -> None:
-        # unreachable code needs a block
-        self._end_block(f"br label %{self._loop_end_labels[-1]}", self._new_label())
-
-    @_emit.register
-    def _(self, statement: ReturnStatement) -> None:
-        word = self._evaluate(statement.value)
-        self._end_block(f"ret i64 {word}", self._new_label())
+        match statement:
+            case AssignmentStatement(variable, value):
+                self._emit_assignment(variable, self._evaluate(value))
+            case StoreStatement(pointer, value):
+                word = self._evaluate(value)
+                self._emit_line(f"store double {word}, ptr {self._emit_pointer(pointer)}")
+            case CopyStatement(target, source, count):
+                to, at = (self._emit_pointer(x) for x in (target, source))
+                copied = f"ptr {to}, ptr {at}, i64 {8 * count}, i1 false"
+                self._emit_line(f"call void @llvm.memcpy.p0.p0.i64({copied})")
+            case CallStatement(function, arguments, result, is_argument):
+                words = [
+                    f"ptr {self._emit_pointer(x)}"
+                    if isinstance(x, ArrayPointer)
+                    else f"i64 {self._evaluate(x)}"
+                    for x in arguments
+                ]
+                sigil = "%" if is_argument else "@"
+                call = f"{sigil}{function}({', '.join(words)})"
+                if result is None:
+                    self._emit_line(f"call void {call}")
+                else:
+                    self._emit_assignment(result, self._emit_value(f"call i64 {call}"))
+            case LoopStatement(index, count, body):
+                start, end = self._new_label(), self._new_label()
+                if index is not None:
+                    self._emit_assignment(index, "0")
+                self._end_block(f"br label %{start}", start)
+                if index is not None and count is not None:
+                    inside = self._new_label()
+                    more = self._evaluate(index < count)
+                    self._end_block(f"br i1 {more}, label %{inside}, label %{end}", inside)
+                self._loop_end_labels.append(end)
+                self._emit_block(body)
+                self._loop_end_labels.pop()
+                if index is not None:
+                    self._emit_assignment(index, self._evaluate(index + 1))
+                self._end_block(f"br label %{start}", end)
+            case ConditionStatement(test, body, otherwise):
+                yes, no, end = self._new_label(), self._new_label(), self._new_label()
+                word = self._evaluate(test)
+                self._end_block(f"br i1 {word}, label %{yes}, label %{no}", yes)
+                self._emit_block(body)
+                self._end_block(f"br label %{end}", no)
+                self._emit_block(otherwise)
+                self._end_block(f"br label %{end}", end)
+            case BreakStatement():
+                # unreachable code needs a block
+                self._end_block(f"br label %{self._loop_end_labels[-1]}", self._new_label())
+            case ReturnStatement(value):
+                word = self._evaluate(value)
+                self._end_block(f"ret i64 {word}", self._new_label())
 
     def _new_label(self) -> str:
         self._number += 1

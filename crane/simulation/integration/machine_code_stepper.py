@@ -33,10 +33,10 @@ from crane.simulation.integration.stick_slip_modes import EVENT_TOLERANCE
 HELD_INDEX = 5  # index in `MachineCodeStepper.bounds`: whether joints are at rest
 
 
-def exceeds_chart_limits(routine: Routine, closure_result: ArrayPointer) -> RoutineValue:
+def exceeds_chart_limits(bounds: ArrayPointer, closure_result: ArrayPointer) -> RoutineValue:
     """Whether a closed configuration is outside of the limits of a chart."""
-    return (closure_result["largest_gamma"] > routine.bounds[3]) | (
-        closure_result["determinant"] < routine.bounds[4]
+    return (closure_result["largest_gamma"] > bounds[3]) | (
+        closure_result["determinant"] < bounds[4]
     )
 
 
@@ -244,7 +244,7 @@ class RungeKuttaStepper(MachineCodeStepper):
             with r.if_then(r.call("close", r.geometry, stage, result, r.bounds) < 1):
                 r.return_value(i)
             r.copy(r.state, stage, size)
-            with r.if_then(exceeds_chart_limits(r, result)):
+            with r.if_then(exceeds_chart_limits(r.bounds, result)):
                 r.return_value(i + 1)
         r.return_value(r.steps)
 

@@ -325,7 +325,7 @@ class StepLoop:
             with r.if_then(least_margin < -EVENT_TOLERANCE):  # a passed event distance
                 r.assign(time_to_event, 0.0)
                 r.assign(self._trial_count, 0)
-        with r.if_then(exceeds_chart_limits(r, self._closure_result)):
+        with r.if_then(exceeds_chart_limits(r.bounds, self._closure_result)):
             self._write_return()
 
     def _advance_references(
