@@ -26,7 +26,7 @@ GROUPS = {  # modules of this room and their commands, in the order of use
     "identify": "excite identify payload circuit calibrate",
     "rate": "workspace working-range breakout capacity stability power",
     "design": "study design",
-    "show": "view plot sketch live",
+    "show": "view plot sketch live draw",
     "exchange": "convert export import schema",
 }
 _SIGNAL_STATUS = 128  # exit status of a process that a signal has ended, less its number

@@ -1,4 +1,4 @@
-"""Commands that show machines and runs: view, plot, sketch, live."""
+"""Commands that show machines and runs: view, plot, sketch, live, draw."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -18,7 +18,7 @@ from crane.cli.options import (
 from crane.cli.parsing import joint_units, parse_configuration
 from crane.cli.simulate import ExportedController
 from crane.cli.terminal import hide_activity_line
-from crane.common.atomic_output import portable_file_name
+from crane.common.atomic_output import check_file_is_writable, portable_file_name
 from crane.common.errors import InputError, check_name
 
 if TYPE_CHECKING:
@@ -37,6 +37,18 @@ RunMachine = Annotated[
     ),
 ]
 
+Host = Annotated[
+    str,
+    typer.Option(metavar="ADDRESS", help="Address to listen on; 0.0.0.0 accepts all computers."),
+]
+Port = Annotated[
+    int | None,
+    typer.Option(
+        min=0, max=65535, help="Port to listen on; the first free one from 8080 by default."
+    ),
+]
+NoOpen = Annotated[bool, typer.Option("--no-open", help="Do not open a browser.")]
+
 
 @command()
 def view(
@@ -53,7 +65,7 @@ def view(
         bool, typer.Option("--drive", help="A page on which the machine is driven by its levers.")
     ] = False,
     controller: ExportedController = None,
-    no_open: Annotated[bool, typer.Option("--no-open", help="Do not open a browser.")] = False,
+    no_open: NoOpen = False,
 ) -> None:
     """Write a 3D page of a machine or run, and open it.
 
@@ -170,18 +182,8 @@ def live(
     run: Annotated[
         Path | None, typer.Option(metavar="RUN", help="A run of the machine to play.")
     ] = None,
-    host: Annotated[
-        str,
-        typer.Option(
-            metavar="ADDRESS", help="Address to listen on; 0.0.0.0 accepts all computers."
-        ),
-    ] = "127.0.0.1",
-    port: Annotated[
-        int | None,
-        typer.Option(
-            min=0, max=65535, help="Port to listen on; the first free one from 8080 by default."
-        ),
-    ] = None,
+    host: Host = "127.0.0.1",
+    port: Port = None,
 ) -> None:
     """Move a machine with sliders in a browser.
 
@@ -204,6 +206,46 @@ def live(
     playback = None if played is None else Playback(loaded, played)
     with hide_activity_line():
         crane.view.serve_live_view(crane.view.Session(loaded), playback, host, port)
+
+
+@command()
+def draw(
+    output: OutputFile,
+    machine: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="MACHINE", help="A machine file with a drawing; a new one by default."
+        ),
+    ] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="A side view to draw on: PNG, JPEG or PDF."),
+    ] = None,
+    page: Annotated[int, typer.Option(help="Page of a PDF.")] = 1,
+    host: Host = "127.0.0.1",
+    port: Port = None,
+    no_open: NoOpen = False,
+) -> None:
+    """Draw a machine by its pins in a browser.
+
+    Bodies, cylinders and slides are drawn over a side view, the linkage moves, and the machine
+    file is written, by default the one that is read.
+    """
+    from crane.view.draw.drawing_file import DrawingFile
+    from crane.view.draw.drawing_server import serve_drawing
+    from crane.view.draw.drawing_session import DrawingSession
+    from crane.view.draw.side_view_picture import place_picture
+
+    if picture is None:
+        refuse_options({"--page": page != 1 or None}, "is for --picture, add it")
+    if machine is not None and output.out in (None, machine):
+        check_file_is_writable(machine)
+        file = DrawingFile(machine, machine)
+    else:
+        file = DrawingFile(output.path(Path("drawing.yaml")), machine)
+    model, content = place_picture(file, machine, picture, page)
+    with hide_activity_line():
+        serve_drawing(DrawingSession(file), model, content, host, port, not no_open)
 
 
 def active_coordinates(machine: "crane.Machine", at: str | None) -> "Array":

@@ -14,6 +14,7 @@ _LIBRARIES = {
     "distributed": ("Dask", "cluster"),
     "fmpy": ("FMPy", "fmu"),
     "mujoco": ("MuJoCo", "mjcf"),
+    "pypdfium2": ("pypdfium2", "draw"),
     "viser": ("viser", "live"),
 }
 

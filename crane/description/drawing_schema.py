@@ -4,6 +4,7 @@ from typing import Any
 
 from crane.description.key_types import (
     REQUIRED,
+    FileKey,
     FlagKey,
     ListKey,
     MapKey,
@@ -125,6 +126,18 @@ DRAWN_PIN = section_schema(
         "velocity": NumberKey("largest velocity", "rad/s", **_POSITIVE),
     },
 )
+PICTURE = section_schema(
+    "'picture'",
+    {
+        "file": FileKey("picture, or PDF", default=REQUIRED),
+        "page": NumberKey("page of a PDF", default=1),
+        "width": NumberKey("width of the picture", "m", **_LENGTH),
+        "corner": NumberListKey("where its lower left corner is: [x, z]", "m", size=2,
+                                default=(0.0, 0.0)),
+        "angle": NumberKey("rotation about this corner", "rad", default=0.0),
+        "mirrored": FlagKey("whether its left is right, with the corner there", default=False),
+    },
+)  # fmt: skip
 DRAWING = section_schema(
     "'drawing'",
     {
@@ -139,5 +152,6 @@ DRAWING = section_schema(
         "slides": MapKey(
             "bodies that slide in others", SectionKey(section=DRAWN_SLIDE), "joint"
         ),
+        "picture": SectionKey("picture under it, of `crane draw`", section=PICTURE),
     },
 )  # fmt: skip

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-import yaml
 from lxml import etree
 
 from crane.common.atomic_output import check_file_is_writable, replace_file
@@ -14,11 +13,10 @@ from crane.common.errors import CraneError, OutputError, ignore_warnings
 from crane.common.package_search import NEAREST_ASSEMBLY
 from crane.common.unit_conversions import WrittenNumber
 from crane.description.machine_lookup import bundled_machines, example_robots
+from crane.formats.machine_file.yaml_edits import TextEdit, apply_edits, edit_yaml
 from crane.formats.machine_loading import load
 from crane.formats.robot_files import is_sdf_file, is_simulator_file
 from crane.machine.machine import Machine
-
-TextEdit = tuple[int, int, str]  # start, end, new text
 
 _SAME_HOME_TOLERANCE = 1e-9
 _BYTE_ORDER_MARK = "\ufeff"
@@ -78,10 +76,11 @@ def write_home(
             joint: written.get(("home", joint), plain).write(value)
             for joint, value in zip(machine.joints, machine.home.tolist(), strict=True)
         }
-        find_edits = _yaml_edits if path.suffix.lower() in (".yaml", ".yml") else _xml_edits
-        edited = text.removeprefix(_BYTE_ORDER_MARK)
-        for start, end, new in sorted(find_edits(edited, home), reverse=True):
-            edited = edited[:start] + new + edited[end:]
+        plain_text = text.removeprefix(_BYTE_ORDER_MARK)
+        if path.suffix.lower() in (".yaml", ".yml"):
+            edited = edit_yaml(plain_text, {"home": home})
+        else:
+            edited = apply_edits(plain_text, _xml_edits(plain_text, home))
         _replace_text(path, _BYTE_ORDER_MARK * text.startswith(_BYTE_ORDER_MARK) + edited)
         try:
             _check_written_home(path, machine, arguments)
@@ -134,56 +133,6 @@ def _check_written_home(
             f"{path}: home is read differently than written into it, write it by hand: "
             + ", ".join(f"{joint}: {value!r}" for joint, value in coordinates)
         )
-
-
-def _yaml_edits(text: str, home: Mapping[str, float | str]) -> list[TextEdit]:
-    line_break = "\r\n" if "\r\n" in text else "\n"
-    top = yaml.compose(text, yaml.SafeLoader)
-    assert isinstance(top, yaml.MappingNode), "it was read before"
-    home_node = next((value for key, value in top.value if key.value == "home"), None)
-    if home_node is None and top.flow_style:
-        end = top.end_mark.index - 1
-        return [(end, end, f", home: {{{_flow_text(home)}}}")]
-    if home_node is None:
-        end = top.end_mark.index
-        separator = "" if text[:end].endswith("\n") else line_break
-        return [(end, end, f"{separator}home:{_block_text(home, '  ', line_break)}{line_break}")]
-    span = range(home_node.start_mark.index, home_node.end_mark.index)
-    has_shared_values = any(value.start_mark.index not in span for _, value in home_node.value)
-    if has_shared_values or "&" in text[span.start : span.stop]:
-        raise OutputError(
-            "'home' shares values with other keys (&, *), write its numbers out first"
-        )
-    edits: list[TextEdit] = []
-    missing = dict(home)
-    for key, value in home_node.value:
-        new = _yaml_text(missing.pop(key.value))
-        edits.append((value.start_mark.index, value.end_mark.index, new))
-    if missing and home_node.flow_style:
-        end = text.rindex("}", 0, span.stop)
-        edits.append((end, end, (", " if home_node.value else "") + _flow_text(missing)))
-    elif missing:
-        key, last = home_node.value[-1]
-        after = text.find("\n", last.end_mark.index)
-        end = len(text) if after < 0 else after - text[:after].endswith("\r")
-        edits.append((end, end, _block_text(missing, " " * key.start_mark.column, line_break)))
-    return edits
-
-
-def _block_text(home: Mapping[str, float | str], indent: str, line_break: str) -> str:
-    return "".join(
-        f"{line_break}{indent}{_yaml_text(x)}: {_yaml_text(value)}" for x, value in home.items()
-    )
-
-
-def _flow_text(home: Mapping[str, float | str]) -> str:
-    return ", ".join(f"{_yaml_text(joint)}: {_yaml_text(value)}" for joint, value in home.items())
-
-
-def _yaml_text(value: str | float) -> str:
-    return str(
-        yaml.safe_dump([value], default_flow_style=True, width=10**6, allow_unicode=True)
-    ).strip()[1:-1]
 
 
 def _xml_edits(text: str, home: Mapping[str, float | str]) -> list[TextEdit]:

@@ -99,6 +99,16 @@ class Kinematics(FrameKinematics):
             )
         return out
 
+    def nearest(self, position: Array, initial_guess: Array, iterations: int = 100) -> Array:
+        """Closed configuration (nq,) in which the frame is nearest to a position.
+
+        Args:
+            position: (3,) in the world [m], within reach or not.
+            initial_guess: (nq,) closed configuration, whose branch is followed.
+            iterations: Most iterations; they take long at dead centres.
+        """
+        return np.asarray(self._levenberg_marquardt(position, initial_guess, None, iterations)[1])
+
     def _attitude_targets(
         self, attitude: ArrayLike, positions: Array
     ) -> tuple[AttitudeCoordinates, Array]:
@@ -224,14 +234,14 @@ class Kinematics(FrameKinematics):
         )
 
     def _levenberg_marquardt(
-        self, target: Array, q: Array, attitude: AttitudeCoordinates | None
+        self, target: Array, q: Array, attitude: AttitudeCoordinates | None, iterations: int = 100
     ) -> tuple[float, Array]:
         """Distance and configuration at the end of a bounded Levenberg-Marquardt iteration."""
         closure, machine = self.machine.closure, self.machine
         error = self._error(target, q, attitude)
         distance = float(norm(error))
         damping, reference_distance = 1e-6, self._reference_distance(target[:3])
-        for _ in range(100):
+        for _ in range(iterations):
             if distance < _ROUNDING_TOLERANCE * reference_distance:
                 break
             q_a = q[closure.active]

@@ -136,6 +136,10 @@ class Drawing:
         """Return the bodies that have a point."""
         return [name for name, body in self.bodies.items() if point in body.points]
 
+    def frame_name(self, body: str, point: str) -> str:
+        """Return the name of the frame that a body has at a point."""
+        return f"{body}_{point}" if len(self.bodies_at(point)) > 1 else point
+
     def distance(self, points: Sequence[str]) -> float:
         """Return the distance of two points [m]."""
         first, second = (self.points[name] for name in points)

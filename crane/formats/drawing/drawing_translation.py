@@ -164,7 +164,7 @@ class _DrawingTranslation:
             self._locate(link, body.location)
         frames = [(name, point) for name in self._origins for point in drawing.bodies[name].points]
         for name, point in frames:
-            frame = f"{name}_{point}" if len(drawing.bodies_at(point)) > 1 else point
+            frame = drawing.frame_name(name, point)
             location = drawing.bodies[name].location
             if frame in drawing.bodies:
                 raise DescriptionError(

@@ -21,9 +21,7 @@ from crane.common.optional_libraries import import_optional_library
 from crane.view.live.live_page import LivePage
 from crane.view.live.live_session import Playback, Session
 
-_REFUSAL_MESSAGE = (
-    "Refused: open the address that crane live has told, by the number of its host.\n"
-)
+REFUSAL_MESSAGE = "Refused: open the address that crane has told, by the number of its host.\n"
 
 
 class AccessGuard:
@@ -97,7 +95,7 @@ class AccessGuard:
                     request.path, header_values("Host"), header_values("Origin")
                 )
                 if path is None:
-                    return connection.respond(403, _REFUSAL_MESSAGE)
+                    return connection.respond(403, REFUSAL_MESSAGE)
                 request.path = path
                 return process_request(connection, request)
 
@@ -178,7 +176,7 @@ def serve_live_view(
     """
     requests: RequestQueue = SimpleQueue()
     guard = AccessGuard(host)
-    with _stop_on_signals(requests):
+    with stop_on_signals(requests):
         server = start_server(guard, port)
         try:
             if not guard.is_local_only:
@@ -207,7 +205,7 @@ def _process_until_end(page: LivePage, requests: RequestQueue) -> None:
 def start_server(guard: AccessGuard, port: int | None) -> Any:
     """Start a guarded viser server that prints nothing and shares no public address."""
     viser = import_optional_library("viser", "a live view")
-    port = _free_port(guard.host, port)
+    port = free_port(guard.host, port)
     with redirect_stdout(io.StringIO()), guard.guard_servers():
         server: Any = viser.ViserServer(host=guard.host, port=port, verbose=False)
     restrict_widget_updates(server)
@@ -236,7 +234,7 @@ def _take_requests(requests: RequestQueue, is_playing: bool) -> list[tuple[str, 
 
 
 @contextmanager
-def _stop_on_signals(requests: RequestQueue) -> Iterator[None]:
+def stop_on_signals(requests: RequestQueue) -> Iterator[None]:
     """Put None into the queue on SIGINT and SIGTERM; `SimpleQueue.put` is reentrant."""
     previous_handlers = {
         number: signal.signal(number, lambda *_: requests.put(None))
@@ -249,7 +247,7 @@ def _stop_on_signals(requests: RequestQueue) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _free_port(host: str, port: int | None) -> int:
+def free_port(host: str, port: int | None) -> int:
     """Return a free port; viser would try other ports, or retry endlessly, silently."""
     try:
         family, _, _, _, address = socket.getaddrinfo(

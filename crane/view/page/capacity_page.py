@@ -1,10 +1,7 @@
 """Interactive page of rated loads: load, limits, strokes and pressures at each position."""
 
 import json
-from html import escape
-from importlib.resources import files
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
@@ -14,7 +11,7 @@ from crane.common.units import display_unit
 from crane.ratings.capacity_report import capacity_facts, slew_labels
 from crane.ratings.drive_force_limits import drive_force_limits
 from crane.ratings.lifting_capacity import Capacity
-from crane.view.page.html_document import write_page
+from crane.view.page.html_document import filled_template, write_page
 from crane.view.plots.rating_figures import (
     capacity_heading,
     drawing_extent,
@@ -42,21 +39,13 @@ def write_capacity_page(chart: Capacity, path: str | Path) -> Path:
     Raises:
         OutputError: The file's suffix is not .html or .htm, or it cannot be written.
     """
-    assets = files("crane.view.page") / "assets"
-    style, script, template = (
-        (assets / f"capacity.{kind}").read_text(encoding="utf-8") for kind in ("css", "js", "html")
+    heading = capacity_heading(chart)
+    return write_page(
+        path,
+        lambda: filled_template(
+            "capacity", ["capacity"], ["capacity"], heading, capacity_page_data(chart)
+        ),
     )
-
-    def create_text() -> str:
-        data = json.dumps(capacity_page_data(chart), separators=(",", ":"), allow_nan=False)
-        return Template(template).substitute(
-            title=escape(capacity_heading(chart)),
-            style=style,
-            script=script,
-            data=data.replace("</", "<\\/"),
-        )
-
-    return write_page(path, create_text)
 
 
 def capacity_page_data(chart: Capacity) -> dict[str, Any]:

@@ -5,10 +5,7 @@ The machine is computed in the page by the same routines as in this package, as 
 
 import base64
 from collections.abc import Iterator
-from html import escape
-from importlib.resources import files
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
@@ -34,9 +31,9 @@ from crane.view.page.drive_conditions import DriveConditions
 from crane.view.page.drive_goals import goal_data
 from crane.view.page.drive_hand import pull_data, target_data
 from crane.view.page.drive_levers import INTERVAL, lever_data
-from crane.view.page.html_document import write_page
+from crane.view.page.html_document import asset_text, filled_template, write_page
 from crane.view.page.page_motion import frame_data, joint_tree, pack_base64
-from crane.view.page.report_page import machine_data, scene_commands, script_json, viewer_script
+from crane.view.page.report_page import machine_data, scene_commands, viewer_script
 from crane.view.page.scene import build_scene, link_poses, read_visuals, scene_bounds
 
 RAMP = 0.15  # time from neutral to the end of a lever [s]
@@ -79,19 +76,15 @@ def drive_html(machine: Machine, controller: str | None = None) -> str:
         "goals": goal_data(machine, conditions.masses, scene.ground_height)
     }
     data["lower"], data["upper"] = (x.tolist() for x in _motion_bounds(machine, scene))
-    assets = files("crane.view.page") / "assets"
-
-    def read(*names: str) -> str:
-        return "\n".join((assets / name).read_text(encoding="utf-8") for name in names)
-
-    return Template(read("drive.html")).substitute(
-        title=escape(result_title(machine.name, "drive")),
-        style=read("page.css", "drive.css"),
+    return filled_template(
+        "drive",
+        ("page", "dark", "drive"),
+        _SCRIPTS,
+        result_title(machine.name, "drive"),
+        data,
         viewer=viewer_script(),
-        data=script_json(data),
         commands=scene_commands(scene),
-        worker=read(*(f"{x}.js" for x in _WORKER_SCRIPTS)),
-        script=read(*(f"{x}.js" for x in _SCRIPTS)),
+        worker=asset_text(*(f"{x}.js" for x in _WORKER_SCRIPTS)),
     )
 
 

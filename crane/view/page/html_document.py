@@ -1,8 +1,12 @@
 """Self-contained HTML documents of text, tables and figures."""
 
+import json
 from collections.abc import Callable, Iterable, Sequence
 from html import escape
+from importlib.resources import files
 from pathlib import Path
+from string import Template
+from typing import Any
 
 from crane.common.atomic_output import replace_file
 from crane.common.errors import OutputError
@@ -72,6 +76,44 @@ def write_page(path: str | Path, create_text: Callable[[], str]) -> Path:
     with replace_file(path) as part:
         part.write_text(text, encoding="utf-8", errors="backslashreplace")
     return Path(path)
+
+
+def asset_text(*names: str) -> str:
+    """Return files of `assets`, one after the other."""
+    assets = files("crane.view.page") / "assets"
+    return "\n".join((assets / name).read_text(encoding="utf-8") for name in names)
+
+
+def filled_template(
+    template: str,
+    styles: Iterable[str],
+    scripts: Iterable[str],
+    title: str,
+    data: Any,
+    **texts: str,
+) -> str:
+    """Return a page by a template of `assets`.
+
+    Args:
+        template: Its name without suffix.
+        styles: Names of style sheets without suffix.
+        scripts: Names of scripts without suffix.
+        title: Title of the page.
+        data: What the scripts read, as JSON.
+        texts: Other texts of the template.
+    """
+    return Template(asset_text(f"{template}.html")).substitute(
+        title=escape(title),
+        style=asset_text(*(f"{name}.css" for name in styles)),
+        script=asset_text(*(f"{name}.js" for name in scripts)),
+        data=script_json(data),
+        **texts,
+    )
+
+
+def script_json(value: Any) -> str:
+    """Return JSON that is safe inside a script element."""
+    return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def definition_list(rows: Iterable[tuple[str, str]]) -> str:

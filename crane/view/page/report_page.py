@@ -1,14 +1,11 @@
 """Report page of a machine and its run, for any browser without network."""
 
 import base64
-import json
 import webbrowser
 from collections.abc import Sequence
-from html import escape
 from importlib.resources import files
 from math import cos, sin
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
@@ -29,7 +26,7 @@ from crane.recordings.recording_summary import (
     summarize,
 )
 from crane.view.page.force_markers import actuator_markers, load_markers, spring_markers
-from crane.view.page.html_document import write_page
+from crane.view.page.html_document import filled_template, script_json, write_page
 from crane.view.page.page_channels import ThinningGrid, plot_groups
 from crane.view.page.page_motion import (
     check_joints,
@@ -103,9 +100,9 @@ def report_html(
     return _render_page(page_data, scene)
 
 
-def open_in_browser(path: str | Path) -> bool:
-    """Open a page in the user's browser; return False if there is none."""
-    return webbrowser.open(Path(path).resolve().as_uri())
+def open_in_browser(page: Path | str) -> bool:
+    """Open a page, a file or an address, in the user's browser; return False if there is none."""
+    return webbrowser.open(page.resolve().as_uri() if isinstance(page, Path) else page)
 
 
 def machine_data(machine: Machine, scene: Scene, recording: Recording | None) -> dict[str, Any]:
@@ -191,17 +188,9 @@ def _run_data(
 
 
 def _render_page(page_data: dict[str, Any], scene: Scene) -> str:
-    assets = files("crane.view.page") / "assets"
-    return Template((assets / "page.html").read_text(encoding="utf-8")).substitute(
-        title=escape(result_title(page_data["machine"], page_data["task"])),
-        style=(assets / "page.css").read_text(encoding="utf-8"),
-        viewer=viewer_script(),
-        data=script_json(page_data),
-        commands=scene_commands(scene),
-        script="\n".join(
-            (assets / f"{name}.js").read_text(encoding="utf-8") for name in SCRIPT_NAMES
-        ),
-    )
+    title = result_title(page_data["machine"], page_data["task"])
+    texts = {"viewer": viewer_script(), "commands": scene_commands(scene)}
+    return filled_template("page", ["page"], SCRIPT_NAMES, title, page_data, **texts)
 
 
 def viewer_script() -> str:
@@ -225,11 +214,6 @@ def _rotate_view(direction: tuple[float, float, float], heading: float) -> list[
         x * sin(heading) + y * cos(heading),
         z,
     ]
-
-
-def script_json(value: Any) -> str:
-    """Return JSON that is safe inside a script element."""
-    return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
 _MAX_LIMIT_SENTENCES = 6  # on limits, at most
