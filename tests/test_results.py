@@ -118,6 +118,13 @@ CASES = {
         {"npz": True, "views": True},
         "recording.npz summary.md figure.png view.html",
     ),
+    "SectionChart": (
+        lambda x: crane.dynamics.section_chart(
+            crane.load(x / "boom.yaml"), crane.Recording.from_csv(x / "boom.csv"), "boom"
+        ),
+        {},
+        "sections.md sections.csv sections.png",
+    ),
     "Sensitivities": (
         lambda x: crane.sensitivities(
             four_bar(x), None, duration=0.01, parameters=["crank_arm.mass"]

@@ -10,6 +10,7 @@ import yaml
 from excavators import planar
 from hydraulic_rig import COMPENSATED, rig
 from test_add_loops import five_bar
+from test_section_forces import write as write_boom
 
 import crane
 from crane.cli import program
@@ -64,6 +65,11 @@ COMMANDS = {
         ["four_bar.yaml", "--by", "crank_arm.mass", "--duration", "0.01", "--out", "result"],
         "result",
     ),
+    "sections": (
+        ["boom.yaml", "boom.csv", "--body", "boom", "--out", "result"],
+        "result",
+    ),
+    "settle": (["mine/four_bar.yaml", "--write"], "mine/four_bar.yaml"),
     "simulate": (["four_bar.yaml", "--duration", "0.01", "--out", "result"], "result"),
     "sketch": (["four_bar.yaml", "--out", "result.svg"], "result.svg"),
     "study": (
@@ -119,6 +125,8 @@ def read(folder):
         crane.simulate(crane.load(folder / "four_bar.yaml"), duration=0.01).to_csv(
             folder / "run.csv"
         )
+        boom = crane.load(write_boom(folder))
+        crane.simulate(boom, duration=0.01).to_csv(folder / "boom.csv")
         machine = rig(folder, COMPENSATED, friction={"viscous": 600.0})
         time = np.arange(0.0, 4.0, 0.01)
         signals = {"x": 5.8 + 2.8 * np.array([0.3, -0.3, 0.4, -0.4])[time.astype(int)]}

@@ -24,7 +24,7 @@ GROUPS = {  # modules of this room and their commands, in the order of use
     "describe": "new list info check add",
     "simulate": "demo simulate sway modes sensitivities",
     "identify": "excite identify payload circuit calibrate",
-    "rate": "workspace working-range breakout capacity stability power",
+    "rate": "workspace working-range breakout capacity stability settle sections power",
     "design": "study design",
     "show": "view plot sketch live draw",
     "exchange": "convert export import schema",
@@ -32,11 +32,8 @@ GROUPS = {  # modules of this room and their commands, in the order of use
 _SIGNAL_STATUS = 128  # exit status of a process that a signal has ended, less its number
 _FLAGS = ("--debug", "--strict", "--trust-xacro")  # that all commands take
 _HELP = """\
-Simulate, identify, rate and design machines with closed kinematic chains.
-
-  crane new excavator --size 20t                write a machine file of your own
-  crane simulate mini_forwarder --task lift     simulate a task of a machine
-  crane view simulate                           show this run in a browser
+Simulate, identify, rate and design machines with closed kinematic chains:
+  crane new excavator -o my.yaml && crane simulate my.yaml && crane view simulate
 
 {commands}
 

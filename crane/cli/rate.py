@@ -1,4 +1,4 @@
-"""Commands that rate machines: workspace, working-range, breakout, capacity, stability, power."""
+"""Commands that rate machines: workspace, ranges, forces, capacity, stability, rest, power."""
 
 import warnings
 from collections.abc import Sequence
@@ -295,6 +295,59 @@ def stability(
             f"in '{task}' a payload of {found.mass:.5g} kg tips it, at t = {found.time:.4g} s; "
             f"at rest {found.static_mass:.5g} kg would"
         )
+
+
+@command()
+def settle(
+    machine: MachineName,
+    options: MachineOptions,
+    at: Configuration = None,
+    write_home: Annotated[
+        bool,
+        typer.Option(
+            "--write", help="Write the coordinates at rest into the machine file, as home."
+        ),
+    ] = False,
+) -> None:
+    """Compute the equilibrium in which a machine stands.
+
+    Driven joints stay where they are; free joints, contacts, tyres, springs and
+    pressures come to rest.
+    """
+    loaded = options.load(machine)
+    if write_home:
+        refuse_options(
+            {"--set": options.changes, "--lock": options.lock},
+            "does not go with --write, write it into the file first",
+        )
+    found = crane.simulation.settle(loaded, active_coordinates(loaded, at))
+    print(found.to_markdown(), end="")
+    if write_home:
+        values = options.assembly()
+        values.pop("floating")
+        print(f"home written to {crane.formats.write_home(machine, **values, q=found.q)}")
+
+
+@command()
+def sections(
+    machine: MachineName,
+    recording: RecordingFile,
+    options: MachineOptions,
+    reading: RecordingOptions,
+    output: OutputFolder,
+    body: Annotated[
+        str, typer.Option(metavar="NAME", help="A body of the drawing, with plates or tubes.")
+    ],
+) -> None:
+    """Compute section forces and stresses of a body in a run.
+
+    Axial force, shear force, bending moment and stress of a body of `drawing:`.
+    """
+    loaded = options.load(machine)
+    run = reading.read(recording, loaded)
+    with status("computing forces"):
+        result = crane.dynamics.section_chart(loaded, run, body)
+    output.write(result)
 
 
 @command()

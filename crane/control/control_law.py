@@ -149,12 +149,20 @@ class ControlLaw(OneLineRepr):
             Dynamics(self.machine, backend="pinocchio"), self.machine.closure.solve(q_a)
         )
 
-    def start_closed(self, dynamics: Dynamics, q: Array) -> Array:
-        """`start` at a closed configuration (nq,), with exact dynamics."""
+    def start_closed(
+        self, dynamics: Dynamics, q: Array, contact_states: Array | None = None
+    ) -> Array:
+        """`start` at a closed configuration (nq,), with exact dynamics.
+
+        Args:
+            dynamics: Dynamics of the machine.
+            q: (nq,) configuration.
+            contact_states: States of the external forces; zeros if not given.
+        """
         q_a = q[self.machine.closure.active]
         zeros, evaluate = np.zeros_like(q_a), dynamics.tree_dynamics.evaluate
         # the machine of a run may have more external forces than that of the law
-        static_forces = static_active_forces(dynamics.machine, q)
+        static_forces = static_active_forces(dynamics.machine, q, contact_states)
 
         def inverse(a_a: Sequence[Scalar], friction: bool) -> list[Scalar]:
             quantity = "inverse with friction" if friction else "inverse"

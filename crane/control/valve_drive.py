@@ -8,15 +8,17 @@ from typing import Any
 import numpy as np
 
 from crane.codegen import Scalar
-from crane.common.errors import InputError, check_name
+from crane.common.errors import InputError, SimulationError, check_name
 from crane.common.samples import Array, as_sample
 from crane.control.control_law import ControlLaw, ControllerInputs
+from crane.control.oil_equilibrium import OilEquilibrium, open_nodes
 from crane.control.valve_commands import (
     SampledCommand,
     ValveCommand,
     ValveSignals,
     require_circuit,
 )
+from crane.dynamics.dynamics import Dynamics
 from crane.hydraulics.circuit_equations import CircuitEquations, CircuitValues
 from crane.machine.machine import Machine
 
@@ -140,6 +142,37 @@ class ValveDrive(ControlLaw):
         if self.command.has_measured_pressures:
             tank = float(np.array(inputs.reference[-1], dtype=np.float64))
         return self.circuit.initial_state(holding_forces, self._initial_pressures, signals, tank)
+
+    def start_closed(
+        self, dynamics: Dynamics, q: Array, contact_states: Array | None = None
+    ) -> Array:
+        """See `ControlLaw`; lines and accumulators as `Machine.start` says.
+
+        By default those without a `pressure` that are open to a chamber have that of its load.
+
+        Raises:
+            SimulationError: `start: equilibrium`, and oil flows in any case.
+        """
+        state = super().start_closed(dynamics, q, contact_states)
+        hydraulics, start = self.circuit.hydraulics, self.machine.start
+        stores = hydraulics.lines | hydraulics.accumulators  # type: ignore[operator]
+        nodes = sorted(x for x in open_nodes(hydraulics) if not stores[x].pressure)
+        if start == "home" or not (nodes or start):
+            return state
+        equilibrium = self.oil_equilibrium(q, state)
+        motion = equilibrium.find(stores if start else nodes)
+        if motion and start:
+            raise SimulationError(
+                f"the oil has no static equilibrium: {motion}, through a valve, relief valve or "
+                "element that is open: close it, or leave 'start' out"
+            )
+        return state if motion else equilibrium.state
+
+    def oil_equilibrium(self, q: Array, state: Array) -> OilEquilibrium:
+        """Equations of the equilibrium of the oil at a configuration (nq,) and state (k,)."""
+        q_a = q[self.machine.closure.active][self._active_indices]
+        positions = (q_a - self._lower_limits).tolist()
+        return OilEquilibrium(self.circuit, state, positions, self._initial_pressures)
 
     def _sample_signals(self, time: float, q_a: Array, v_a: Array, pressures: Array) -> Array:
         """Signals (s,) of a sampled law."""

@@ -78,6 +78,15 @@ class Ground:
         normal_z = 1.0 / apply_function("sqrt", slope * slope + 1.0)
         return (position[2] - height) * normal_z, [-1.0 * slope * normal_z, 0.0, normal_z]
 
+    def tangents(self, normal: list[Scalar]) -> tuple[list[Scalar], list[Scalar]]:
+        """Return two directions along the ground, the first in the plane of x and z."""
+        first: list[Scalar] = [1.0, 0.0, 0.0]
+        if self.profile or np.any(self.normal[::2]):  # the normal is not along y
+            square = normal[0] * normal[0] + normal[2] * normal[2]
+            normalization = 1.0 / apply_function("sqrt", square)
+            first = [normalization * normal[2], 0.0, -1.0 * normalization * normal[0]]
+        return first, cross(normal, first)
+
 
 class Contact(ExternalForce):
     """Contact of a point of a body, or of a wheel or ball around it, with the ground.
@@ -217,12 +226,7 @@ class Contact(ExternalForce):
         sliding_velocity: list[Scalar],
     ) -> tuple[list[Scalar], list[Scalar]]:
         """Return F_t (3,) and s' (2,)."""
-        first: list[Scalar] = [1.0, 0.0, 0.0]
-        if self.ground.profile or np.any(self.ground.normal[::2]):  # it is not along y
-            square = normal[0] * normal[0] + normal[2] * normal[2]
-            normalization = 1.0 / apply_function("sqrt", square)
-            first = [normalization * normal[2], 0.0, -1.0 * normalization * normal[0]]
-        axes = first, cross(normal, first)
+        axes = self.ground.tangents(normal)
         s, max_friction = list(motion.states), self.friction * normal_force
         excess_share = maximum(
             1.0 - max_friction / (self.lateral_stiffness * _smoothed_norm(s, _MIN_LENGTH)), 0.0

@@ -386,6 +386,11 @@ MACHINE = section_schema(
             MapKey("", _FACTOR, "joint"), default_text="the joints under `active`",
         ),
         "home": MapKey("home configuration", _JOINT_VALUE, "joint", default_text="0 each"),
+        "start": TextKey(
+            "how runs [start](simulation.md#start): in static equilibrium of all free joints and "
+            "of the oil, or at home with the pressures of the file", default="",
+            choices=("equilibrium", "home"), default_text="equilibrium on contacts, else home",
+        ),
         "friction": MapKey(
             "joint friction", SectionKey(section=FRICTION), "joint",
             default_text="none, or the URDF's"

@@ -275,12 +275,20 @@ class ExternalForces:
         )
 
 
-def static_active_forces(machine: Machine, q: Array) -> Array:
-    """gamma^T J^T w (n,) of the external forces at time 0, at rest at a configuration (nq,)."""
+def static_active_forces(machine: Machine, q: Array, states: Array | None = None) -> Array:
+    """gamma^T J^T w (n,) of the external forces at time 0, at rest at a configuration (nq,).
+
+    Args:
+        machine: The machine.
+        q: (nq,) closed configuration.
+        states: States of all external forces; zeros if not given.
+    """
     if not machine.external_forces:
         return np.zeros(len(machine.active))
-    still, none = np.zeros(machine.model.nv), np.zeros(state_count(machine.external_forces))
+    if states is None:
+        states = np.zeros(state_count(machine.external_forces))
+    still = np.zeros(machine.model.nv)
     applied = ExternalForces(machine, machine.external_forces).generalized_forces(
-        0.0, q, still, none
+        0.0, q, still, states
     )
     return np.asarray(machine.closure.gamma(q).T @ applied.generalized_forces)

@@ -11,6 +11,7 @@ from lxml import etree
 from crane.common.atomic_output import check_file_is_writable, replace_file
 from crane.common.errors import CraneError, OutputError, ignore_warnings
 from crane.common.package_search import NEAREST_ASSEMBLY
+from crane.common.samples import Array
 from crane.common.unit_conversions import WrittenNumber
 from crane.description.machine_lookup import bundled_machines, example_robots
 from crane.formats.machine_file.yaml_edits import TextEdit, apply_edits, edit_yaml
@@ -35,6 +36,7 @@ def write_home(
     free: Sequence[str] | None = None,
     packages: Sequence[str | Path] = (),
     arguments: Mapping[str, object] | None = None,
+    q: Array | None = None,
 ) -> Path:
     """Write the closed home configuration of a machine into its file in full precision.
 
@@ -49,6 +51,7 @@ def write_home(
         free: As for `load`.
         packages: As for `load`.
         arguments: As for `load`.
+        q: (nq,) closed configuration that becomes home instead [m], [rad].
 
     Returns:
         The file.
@@ -65,6 +68,8 @@ def write_home(
             packages=packages,
             arguments={**(arguments or {}), NEAREST_ASSEMBLY: True},
         )
+        if q is not None:
+            machine = machine.with_home_configuration(q, machine.active)
         path = machine.path.resolve()
         _check_is_writable(machine, path)
         try:

@@ -71,6 +71,7 @@ class Machine(OneLineRepr, MachineParts):
         free: Active joints without drive: only friction, springs and stops act on them.
         external_forces: External forces.
         supports: Links that stand on the ground; empty if its contacts do.
+        start: How runs start: "equilibrium", "home", or "" for the default.
         pin_capacities: Largest force that pins bear, by joint or loop [N].
         explicit_drives: Drives of the file (actuators of a MJCF), or all drives where they are
             redundant; empty where `drives` are the active joints.

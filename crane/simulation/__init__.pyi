@@ -12,3 +12,5 @@ from .sensitivity.motion_sensitivities import Sensitivities as Sensitivities
 from .sensitivity.motion_sensitivities import gradient as gradient
 from .sensitivity.motion_sensitivities import sensitivities as sensitivities
 from .simulation_run import simulate as simulate
+from .standing_machine import StandingMachine as StandingMachine
+from .standing_machine import settle as settle

@@ -62,12 +62,12 @@ from crane.simulation.run_checks import (
 from crane.simulation.simulation_setup import (
     Force,
     count_steps,
-    equilibrium_on_contacts,
     initial_motion,
     machine_under_control,
     reference_limits_text,
     resolve_controller,
 )
+from crane.simulation.static_equilibrium import RestState, rest_state
 
 _MIN_TOLERANCE, _MAX_TOLERANCE = 1e-13, 1e-2
 
@@ -116,7 +116,7 @@ def simulate(
         initial: Initial active coordinates (n,) [m], [rad] at rest, or a pair (q_a, v_a) with
             velocities [m/s], [rad/s]. The default is the start of the reference or levers of the
             controller, or else home. By default a machine that stands on contacts starts in static
-            equilibrium, see `crane.simulation.simulation_setup`.
+            equilibrium, see `crane.simulation.static_equilibrium`.
         duration: Duration [s]; that of the reference or levers of the controller if not given,
             which ends with the last phase.
         step: Interval of the output instants, and step size of "rk4" [s].
@@ -298,24 +298,23 @@ def _initial_state(
     """Initial state, the number of states of the controller, and a note about the state."""
     machine = dynamics.machine
     q_a, v_a = initial_motion(machine, initial, control)
-    start_text = ""
+    rest = RestState(q_a, np.zeros(state_count(machine.external_forces)))
     if initial is None:
-        q_a, start_text = equilibrium_on_contacts(dynamics, q_a)
+        rest = rest_state(dynamics, q_a)
     try:
         # from home, so that a run does not depend on earlier solutions
-        configuration = machine.closure.solve(q_a, initial_guess=machine.home)
+        configuration = machine.closure.solve(rest.q_a, initial_guess=machine.home)
         if isinstance(control, ControlLaw) and dynamics.formulation == "exact":
-            controller_state = control.start_closed(dynamics, configuration)
+            controller_state = control.start_closed(dynamics, configuration, rest.contact_states)
         else:
             controller_state = control.start(configuration[machine.closure.active])
     except ClosureError as error:
         raise SimulationError(f"at t = 0 s, where the motion starts: {error}") from None
     if text := buried_contact_text(machine, configuration):
         raise SimulationError(f"at t = 0 s, where the motion starts: {text}")
-    contact_states = np.zeros(state_count(machine.external_forces))
     energies = np.zeros(2 + len(machine.external_forces))
-    state = np.concatenate([configuration, v_a, contact_states, controller_state, energies])
-    return state, len(controller_state), start_text
+    state = np.concatenate([configuration, v_a, rest.contact_states, controller_state, energies])
+    return state, len(controller_state), rest.text
 
 
 def has_fixed_steps(dynamics: Dynamics, control: Controller, method: str | None) -> bool:

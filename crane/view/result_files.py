@@ -400,6 +400,11 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         motion=lambda run: (load_from_expression(run.machine), run),
         notebook_figures=("plots.recording_figure.recording_figure",),
     ),
+    "SectionChart": ResultFiles(
+        summary="sections.md",
+        tables={"sections.csv": "to_csv"},
+        figures={"sections.png": "plots.rating_figures.section_figure"},
+    ),
     "Sensitivities": ResultFiles(
         summary="sensitivities.md",
         tables={"sensitivities.csv": "to_csv"},

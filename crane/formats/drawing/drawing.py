@@ -21,6 +21,7 @@ from crane.formats.drawing.body_inertia import (
     tube_inertia,
 )
 from crane.formats.drawing.body_placement import place_bodies, read_point
+from crane.formats.drawing.body_shapes import BarShape, PlateShape, equivalent_plate
 from crane.formats.machine_file.yaml_section import YamlSection
 from crane.formats.steel_cylinder import SteelCylinder, sum_inertias
 
@@ -33,27 +34,13 @@ _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 @dataclass(frozen=True)
-class BarShape:
-    """A straight part of the shape of a body.
-
-    Attributes:
-        ends: (2, 3) centres of its end faces [m].
-        height: In the plane of the drawing [m].
-        width: Across it [m]; None: it is round.
-    """
-
-    ends: Array
-    height: float
-    width: float | None = None
-
-
-@dataclass(frozen=True)
 class DrawnBody:
     """A rigid body.
 
     Attributes:
         points: Names of its points.
         bars: Its shape: tubes, the edges of plates, or lines between its points.
+        plates: Its plates and tubes.
         inertia: About its centre, along the axes of the drawing; the lever counts from the
             origin of the drawing.
         location: File and line.
@@ -63,6 +50,7 @@ class DrawnBody:
     bars: tuple[BarShape, ...]
     inertia: pin.Inertia
     location: str
+    plates: tuple[PlateShape, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -280,6 +268,7 @@ class _DrawingReader:
             if placement is None
             else item.item_names("points")
         )
+        self._plates: list[PlateShape] = []
         parts = [*self._read_plates(item), *self._read_tubes(item)]
         mass = item.number("mass") if "mass" in item else None
         bars = [bar for bars, _ in parts for bar in bars]
@@ -304,6 +293,7 @@ class _DrawingReader:
             tuple(bars or self._outline_bars(points)),
             rigid_inertia(body.mass, centre, tensor),
             item.source_location(),
+            tuple(self._plates),
         )
 
     def _outline_bars(
@@ -325,6 +315,8 @@ class _DrawingReader:
             if polygon_moments(outline[:, [0, 2]])[0] == 0:
                 raise plate.error_at("outline", f"{plate.title} has no area, order its points")
             for y in values["y"]:
+                place = outline + [0.0, y, 0.0]
+                self._plates.append(PlateShape(place, values["thickness"], values["density"]))
                 yield (
                     self._outline_bars(names, values["thickness"], y),
                     plate_inertia(outline, values["thickness"], y, values["density"]),
@@ -344,7 +336,9 @@ class _DrawingReader:
             values |= tube.values("points")
             for y in values.pop("y"):
                 bar = BarShape(ends + [0.0, y, 0.0], values["height"], values["width"])
-                yield [bar], tube_inertia(bar.ends, **values)
+                inertia = tube_inertia(bar.ends, **values)
+                self._plates.append(equivalent_plate(bar, inertia, values["density"]))
+                yield [bar], inertia
 
     def _estimate_mass(self, name: str, item: YamlSection, points: Sequence[str]) -> float:
         known = self._piston_areas

@@ -29,7 +29,8 @@ from crane.description.kinematic_tree import (
 from crane.description.machine_schema import MACHINE
 from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
 from crane.formats.drawing.body_inertia import rigid_inertia
-from crane.formats.drawing.drawing import BarShape, Drawing, DrawnPin, DrawnSlide, read_drawing
+from crane.formats.drawing.body_shapes import BarShape
+from crane.formats.drawing.drawing import Drawing, DrawnPin, DrawnSlide, read_drawing
 from crane.formats.machine_file.yaml_section import YamlSection
 from crane.formats.steel_cylinder import SteelCylinder, add_cylinder_visuals, sum_inertias
 from crane.formats.xml_file import (

@@ -188,6 +188,7 @@ def _read_machine(path: Path) -> MachineSpec:
         supports=_read_or_default(_read_supports, (), top, tree, external_forces),
         pin_capacities=_read_or_default(_read_pins, {}, top, tree, loops),
         gravity=gravity,
+        start=_read_or_default(YamlSection.text, "", top, "start"),
         written_numbers=top.written_numbers(),
     )
 

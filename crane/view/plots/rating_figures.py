@@ -1,4 +1,4 @@
-"""Figures of load charts and tool forces over radius and height, by limiting factor."""
+"""Figures of load charts and tool forces by limiting factor, and of sections of bodies."""
 
 import itertools
 from collections.abc import Mapping
@@ -16,6 +16,7 @@ from matplotlib.ticker import MaxNLocator
 
 from crane.common.samples import Array
 from crane.common.units import display_unit
+from crane.dynamics.section_forces import SECTION_UNITS, SectionChart, section_unit
 from crane.ratings.capacity_report import round_levels, slew_labels
 from crane.ratings.lift_charts import LiftChart
 from crane.ratings.lifting_capacity import Capacity
@@ -391,3 +392,25 @@ def _draw_arrows(
             width=0.008,
             pivot="mid",
         )
+
+
+@figure_style
+def section_figure(chart: SectionChart) -> Figure:
+    """Return panels of the envelopes along the axis, one per quantity; stresses in one."""
+    figure = Figure(figsize=(7.0, 8.4), layout="constrained")
+    panels = figure.subplots(4, 1, sharex=True)
+    drawn = (*panels, panels[-1]), (*CURVE_COLOURS[:1] * 4, CURVE_COLOURS[1])
+    for (name, envelope), axes, color in zip(chart.envelopes.items(), *drawn, strict=True):
+        unit, scale = section_unit(SECTION_UNITS[name], float(np.nanmax(np.abs(envelope))))
+        low, high = scale * envelope
+        label = name.replace("_", " ")
+        axes.axhline(0.0, color="0.6", lw=0.6)
+        axes.fill_between(chart.positions, low, high, alpha=0.25, color=color, label=label)
+        axes.plot(chart.positions, low, chart.positions, high, color=color)
+        axes.set_ylabel(f"{label.removeprefix('upper ')} [{unit}]")
+    panels[3].legend(loc="best")
+    panels[3].set_xlabel("position along the axis [m]")
+    add_heading(
+        figure, escape_label(result_title(chart.machine_name, f"sections of {chart.body}"))
+    )
+    return figure
