@@ -711,6 +711,29 @@ def test_slow_speeds_alone_tell_no_stiction(machine):
     assert "do not exceed the Stribeck velocity twofold, record faster ones" in found.note
 
 
+def test_friction_of_a_speed_that_rings(machine):
+    """About a constant mean at a held valve, by a fifth: means over its periods tell the law."""
+    speeds = [0.012, 0.018, 0.027, 0.04]
+    run = strokes(speeds, 0, None, hold=8.0)
+    time, v = run.time, run.v[:, 0]
+    swing = 0.2 * v * np.sin(2 * np.pi * 2.0 * time)
+    a = np.gradient(v + swing, time)
+    q = run.q[:, 0] + np.concatenate(
+        [[0], np.cumsum(0.5 * np.diff(time) * (swing[1:] + swing[:-1]))]
+    )
+    force = MASS * (9.81 + a) + friction_force(v + swing)
+    rings = recording(time, q, v + swing, force)
+    with pytest.raises(
+        RecordingError, match="no speed of 'boom' is steady|never extends steadily"
+    ):
+        identify_cylinder_friction(machine, rings, "boom")
+    held = dataclasses.replace(
+        rings, channels={"voltage_boom": 5.8 - 20.0 * v}, channel_units={"voltage_boom": "V"}
+    )
+    found = identify_cylinder_friction(machine, held, "boom", stribeck=False)
+    np.testing.assert_allclose(found.values, [210, 25, 3300], rtol=0.03)
+
+
 def test_friction_needs_both_ways(machine):
     time = np.arange(0, 20, 5e-3)
     v = np.interp(time, [0, 1, 9, 10, 19, 20], [0, 0.01, 0.01, 0.02, 0.02, 0.0])

@@ -7,6 +7,7 @@ import pytest
 
 import crane
 from crane.formats.machine_loading import MachineVariants
+from crane.identification.calibration import model_selection
 from crane.identification.calibration.levenberg_marquardt import bounded_step
 from crane.identification.calibration.model_selection import (
     LinearizedSelection,
@@ -19,6 +20,7 @@ from crane.identification.calibration.plausibility import (
     static_payload,
 )
 from crane.identification.calibration.unknowns import Unknown
+from crane.recordings.sensor_kinematics import cylinder_pins
 from crane.recordings.timeseries import Table
 
 NAMES = ["gain", "offset", "nothing", "twin", "weak"]
@@ -33,8 +35,10 @@ def linear_search(seed=0, noise=0.1, count=1200):
     residual = J @ np.array([-2.0, 1.0, 0.0, 0.0, 0.0]) + noise * random.normal(size=2 * count)
     unknowns = [Unknown(x, 0.0, -9.0, 9.0, 1.0, prior=1.0) for x in NAMES]
     return SimpleNamespace(
-        jacobian=J, residual=residual, blocks=np.repeat(time, 2), redundancy=1.0,
+        jacobian=J, residual=residual, blocks=np.repeat(time, 2),
+        redundancies={"x": 1.0, "y": 1.0},
         channels=np.tile([0, 1], count), channel_scales={"x": 0.5, "y": 2.0},
+        weight_divisors={"x": 0.5, "y": 2.0},
         prior=np.ones(5), low=np.full(5, -9.0), high=np.full(5, 9.0),
         problem=SimpleNamespace(unknowns=unknowns),
     )  # fmt: skip
@@ -109,6 +113,56 @@ def test_what_is_not_believable_is_said():
     zero, bound = implausible_values(problem, np.array([18.0, 1.0, 0.0]))
     assert "sensor.p.zero = 3.6e+06 is not believable, 18 deviations from 0" in zero
     assert bound == "a = 2 is on its bound."
+
+
+class SimulatedSearch:
+    """A search of a linear model, whose simulation without its second parameter is bad."""
+
+    def __init__(self, names, linear):
+        self.__dict__ |= vars(linear)
+        unknowns = [x for x in linear.problem.unknowns if x.name in names]
+        self.problem = SimpleNamespace(unknowns=unknowns, simulation_count=0)
+        self.prior = np.ones(len(unknowns))
+
+    def restricted_search(self, problem, z):
+        return SimulatedSearch([x.name for x in problem.unknowns], self)
+
+    def cost(self, z):
+        return float(z @ z)
+
+    def minimize(self, z, tolerance):
+        return SimpleNamespace(z=z)
+
+    def training_errors(self, z):
+        known = "twin" in [x.name for x in self.problem.unknowns]
+        return {"x": 0.1 if known else 0.2, "y": 0.1}
+
+
+@pytest.mark.parametrize("is_simulated", [False, True])
+def test_what_a_simulation_needs_stays(monkeypatch, is_simulated):
+    """The twin costs nothing by linearization, which does not hold as far as its old value."""
+    monkeypatch.setattr(
+        model_selection, "subset_problem",
+        lambda problem, chosen: SimpleNamespace(
+            unknowns=[problem.unknowns[i] for i in chosen], simulation_count=1
+        ),
+    )  # fmt: skip
+    linear = linear_search()
+    linear.residual -= linear.jacobian @ np.array([-2.0, 1.0, 0.0, 0.0, 0.0])  # noise, at z
+    search = SimulatedSearch(NAMES, linear)
+    if not is_simulated:
+        monkeypatch.setattr(SimulatedSearch, "training_errors", lambda *_: {"x": 0.1, "y": 0.1})
+    z = np.array([2.0, -1.0, 0.0, 0.5, 0.0])  # the twin was moved
+    fewer, _, steps = model_selection._fewer_parameters(search, z, [])
+    names = [x.name for x in fewer.problem.unknowns]
+    assert names[:2] == ["gain", "offset"] and ("twin" in names) == is_simulated
+    assert [x.name for x in steps[1:3]] == ["gain", "offset"]
+
+
+def test_pins_of_a_cylinder():
+    """Those on the boom that it lifts, in its plane; not its own, which are its stroke."""
+    machine = crane.load("patu655")
+    assert cylinder_pins(machine, "X_lift") == ["lift_boom_rod.x", "lift_boom_rod.y"]
 
 
 def test_a_payload_that_the_file_lacks_is_a_candidate():

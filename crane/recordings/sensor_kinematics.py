@@ -6,8 +6,11 @@ import numpy as np
 import pinocchio as pin
 
 from crane.common.samples import Array
+from crane.description.kinematic_tree import path_to_root
 from crane.description.sensors import INCLINATION_PREFIX, VELOCITY_SUFFIX
 from crane.machine.machine import Machine
+
+_MIN_EFFECT = 1e-6  # of a pin's coordinate on joints, in their units per metre
 
 
 def ideal_readings(machine: Machine, q: Array, v: Array, names: Sequence[str]) -> dict[str, Array]:
@@ -40,16 +43,16 @@ def _inclinations(machine: Machine, q: Array, v: Array, links: list[str]) -> dic
     """Inclinations of links and their rates (N,), by name of the column."""
     model, data = machine.model, machine.model.createData()
     frames = [machine.frame(link) for link in links]
-    out = np.empty((2 * len(links), len(q)))
+    x, w = np.empty((2, len(links), len(q), 3))
     axes, up = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED, machine.up_direction
     for i, (place, rate) in enumerate(zip(q, v, strict=True)):
         pin.forwardKinematics(model, data, machine.coordinates.configuration(place), rate)
         for k, frame in enumerate(frames):
-            x = pin.updateFramePlacement(model, data, frame).rotation[:, 0]
-            w = pin.getFrameVelocity(model, data, frame, axes).angular
-            flat = max(float(np.linalg.norm(np.cross(up, x))), 1e-12)
-            out[2 * k, i] = np.arctan2(up @ x, flat)
-            out[2 * k + 1, i] = up @ np.cross(w, x) / flat
+            x[k, i] = pin.updateFramePlacement(model, data, frame).rotation[:, 0]
+            w[k, i] = pin.getFrameVelocity(model, data, frame, axes).angular
+    flat = np.maximum(np.linalg.norm(np.cross(up, x), axis=-1), 1e-12)
+    rates = np.cross(w, x) @ up / flat
+    out = np.stack([np.arctan2(x @ up, flat), rates], axis=1).reshape(-1, len(q))
     names = [INCLINATION_PREFIX + link + end for link in links for end in ("", VELOCITY_SUFFIX)]
     return dict(zip(names, out, strict=True))
 
@@ -86,6 +89,30 @@ def pin_derivatives(machine: Machine, q: Array) -> dict[str, Array]:
             for k, name in enumerate(out):
                 out[name][i, passive] = solved[:, k]
     return out
+
+
+def cylinder_pins(machine: Machine, joint: str) -> list[str]:
+    """Coordinates LINK.x, .y, .z of the pins between a cylinder and what it moves, as they matter.
+
+    They are on the sides of loops that the cylinder's own joint does not carry.
+
+    Args:
+        machine: The machine.
+        joint: Joint of the cylinder.
+    """
+    parents, found = machine.tree.parent_joints, []
+    derivatives = pin_derivatives(machine, machine.home[None])
+    for loop in machine.closure.equations.loops:
+        carried = [
+            link
+            for link in (loop.predecessor, loop.successor)
+            if joint in (x.name for x in path_to_root(parents, link))
+        ]
+        if len(carried) == 1:
+            other = loop.successor if carried[0] == loop.predecessor else loop.predecessor
+            names = [f"{other}.{axis}" for axis in "xyz"]
+            found += [x for x in names if np.any(np.abs(derivatives.get(x, 0.0)) > _MIN_EFFECT)]
+    return found
 
 
 def _loop_pins(machine: Machine) -> dict[str, list[tuple[int, float, str]]]:

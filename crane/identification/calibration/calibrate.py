@@ -44,6 +44,7 @@ from crane.identification.calibration.model_selection import (
     SelectedModel,
     block_errors,
     select_parameters,
+    subset_problem,
 )
 from crane.identification.calibration.multi_start import minimize_from_starts
 from crane.identification.calibration.plausibility import (
@@ -65,6 +66,7 @@ from crane.recordings.recording_reader import (
     select_time_span,
 )
 from crane.recordings.sensor_discrepancy import displaced_pins
+from crane.recordings.sensor_kinematics import cylinder_pins
 from crane.recordings.timeseries import Table, parse_heading
 from crane.simulation.recorded_run import simulated_columns
 
@@ -92,12 +94,13 @@ def calibrate(
     The simulation of the signals of each recording (see `crane.simulation.replay`) is compared
     with the measurements by least squares over the parameters and the start of each recording,
 
-        min sum_c sum_t ((y_c(t) - m_c(t)) / s_c)^2 + sum (start / deviation)^2,
+        min sum_c sum_t ((y_c(t) - m_c(t)) / s_c)^2 / r_c + sum (start / deviation)^2,
 
     The method is Levenberg-Marquardt within bounds, first with friction smoothed over some
     millimetres per second, because the instants of sticking depend on the whole motion before. The
     scale s_c of a channel is its residual, updated in rounds, at least its noise and at most a
-    fifth of its variation, so that no channel dominates by low noise or is neglected. Confidence
+    two-hundredth of the range of its unit, so that no channel dominates by low noise or is
+    neglected; r_c is the number of its samples per independent residual. Confidence
     intervals take blocks of instants as independent, since the residuals are not white (Huber's
     sandwich estimator over blocks).
 
@@ -174,7 +177,7 @@ def calibrate(
     with open_checkpoint(checkpoint, dependencies, LOG_COLUMNS, 1) as table:
         first = LevenbergMarquardt(problem, progress, SearchLog(table))
         if automatic:
-            selected = select_parameters(first, kept)
+            first, selected = _select(first, kept, {} if pins else _drawn_pins(machine))
         else:
             selected = SelectedModel(first, minimize_from_starts(first))
         search, problem = selected.search, selected.search.problem
@@ -199,6 +202,37 @@ def calibrate(
             *near_minima(first.problem, first.minima),
         ),
     )
+
+
+def _drawn_pins(machine: Machine) -> dict[str, str]:
+    """Joints of cylinders by the coordinates of pins on which they act."""
+    circuit = machine.hydraulics
+    return {
+        x: joint
+        for joint in (circuit.joints if circuit else ())
+        for x in cylinder_pins(machine, joint)
+    }
+
+
+def _select(
+    search: LevenbergMarquardt, kept: Sequence[str], pins: Mapping[str, str]
+) -> tuple[LevenbergMarquardt, SelectedModel]:
+    """Search of the candidates and selected model.
+
+    Pins of the drawing are candidates if the model without them leaves more than noise in the
+    stroke and the pressures of their cylinders: with friction and load they explain each other.
+    """
+    unknowns = search.problem.unknowns
+    pins = {name: joint for name, joint in pins.items() if name not in kept}
+    others = [i for i, x in enumerate(unknowns) if x.name not in pins]
+    if len(others) < len(unknowns):
+        drawn = search.restricted_search(subset_problem(search.problem, others), None)
+        selected = select_parameters(drawn, kept)
+        moved = {pins[x.name] for x in unknowns if x.name in pins}
+        names = moved | {f"{PRESSURE_PREFIX}{x}_{side}" for x in moved for side in "ab"}
+        if selected.search.leaves_noise(selected.minimum, names):
+            return drawn, selected
+    return search, select_parameters(search, kept)
 
 
 def _sensor_units(cases: Sequence[RecordingCase]) -> dict[str, str]:

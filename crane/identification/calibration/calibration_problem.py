@@ -35,12 +35,12 @@ from crane.simulation.sensitivity.variational_integration import VariationalInte
 from crane.simulation.simulation_run import simulate
 from crane.simulation.simulation_setup import initial_motion
 
-DERIVATIVE_TOLERANCE = 1e-4  # relative error of derivatives
+DERIVATIVE_TOLERANCE = 1e-3  # relative error of derivatives
 _DIFFERENCE_STEP = 1e-5  # of the scale of an unknown, for differences of simulation constants
 # [rad/s], [m/s] over which smoothed friction changes its sign
 _FRICTION_SMOOTHING = {"rad": 5e-3, "m": 2e-3}
 # largest steps [s] of a simulation, and of one with derivatives
-_MAX_STEP, _MAX_SENSITIVITY_STEP = 1e-2, 2e-3
+_MAX_STEP, _MAX_SENSITIVITY_STEP = 1e-2, 5e-3
 _MAX_CACHED_MACHINES = 100  # machines with changed parameters in the cache
 
 

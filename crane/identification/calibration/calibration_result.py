@@ -17,7 +17,7 @@ from crane.identification.calibration.calibration_statistics import (
     correlated_directions,
 )
 from crane.identification.calibration.model_selection import SelectionStep
-from crane.identification.calibration.recording_case import noise_std
+from crane.identification.calibration.recording_case import NOISE_LEVEL, noise_std
 from crane.machine.machine import Machine
 
 _DEGRADATION_FACTOR = 1.1  # times the residual before
@@ -217,11 +217,26 @@ class Calibration(Result):
         ]
 
     @property
+    def unexplained_channels(self) -> list[str]:
+        """Channels whose residuals over the training data are more than noise."""
+        noisy = [
+            x.name
+            for x in self.channels
+            if x.train_mask.any() and x.rms(x.simulated_after, True) > NOISE_LEVEL * x.noise
+        ]
+        return list(dict.fromkeys(noisy))
+
+    @property
     def quality_warnings(self) -> list[str]:
         """Warnings about the calibration as a whole."""
         texts = [*self.findings]
         if not self.is_lowest_minimum:
             texts.append(LOWER_MINIMUM_WARNING)
+        if self.unexplained_channels:
+            texts.append(
+                f"The residuals of {', '.join(self.unexplained_channels)} are more than noise: "
+                "the model lacks something, and the intervals do not contain that error."
+            )
         if self.degraded_channels:
             texts.append(
                 "On held-out data the residuals are larger than before in "

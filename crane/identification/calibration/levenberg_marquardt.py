@@ -3,6 +3,7 @@
 Its states are kept, so that an interrupted search goes on from the last one.
 """
 
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -18,12 +19,12 @@ from crane.identification.calibration.calibration_problem import (
     DERIVATIVE_TOLERANCE,
     CalibrationProblem,
 )
-from crane.identification.calibration.recording_case import RecordingCase, noise_std
+from crane.identification.calibration.recording_case import NOISE_LEVEL, RecordingCase, noise_std
 
 _MAX_WEIGHT_ROUNDS = 3  # rounds of channel scales
 _SCALE_TOLERANCE = 0.05  # relative change of channel scales that ends them
 # smoothing of friction and least smoothing for derivatives: initial rounds, and final
-_SMOOTHING_SCHEDULE, _FINAL_SMOOTHING = (
+_SMOOTHING_SCHEDULE, FINAL_SMOOTHING = (
     ((1.0, 1.0), (0.3, 0.3), (0.1, 0.1), (0.0, 0.3)),
     (0.0, 0.03),
 )
@@ -31,11 +32,14 @@ _COVARIANCE_SMOOTHING = 0.1  # smoothing for derivatives of the covariance
 _MAX_ITERATIONS = 40  # iterations per round
 # relative change of the cost that ends the iterations
 _COST_TOLERANCE, INITIAL_COST_TOLERANCE = 1e-4, 1e-2
+# largest cost that the change is relative to: much left of some channels shall not hide others
+_MAX_COMPARED_COST = 500.0
+# relative change, where sets of parameters are compared
+COMPARED_COST_TOLERANCE = 3e-4
 # least scale per largest value of a channel, and absolute [SI]
 _MIN_RELATIVE_SCALE, _MIN_SCALE = 1e-6, 1e-9
 # largest scale of a channel, the usual error of a model, per range of its unit in the recordings
 _MAX_SCALE_SHARE = 5e-3
-_NOISE_LEVEL = 1.5  # noises of a channel, up to which nothing is left to explain
 _INITIAL_DAMPING = 1e-3
 _DAMPING_INCREASE, _DAMPING_DECREASE, _MAX_DAMPING = 10.0, 0.2, 1e8  # of the damping
 _COARSE_DERIVATIVE_TOLERANCE = 1e-2  # relative error of derivatives far from the minimum
@@ -118,8 +122,10 @@ class LevenbergMarquardt:
         residual: (M,) weighted residuals, likewise.
         blocks: (M,) time of each row, unique over recordings.
         channels: (M,) channel of each row, by its index in `channel_scales`.
-        redundancy: Samples per independent residual. Priors count as often, because residuals of
-            model errors are no independent observations.
+        redundancies: Samples per independent residual by sensor: residuals of model errors are no
+            independent observations.
+        has_equal_channels: Whether all channels count by the largest redundancy, not by their own.
+        prior: (p,) weights of the priors.
         initial_guess: (p,) unknowns from which it goes on, None for a search of its own.
         minima: Minima of the searches from several starts, the lowest first.
     """
@@ -141,28 +147,26 @@ class LevenbergMarquardt:
             [(x.high - x.start) / x.scale for x in unknowns] + [np.inf] * start_count
         )
         self.training_cases = [case for case in problem.cases if case.train_mask.any()]
-        self._prior = np.array([x.prior for x in unknowns] + [1.0] * start_count)
+        self.prior = np.array([x.prior for x in unknowns] + [1.0] * start_count)
         count = sum(int(case.train_mask.sum()) for case in self.training_cases)
         self._max_redundancy = max(count / _BLOCK_COUNT_RANGE[1], 1.0)
-        self.redundancy = self._max_redundancy
         self._scale_bounds = self._channel_scale_bounds()
+        self.redundancies = dict.fromkeys(self._scale_bounds, self._max_redundancy)
         self.channel_scales: dict[str, float] = {}
         self.jacobian = self.residual = self.blocks = self.channels = np.zeros(0)
         self.minima: list[SearchState] = []
         self._iteration_count = iteration_count
         self.initial_guess: Array | None = None
+        self.has_equal_channels = True
         self._has_stiction = bool(find_stick_slip_columns(problem.machine))
 
-    @property
-    def prior(self) -> Array:
-        """Weights (p,) of the priors, as many samples count as one independent residual."""
-        return self._prior * np.sqrt(self.redundancy)
-
-    def restricted_search(self, problem: CalibrationProblem, z: Array) -> "LevenbergMarquardt":
+    def restricted_search(
+        self, problem: CalibrationProblem, z: Array | None
+    ) -> "LevenbergMarquardt":
         """Method for fewer unknowns, with these channel scales and an initial guess."""
         search = LevenbergMarquardt(problem, self._progress, self._log, self._iteration_count)
-        search.channel_scales, search.initial_guess = self.channel_scales, z
-        search.redundancy = self.redundancy
+        search.channel_scales, search.redundancies = self.channel_scales, self.redundancies
+        search.initial_guess, search.has_equal_channels = z, self.has_equal_channels
         return search
 
     def start_with_smoothed_friction(self) -> None:
@@ -178,20 +182,22 @@ class LevenbergMarquardt:
         problem.derivative_tolerance = DERIVATIVE_TOLERANCE
         # residuals with smoothed friction do not give the final scales: they are updated
         for problem.smooth, problem.slopes in _SMOOTHING_SCHEDULE if self._has_stiction else ():
-            z = self.minimize(z, INITIAL_COST_TOLERANCE).z
-            self.channel_scales = self.updated_channel_scales(z)
+            is_last = not problem.smooth
+            z = self.minimize(z, COMPARED_COST_TOLERANCE if is_last else INITIAL_COST_TOLERANCE).z
+            self.update_scales(z)
         return z
 
     def nearest_minimum(self, z: Array) -> Array:
         """Nearest minimum to some unknowns, with updated channel scales."""
         problem = self.problem
-        problem.smooth, problem.slopes = _FINAL_SMOOTHING
+        problem.smooth, problem.slopes = FINAL_SMOOTHING
         for _ in range(_MAX_WEIGHT_ROUNDS):
-            z = self.minimize(z).z
-            before, self.channel_scales = self.channel_scales, self.updated_channel_scales(z)
+            z, before = self.minimize(z).z, self.weight_divisors
+            self.update_scales(z)
+            self.has_equal_channels = False
             if all(
                 abs(np.log(x / before[name])) < _SCALE_TOLERANCE
-                for name, x in self.channel_scales.items()
+                for name, x in self.weight_divisors.items()
             ):
                 break
         self.linearize_for_covariance(z)
@@ -199,40 +205,38 @@ class LevenbergMarquardt:
         return z
 
     def linearize_for_covariance(self, z: Array) -> None:
-        """Linearize with derivatives that hold over an interval, and update the redundancy."""
+        """Linearize with derivatives that hold over an interval."""
         self.problem.slopes = _COVARIANCE_SMOOTHING
         self.linearize(z)
-        self.update_redundancy()
 
-    def training_errors(self, z: Array) -> dict[str, float]:
-        """RMS residual of each channel over the training data."""
+    def _training_residuals(self, z: Array) -> dict[str, Array]:
+        """Residuals of each channel over the training data."""
         residuals: dict[str, list[Array]] = {}
         for case in self.training_cases:
             residual = self.problem.residuals(case, z)[case.train_mask]
             for name, x in zip(case.sensors, residual.T, strict=True):
                 residuals.setdefault(name, []).append(x)
-        return {
-            name: max(root_mean_square(np.concatenate(parts)), _MIN_SCALE)
-            for name, parts in residuals.items()
-        }
+        return {name: np.concatenate(parts) for name, parts in residuals.items()}
 
-    def updated_channel_scales(self, z: Array) -> dict[str, float]:
-        """Channel scales by the residuals of the training data."""
-        return {
-            name: float(np.clip(rms, *self._scale_bounds[name]))
-            for name, rms in self.training_errors(z).items()
-        }
+    def training_errors(self, z: Array) -> dict[str, float]:
+        """RMS residual of each channel over the training data."""
+        residuals = self._training_residuals(z).items()
+        return {name: max(root_mean_square(x), _MIN_SCALE) for name, x in residuals}
 
-    def update_redundancy(self) -> None:
-        """Set the samples per independent residual, by the correlation of each channel."""
-        total, start = 0.0, 0
-        for case in self.training_cases:
-            count = int(case.train_mask.sum())
-            rows = self.residual[start : start + count * len(case.sensors)].reshape(count, -1)
-            start += rows.size
-            total += sum((2.0 * _correlation_time(x) - 1.0) * float(x @ x) for x in rows.T)
-        power = float(self.residual @ self.residual)
-        self.redundancy = float(np.clip(total / max(power, 1e-300), 1.0, self._max_redundancy))
+    def update_scales(self, z: Array) -> None:
+        """Set scale and redundancy of each channel by the residuals of the training data."""
+        for name, x in self._training_residuals(z).items():
+            scale = np.clip(root_mean_square(x), *self._scale_bounds[name])
+            redundancy = np.clip(2.0 * _correlation_time(x) - 1.0, 1.0, self._max_redundancy)
+            self.channel_scales = self.channel_scales | {name: float(scale)}
+            self.redundancies = self.redundancies | {name: float(redundancy)}
+
+    @property
+    def weight_divisors(self) -> dict[str, float]:
+        """One over the weight of each channel in its unit."""
+        sizes = dict.fromkeys(self.channel_scales, self._max_redundancy)
+        sizes |= {} if self.has_equal_channels else self.redundancies
+        return {x: scale * float(np.sqrt(sizes[x])) for x, scale in self.channel_scales.items()}
 
     def _channel_scale_bounds(self) -> dict[str, tuple[float, float]]:
         """Least and largest scale of each channel.
@@ -259,18 +263,18 @@ class LevenbergMarquardt:
             bounds[name] = least, max(least, _MAX_SCALE_SHARE * ranges[units[name]])
         return bounds
 
-    def leaves_noise(self, z: Array) -> bool:
-        """Whether the residuals of all channels are about their noise."""
+    def leaves_noise(self, z: Array, names: Collection[str] = ()) -> bool:
+        """Whether the residuals of channels, all by default, are about their noise."""
         return all(
-            rms < _NOISE_LEVEL * self._scale_bounds[name][0]
+            rms < NOISE_LEVEL * self._scale_bounds[name][0]
             for name, rms in self.training_errors(z).items()
+            if not names or name in names
         )
 
     def channel_weights(self, case: RecordingCase) -> Array:
-        """Weights (N, k): one over the channel scales, 0 for held-out data."""
-        return case.train_mask[:, None] / np.array(
-            [self.channel_scales[name] for name in case.sensors]
-        )
+        """Weights (N, k) by channel scales and redundancies, 0 for held-out data."""
+        divisors = self.weight_divisors
+        return case.train_mask[:, None] / np.array([divisors[x] for x in case.sensors])
 
     def weighted_residuals(self, z: Array) -> Array:
         """Weighted residuals (M,) of the training data.
@@ -361,7 +365,9 @@ class LevenbergMarquardt:
                 break
             damping *= _DAMPING_INCREASE
         iteration, reduction = state.iteration + 1, state.cost - cost
-        has_ended = reduction < cost_tolerance * state.cost or not reduction
+        has_ended = not reduction or reduction < cost_tolerance * min(
+            state.cost, _MAX_COMPARED_COST
+        )
         return SearchState(
             z, cost, damping, iteration, has_ended,
             self._iteration_count, self.problem.simulation_count,
@@ -380,7 +386,7 @@ class LevenbergMarquardt:
         np.add.at(sums, numbers, self.jacobian * self.residual[:, None])
         count = len(sums)
         meat = sums.T @ sums * (count / max(count - 1, 1))
-        meat += self.redundancy * np.diag(self.prior**2)
+        meat += np.diag(self.prior**2)
         robust = inverse @ meat @ inverse
         degrees_of_freedom = max(len(self.residual) - len(z), 1)
         white = inverse * float(self.residual @ self.residual) / degrees_of_freedom

@@ -10,10 +10,14 @@ their matrices. The set grows by the parameter that reduces
             + 2 k
 
 most, with the number n_c of independent samples, deviations z of priors and k parameters, up to
-all candidates. The set
-of the lowest score is kept, without parameters that the recordings do not determine: whose
-deviation is that of their prior, or that correlate with another one. It is fitted by simulation,
-and selected again by the linearization there, until it repeats.
+all candidates. The set of the lowest score is kept, without parameters whose deviation is that of
+their prior, or that correlate with another one, if they cost nothing.
+
+A linearization does not hold as far as the values of the machine. Therefore the set is fitted by
+simulation, and replaces the larger one only if its score, sum_c n_c ln(mean square) over the
+training data with the same penalties, is not higher; else the half of what it lacks joins that
+was moved farthest.
+It is selected again by the linearization at its minimum, until nothing is left out any more.
 """
 
 from collections.abc import Sequence
@@ -24,6 +28,8 @@ import numpy as np
 from crane.common.samples import Array
 from crane.identification.calibration.calibration_problem import CalibrationProblem
 from crane.identification.calibration.levenberg_marquardt import (
+    COMPARED_COST_TOLERANCE,
+    FINAL_SMOOTHING,
     INITIAL_COST_TOLERANCE,
     LevenbergMarquardt,
     bounded_step,
@@ -34,8 +40,8 @@ MAX_CORRELATION = 0.98  # of parameters that are both kept
 MAX_PRIOR_SHARE = 0.7  # of the deviation of a prior, up to which recordings determine a parameter
 BLOCK_DURATION = 3.0  # [s] of a block that is left out
 _BLOCK_RANGE = 3, 8  # number of blocks of a recording
-_MAX_ROUNDS = 3  # linearizations
-_MAX_COST = 20.0  # of the score, of a parameter that the recordings do not determine
+_MAX_COST = 4.0  # of the score, of a parameter that the recordings do not determine: chi-square
+_WEIGHT_ROUNDS = 3  # of weights by redundancies of all candidates
 _BLOCK_ITERATIONS = 3  # of the fits without a block
 
 
@@ -91,7 +97,8 @@ class LinearizedSelection:
         residual = search.residual - J @ z
         blocks = training_blocks(search.blocks)
         names = list(search.channel_scales)
-        self._counts = np.bincount(search.channels, minlength=len(names)) / search.redundancy
+        redundancies = np.array([search.redundancies[x] for x in names])
+        self._counts = np.bincount(search.channels, minlength=len(names)) / redundancies
         shape = len(np.unique(blocks)), len(names), len(z) + 1, len(z) + 1
         extended = np.column_stack([J, residual])
         self._products = np.zeros(shape)  # by block and channel
@@ -133,15 +140,14 @@ class LinearizedSelection:
         """Score of a set of parameters, by blocks left out."""
         unknowns = self.with_starts(parameters)
         squares, z = self.mean_squares(unknowns, True), self.fit(unknowns)
-        penalty = float(z @ self._prior @ z) / self._search.redundancy
+        penalty = float(z @ self._prior @ z)
         return float(self._counts @ np.log(squares)) + penalty + 2.0 * len(parameters)
 
-    def simulated_criterion(self, z: Array, count: int) -> float:
-        """Score of simulated unknowns (p,) with some parameters, without blocks left out."""
-        errors = np.array(list(self._search.training_errors(z).values()))
-        return (
-            2.0 * float(self._counts @ np.log(errors) + count)
-            + float(z @ self._prior @ z) / self._search.redundancy
+    def simulated_criterion(self, search: LevenbergMarquardt, z: Array) -> float:
+        """Score of simulated unknowns of a search, without blocks left out."""
+        errors = np.array(list(search.training_errors(z).values()))
+        return 2.0 * float(self._counts @ np.log(errors) + len(search.problem.unknowns)) + float(
+            np.sum((search.prior * z) ** 2)
         )
 
     def with_starts(self, parameters: Sequence[int]) -> list[int]:
@@ -154,8 +160,8 @@ class LinearizedSelection:
         fitted, errors = (self.mean_squares(unknowns, x) for x in (False, True))
         total = float(self._counts.sum())
         criterion = float(self._counts @ np.log(fitted)) + len(parameters) * np.log(total)
-        sizes = self._search.channel_scales.items()
-        by_name = {c: float(s * np.sqrt(x)) for (c, s), x in zip(sizes, errors, strict=True)}
+        sizes = self._search.weight_divisors.items()
+        by_name = {c: s * float(np.sqrt(x)) for (c, s), x in zip(sizes, errors, strict=True)}
         return SelectionStep(name, is_removal, self.score(parameters), criterion, by_name)
 
     def undetermined(self, parameters: Sequence[int]) -> list[int]:
@@ -232,42 +238,61 @@ def select_parameters(search: LevenbergMarquardt, kept_names: Sequence[str]) -> 
     Returns:
         The selected model.
     """
-    whole, z = search.problem, search.sharpen_friction(smoothed_minimum(search))
-    search.linearize_for_covariance(z)
-    best: tuple[float, list[SelectionStep], list[int], Array] | None = None
-    kept = [i for i, x in enumerate(whole.unknowns) if x.name in kept_names]
-    before: list[int] | None = None
-    for _ in range(_MAX_ROUNDS):
-        selection = LinearizedSelection(search, z, kept)
-        chosen, steps = selection.path()
-        unknowns = selection.with_starts(chosen := sorted(chosen))
-        if chosen == before:
-            break
-        before = chosen
-        problem = _subset(whole, chosen)
-        starts = [z[unknowns], selection.fit(unknowns)[unknowns]]
-        restricted = search.restricted_search(problem, starts[0])
-        start = min(starts, key=restricted.cost)
-        z = np.zeros(len(z))
-        z[unknowns] = restricted.minimize(start, INITIAL_COST_TOLERANCE).z
-        search.channel_scales = search.updated_channel_scales(z)
+    names = [x.name for x in search.problem.unknowns]
+    z = search.sharpen_friction(smoothed_minimum(search))
+    for _ in range(_WEIGHT_ROUNDS):  # before its end a search leaves what looks like model errors
+        search.update_scales(z)
+        search.has_equal_channels = False
+        search.problem.smooth, search.problem.slopes = FINAL_SMOOTHING
+        z = search.minimize(z, COMPARED_COST_TOLERANCE).z
+    steps, count = list[SelectionStep](), len(names) + 1
+    while len(search.problem.unknowns) < count:
+        count = len(search.problem.unknowns)
+        search.update_scales(z)
         search.linearize_for_covariance(z)
-        whole.simulation_count = max(whole.simulation_count, problem.simulation_count)
-        criterion = selection.simulated_criterion(z, len(chosen))
-        if best is None or criterion < best[0]:
-            best = criterion, steps, chosen, z
-    assert best is not None
-    _, steps, chosen, z = best
-    unknowns = selection.with_starts(chosen)
-    search.channel_scales = search.updated_channel_scales(z)
-    restricted = search.restricted_search(_subset(whole, chosen), z[unknowns])
-    determined, z = _determined(restricted, restricted.nearest_minimum(z[unknowns]), kept_names)
-    names = {x.name for x in determined.problem.unknowns}
-    left_out = (x.name for x in whole.unknowns if x.name not in names)
-    return SelectedModel(determined, z, tuple(steps), tuple(left_out))
+        search, z, last = _fewer_parameters(search, z, kept_names)
+        steps = steps or last
+    z = search.nearest_minimum(z)
+    selected = {x.name for x in search.problem.unknowns}
+    return SelectedModel(search, z, tuple(steps), tuple(x for x in names if x not in selected))
 
 
-def _subset(problem: CalibrationProblem, chosen: Sequence[int]) -> CalibrationProblem:
+def _fewer_parameters(
+    search: LevenbergMarquardt, z: Array, kept_names: Sequence[str]
+) -> tuple[LevenbergMarquardt, Array, list[SelectionStep]]:
+    """Search and minimum of fewer parameters, or of these, and the steps that lead there.
+
+    A linearization does not hold as far as the machine's values. So the selected set is fitted by
+    simulation; if that is worse than with all parameters, the half of the others joins that the
+    recordings moved farthest, in deviations of their priors.
+
+    Args:
+        search: Search, linearized at its minimum.
+        z: (p,) minimum.
+        kept_names: Parameters that are kept in any case.
+    """
+    parameters = search.problem.unknowns
+    selection = LinearizedSelection(
+        search, z, [i for i, x in enumerate(parameters) if x.name in kept_names]
+    )
+    chosen, steps = selection.path()
+    others = sorted(set(range(len(parameters))) - set(chosen), key=lambda i: -abs(z[i]))
+    criterion = selection.simulated_criterion(search, z)
+    while others:
+        unknowns = selection.with_starts(sorted(chosen))
+        problem = subset_problem(search.problem, sorted(chosen))
+        fewer = search.restricted_search(problem, z[unknowns])
+        start = min((z[unknowns], selection.fit(unknowns)[unknowns]), key=fewer.cost)
+        minimum = fewer.minimize(start, COMPARED_COST_TOLERANCE).z
+        search.problem.simulation_count = problem.simulation_count
+        if selection.simulated_criterion(fewer, minimum) <= criterion:
+            return fewer, minimum, steps
+        half = (len(others) + 1) // 2
+        chosen, others = [*chosen, *others[:half]], others[half:]
+    return search, z, steps
+
+
+def subset_problem(problem: CalibrationProblem, chosen: Sequence[int]) -> CalibrationProblem:
     """Problem of some of the parameters, with the same smoothing."""
     smaller = CalibrationProblem(
         problem.machine, [problem.unknowns[i] for i in chosen], problem.cases
@@ -275,32 +300,6 @@ def _subset(problem: CalibrationProblem, chosen: Sequence[int]) -> CalibrationPr
     smaller.smooth, smaller.slopes = problem.smooth, problem.slopes
     smaller.simulation_count = problem.simulation_count
     return smaller
-
-
-def _determined(
-    search: LevenbergMarquardt, z: Array, kept_names: Sequence[str]
-) -> tuple[LevenbergMarquardt, Array]:
-    """Search and minimum of the parameters that the recordings determine.
-
-    Args:
-        search: Search at its minimum.
-        z: (p,) minimum.
-        kept_names: Parameters that are kept in any case.
-    """
-    while True:
-        problem = search.problem
-        parameters = problem.unknowns
-        kept = [i for i, x in enumerate(parameters) if x.name in kept_names]
-        selection = LinearizedSelection(search, z, kept)
-        everything = list(range(len(parameters)))
-        unmoved = [i for i, x in enumerate(parameters) if x.prior and not z[i] and i not in kept]
-        worst = unmoved[0] if unmoved else selection.dispensable(everything)
-        if worst is None:
-            return search, z
-        rest = [x for x in everything if x != worst]
-        unknowns = selection.with_starts(rest)
-        search = search.restricted_search(_subset(problem, rest), z[unknowns])
-        z = search.nearest_minimum(z[unknowns])
 
 
 def block_errors(search: LevenbergMarquardt, z: Array) -> dict[str, tuple[float, float]]:

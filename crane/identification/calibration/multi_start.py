@@ -6,8 +6,11 @@ sequence, which are simulated only. In three rounds the better half of the searc
 search from the machine that leaves nothing but noise needs no others.
 """
 
+from contextlib import suppress
+
 import numpy as np
 
+from crane.common.errors import SimulationError
 from crane.common.samples import Array
 from crane.identification.calibration.levenberg_marquardt import (
     INITIAL_COST_TOLERANCE,
@@ -31,18 +34,15 @@ def minimize_from_starts(search: LevenbergMarquardt) -> Array:
 
 
 def smoothed_minimum(search: LevenbergMarquardt) -> Array:
-    """Lowest minimum (p,) found with smoothed friction, and the linearization there."""
+    """Lowest minimum (p,) found with smoothed friction."""
     search.start_with_smoothed_friction()
     start = np.zeros(search.problem.unknown_count)
     first = search.minimize(start, INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING, _ROUNDS[0][1])
     is_good = search.leaves_noise(first.z)
     search.minima = [first] if is_good else _race(search, first)
     z = search.minima[0].z
-    search.channel_scales = search.updated_channel_scales(z)
-    z = search.minimize(z, INITIAL_COST_TOLERANCE).z
-    search.linearize(z)
-    search.update_redundancy()
-    return z
+    search.update_scales(z)
+    return search.minimize(z, INITIAL_COST_TOLERANCE).z
 
 
 def _race(search: LevenbergMarquardt, first: SearchState) -> list[SearchState]:
@@ -57,11 +57,11 @@ def _race(search: LevenbergMarquardt, first: SearchState) -> list[SearchState]:
     states = sorted((x for x in points if np.isfinite(x.cost)), key=lambda x: x.cost)
     others = [first]
     for count, iterations in _ROUNDS:
-        states = [
-            search.minimize(x.z, INITIAL_COST_TOLERANCE, x.damping, iterations)
-            for x in states[:count]
-        ]
-        states = sorted([*others, *states], key=lambda x: x.cost)
+        found = []
+        for x in states[:count]:
+            with suppress(SimulationError):  # of a crane that none is: near a dead centre
+                found.append(search.minimize(x.z, INITIAL_COST_TOLERANCE, x.damping, iterations))
+        states = sorted([*others, *found], key=lambda x: x.cost)
         others = []
     return states
 

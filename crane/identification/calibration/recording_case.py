@@ -18,6 +18,7 @@ MIN_SAMPLES = 20  # least number of instants of a recording
 _NORMAL_MEDIAN = 0.6745  # median absolute value of a standard normal variable
 # standard deviations of starts that are not measured [rad], [m], and rates
 _START_POSITION_STD, _START_VELOCITY_STD = {"rad": 5e-3, "m": 5e-3}, {"rad": 0.01, "m": 5e-3}
+NOISE_LEVEL = 1.5  # noises of a channel, up to which nothing is left to explain
 _START_NOISE_FACTOR = 2.0  # standard deviation of the start, per noise of its sensor
 _MIN_START_STD = {"rad": 1e-4, "m": 1e-5, "Pa": 1e3}
 

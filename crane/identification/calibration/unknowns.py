@@ -15,6 +15,7 @@ from crane.hydraulics.components import Spool, Valve
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.identification.calibration.recording_case import RecordingCase
 from crane.machine.machine import Machine
+from crane.recordings.sensor_kinematics import cylinder_pins
 from crane.recordings.timeseries import table_column
 
 SENSOR_PARAMETER_DEFAULTS = {"zero": 0.0, "scale": 1.0, "delay": 0.0}
@@ -193,17 +194,16 @@ def candidate_parameters(
         machine: The machine.
         cases: The recordings.
         parameters: Parameters of the machine and its sensors by name.
-        pins: Coordinates of pins that may be displaced.
+        pins: Coordinates of pins that are displaced by the sensors; without any, those on which
+            the cylinders of moved valves act are candidates.
     """
     found: list[Unknown] = []
     for sensor in dict.fromkeys(name for case in cases for name in case.sensors):
         found += _sensor_candidates(sensor, machine, parameters)
-    for name in pins:
-        x = parameters[name]
-        found.append(_candidate(name, x, _PIN_STD, x - _MAX_PIN_ERROR, x + _MAX_PIN_ERROR))
     hydraulics = machine.hydraulics
     if hydraulics is None:
-        return found
+        return found + _pin_candidates(pins, parameters)
+    moved_pins: list[str] = []
     for joint, valve in hydraulics.valves.items():
         directions = {name: _opening_directions(name, hydraulics, cases) for name in valve.spools}
         for name, spool in valve.spools.items():
@@ -212,10 +212,21 @@ def candidate_parameters(
                 found += _orifice_candidates(spool, valve, parameters, directions[name])
         if any(directions.values()):
             found += _cylinder_candidates(joint, machine, hydraulics, parameters, cases)
+            moved_pins += cylinder_pins(machine, joint)
+    found += _pin_candidates(list(pins) or moved_pins, parameters)
     if parameters.get("payload.mass", 0.0):
         found.append(_positive_candidate("payload.mass", parameters["payload.mass"], 0.5, 3.0))
     found.append(_positive_candidate("oil.bulk_modulus", hydraulics.oil.bulk_modulus, 0.5, 5.0))
     return found
+
+
+def _pin_candidates(names: Iterable[str], parameters: Mapping[str, float]) -> list[Unknown]:
+    """Candidates of coordinates of pins, which may be elsewhere than in the drawing."""
+    positions = {name: parameters[name] for name in names}
+    return [
+        _candidate(name, x, _PIN_STD, x - _MAX_PIN_ERROR, x + _MAX_PIN_ERROR)
+        for name, x in positions.items()
+    ]
 
 
 def _candidate(

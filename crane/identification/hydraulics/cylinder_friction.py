@@ -12,16 +12,22 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crane.common.errors import RecordingError, check_name
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
 from crane.description.force_elements import Friction
+from crane.description.sensors import VALVE_SIGNAL_PREFIX
 from crane.dynamics.dynamics import Dynamics
 from crane.identification.estimation.estimators import Estimate, EstimatedValues, least_squares
 from crane.identification.mechanics.smoothed_motion import smoothed_motion
-from crane.identification.signals.signal_quality import steady_samples
+from crane.identification.signals.signal_processing import sampling_step
+from crane.identification.signals.signal_quality import (
+    steady_mask,
+    steady_means,
+)
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 
@@ -105,7 +111,8 @@ def identify_cylinder_friction(
     """Identify the friction of one joint, with the load by the masses of the machine.
 
     The load is tau_A of `Dynamics.inverse` without friction for the smoothed motion. Samples are
-    used where the speed was steady for `settle` seconds and the joint slides. Stiction and its
+    used where the speed was steady for `settle` seconds and the joint slides; where the speed
+    rings at a constant valve signal, if their means over its period were. Stiction and its
     velocity are estimated if there are speeds below that velocity and the stiction is significant;
     otherwise they are 0 and the note of the result gives the reason.
 
@@ -130,11 +137,16 @@ def identify_cylinder_friction(
     slow = max(
         _SLIDING_FACTOR * described_friction.smoothing, _REST_SPEED_SHARE * float(np.abs(v).max())
     )
-    at = np.flatnonzero(
-        steady_samples(motion.time, settle, v, share=_STEADY_SHARE, relative=True)
-        & (np.abs(v) > slow)
+    signal = recording.channels.get(VALVE_SIGNAL_PREFIX + joint)
+    is_steady, v, force = _steady_speeds(
+        motion.time, settle, signal, v, motion.tau[:, index] - load
     )
-    speed, force = v[at], (motion.tau[:, index] - load)[at]
+    if not is_steady.any():
+        raise RecordingError(
+            f"no speed of '{joint}' is steady for {settle:g} s, record longer constant speeds"
+        )
+    at = np.flatnonzero(is_steady & (np.abs(v) > slow))
+    speed, force = v[at], force[at]
     for sense, word in ((1, "extends"), (-1, "retracts")):
         sizes = np.abs(speed[sense * speed > 0])
         if len(sizes) < 2 or sizes.max() < 1.5 * sizes.min():
@@ -162,6 +174,35 @@ def identify_cylinder_friction(
         force=force,
         noise=float(estimate.noise[0]),
         note=note and f"Coulomb and viscous friction only: {note}",
+    )
+
+
+def _steady_speeds(
+    time: Array, settle: float, signal: Array | None, v: Array, force: Array
+) -> tuple[NDArray[np.bool_], Array, Array]:
+    """Mask (N,) of samples with a steady speed, speeds and forces.
+
+    They are means over the periods of a speed that rings, without a reversal, at a held valve
+    signal. The sign of friction and the part that is linear in the speed have the same mean as
+    the speed.
+    """
+    from scipy.ndimage import maximum_filter1d
+
+    plain = steady_mask(time, settle, v, share=_STEADY_SHARE, relative=True)
+    if signal is None or plain.all():
+        return plain, v, force
+    try:
+        means = steady_means(time, settle, signal, v, force, share=_STEADY_SHARE, relative=True)
+    except RecordingError:  # no held signal
+        return plain, v, force
+    period = 1.0 / means.frequency[0] if means.frequency else 0.0
+    count = round((settle + period) / sampling_step(time)) + 1
+    reverses = maximum_filter1d((v * means.answer <= 0).astype(np.int8), count, origin=count // 2)
+    rings = means.kept & ~plain & (reverses == 0)
+    return (
+        plain | rings,
+        np.where(rings, means.answer, v),
+        np.where(rings, means.others[0], force),
     )
 
 

@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -233,7 +233,7 @@ def steady_samples(
         InputError: `settle` is not above two steps.
         RecordingError: No sample is steady.
     """
-    is_steady = _steady_mask(time, settle, *signals, share=share, relative=relative)
+    is_steady = steady_mask(time, settle, *signals, share=share, relative=relative)
     if not is_steady.any():
         raise RecordingError(
             f"no sample is steady for {settle:g} s, record slower ramps or longer steps"
@@ -241,9 +241,10 @@ def steady_samples(
     return is_steady
 
 
-def _steady_mask(
+def steady_mask(
     time: Array, settle: float, *signals: Array, share: float = _MAX_CHANGE, relative: bool = False
 ) -> np.ndarray:
+    """Mask (N,) of `steady_samples`, which may be empty."""
     from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
     step = sampling_step(time)
@@ -275,6 +276,7 @@ class SteadyMeans:
         answer: (N,) the response likewise.
         frequency: Lowest and highest frequency of the ringing [Hz], None without ringing.
         amplitude: Largest amplitude of the ringing, in the unit of the response.
+        others: (m, N) other responses likewise.
     """
 
     kept: np.ndarray
@@ -282,9 +284,18 @@ class SteadyMeans:
     answer: Array
     frequency: tuple[float, float] | None = None
     amplitude: float = 0.0
+    others: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
 
-def steady_means(time: Array, settle: float, signal: Array, answer: Array) -> SteadyMeans:
+def steady_means(
+    time: Array,
+    settle: float,
+    signal: Array,
+    answer: Array,
+    *others: Array,
+    share: float = _MAX_CHANGE,
+    relative: bool = False,
+) -> SteadyMeans:
     """Steady samples of a signal and its response, which may ring about a steady mean.
 
     Samples of `steady_samples` are not changed. Others are used if both have steady means over
@@ -296,16 +307,23 @@ def steady_means(time: Array, settle: float, signal: Array, answer: Array) -> St
         settle: As for `steady_samples`.
         signal: (N,) signal.
         answer: (N,) response.
+        others: Other responses (N,), which need not be steady.
+        share: Largest change of the response, as for `steady_samples`.
+        relative: Whether it refers to the response at the sample, likewise.
 
     Raises:
         InputError: `settle` is not above two steps.
         RecordingError: No sample is steady.
     """
-    plain = _steady_mask(time, settle, signal, answer)
-    held = _steady_mask(time, settle, signal)
+
+    def has_steady_answer(x: Array) -> np.ndarray:
+        return steady_mask(time, settle, x, share=share, relative=relative)
+
+    held = steady_mask(time, settle, signal)
+    plain = held & has_steady_answer(answer)
     step = sampling_step(time)
     means, found = plain.copy(), []
-    pairs = np.stack([signal, answer])
+    pairs = np.stack([signal, answer, *others])
     for start, end in true_runs(held).tolist():
         if plain[start:end].all():
             continue
@@ -319,7 +337,8 @@ def steady_means(time: Array, settle: float, signal: Array, answer: Array) -> St
                 break
             part[:] = _period_means(time[start:end], part, period)
             lines.append((1 / period, amplitude))
-            new = _steady_mask(time, settle, *whole)[start:end] & ~plain[start:end]
+            new = steady_mask(time, settle, whole[0]) & has_steady_answer(whole[1])
+            new = new[start:end] & ~plain[start:end]
             new[: round(reach / step)] = False
         means[start:end] |= new
         pairs[:, start:end] = np.where(new, whole[:, start:end], pairs[:, start:end])
@@ -327,10 +346,10 @@ def steady_means(time: Array, settle: float, signal: Array, answer: Array) -> St
     if not means.any():
         return SteadyMeans(steady_samples(time, settle, signal, answer), signal, answer)  # raises
     if not found:
-        return SteadyMeans(means, signal, answer)
+        return SteadyMeans(means, signal, answer, others=pairs[2:])
     frequencies, amplitudes = zip(*found, strict=True)
     ends = min(frequencies), max(frequencies)
-    return SteadyMeans(means, pairs[0], pairs[1], ends, max(amplitudes))
+    return SteadyMeans(means, pairs[0], pairs[1], ends, max(amplitudes), pairs[2:])
 
 
 def _ringing(time: Array, x: Array, settle: float) -> tuple[float, float]:
