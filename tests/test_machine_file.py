@@ -65,7 +65,7 @@ TEXT = [
         swap("  crank: 1.2", "  yes: 1.2"),
     ),
     case(
-        "four_bar.yaml:29: unknown key 'tip  [31m' in the machine file, the nearest of 33 "
+        "four_bar.yaml:29: unknown key 'tip  [31m' in the machine file, the nearest of 34 "
         "known ones are tip, active, floating, friction, end_stops, rotor_inertia, "
         "identification, home",
         swap("tip: coupler_pin", '"tip\\n\\e[31m": coupler_pin'),
@@ -80,9 +80,8 @@ TEXT = [
 # Keys that are unknown, missing or empty.
 KEYS = [
     case(
-        "four_bar.yaml:29: unknown key 'weather' in the machine file, the nearest of 33 "
-        "known ones are active, cutters, extends, home, name, rotor_inertia, control, "
-        "identification",
+        "four_bar.yaml:29: unknown key 'weather' in the machine file, the nearest of 34 "
+        "known ones are active, cutters, extends, home, name, start, rotor_inertia, control",
         swap("tip: coupler_pin", "weather: 9.81"),
         alone=False,
     ),

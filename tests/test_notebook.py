@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from test_section_forces import write as write_boom
 
 import crane
 from crane.common import one_line_repr, progress
@@ -182,7 +183,15 @@ def test_markdown_makes_tables_and_no_addresses():
     assert {"code", "li", "table", "strong"} <= set(found.tags) and EVIL in found.text
 
 
-def results(mini, run):
+def section_chart(folder):
+    """Of a boom that is lifted."""
+    machine = crane.load(write_boom(folder))
+    control = crane.ComputedTorque(machine, crane.point_to_point([0.3], [0.4], 1.0))
+    run = crane.simulate(machine, control, duration=0.1, step=0.01)
+    return crane.dynamics.section_chart(machine, run, "boom")
+
+
+def results(mini, run, folder):
     """Of each class that is shown, one that takes little."""
     patu, digger = crane.load("patu655"), crane.load("excavator")
     swing = crane.ValvePD(patu, crane.task_trajectory(patu, "swing"))
@@ -198,6 +207,8 @@ def results(mini, run):
     yield crane.ratings.torques(patu, radius=5.0)
     yield crane.ratings.breakout(digger)
     yield crane.working_range(digger)
+    yield crane.simulation.settle(digger)
+    yield section_chart(folder)
     yield crane.ratings.tool_force(digger, "up", step=2.0)
     yield account
     yield crane.studies.PowerComparison({"one": account, "two": account})
@@ -219,9 +230,9 @@ def results(mini, run):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::crane.CraneWarning")
-def test_every_result_has_its_line_its_figure_and_its_table(mini, run):
+def test_every_result_has_its_line_its_figure_and_its_table(mini, run, tmp_path):
     seen = set()
-    for result in results(mini, run):
+    for result in results(mini, run, tmp_path):
         found, name = looked_at(result), type(result).__name__
         assert found.text.count(repr(result)) == 1 and len(repr(result)) <= 200
         assert {"table", "pre"} & set(found.tags), name
@@ -311,7 +322,8 @@ def test_every_class_is_shown_in_one_line(mini, run):
     ]
     listed = [getattr(module, name) for module in submodules for name in module.__all__]
     shown = {x.__name__ for x in listed if inspect.isclass(x) and issubclass(x, OneLineRepr)}
-    assert shown - seen == RESULTS | {"FmuController"}  # of an FMU, see test_fmu
+    elsewhere = {"FmuController", "SectionForces"}  # test_fmu, test_section_forces
+    assert shown - seen == RESULTS | elsewhere
 
 
 # Results whose figures a notebook shows; those of cylinders come from identifications of minutes.
@@ -323,8 +335,8 @@ WITH_FIGURES = {
 # Those that take seconds: `results`, and tests of what makes them.
 RESULTS = {
     "Breakout", "Capacity", "Comparison", "Design", "Excitation", "Gradient", "Identification",
-    "LiftChart", "LinearModel", "PowerBalance", "PowerComparison", "Sensitivities",
-    "SignalExcitation", "Study", "ToolForce", "WorkingRange", "Workspace",
+    "LiftChart", "LinearModel", "PowerBalance", "PowerComparison", "SectionChart", "Sensitivities",
+    "SignalExcitation", "StandingMachine", "Study", "ToolForce", "WorkingRange", "Workspace",
 }  # fmt: skip
 
 

@@ -153,6 +153,7 @@ def test_the_chart_of_a_run_has_its_extremes_and_loads(boom, tmp_path):
     pin = np.flatnonzero((chart.positions > PIN) & (chart.positions < LENGTH))[0]
     rest = LENGTH - PIN
     still = crane.dynamics.SectionForces(machine, "boom")
+    assert repr(still).startswith("SectionForces(")
     (q, v, a), (angle, *_) = motion(machine, 0.3, 0.0, 0.0)
     load = {"tip": np.array([[0, 0, -5e3, 0, 0, 0]])}
     at_rest = still.evaluate(q[None], v[None], a[None], load)[0]

@@ -33,12 +33,12 @@ _SIGNAL_STATUS = 128  # exit status of a process that a signal has ended, less i
 _FLAGS = ("--debug", "--strict", "--trust-xacro")  # that all commands take
 _HELP = """\
 Simulate, identify, rate and design machines with closed kinematic chains:
-  crane new excavator -o my.yaml && crane simulate my.yaml && crane view simulate
+  crane new excavator --size 20t                write a machine file of your own
+  crane simulate mini_forwarder --task lift     simulate a task of a machine
+  crane view simulate                           show this run in a browser
 
 {commands}
-
-crane COMMAND --help shows options, --version the version. All take --gravity
-X,Y,Z (m/s2), --strict (impossible inertias), --trust-xacro (Python), --debug.
+COMMAND --help shows options. All take --gravity --strict --trust-xacro --debug.
 """
 
 
