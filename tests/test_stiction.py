@@ -1,5 +1,7 @@
 """Stiction: rest, break-away, stops and stick-slip against closed forms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import singular_linkages
@@ -10,6 +12,7 @@ from urdf_text import sliding_block
 from warned import without_a_word
 
 import crane
+from crane.description import machine_templates
 from crane.dynamics import Dynamics
 from crane.simulation.integration.stick_slip_modes import (
     RANK_TOLERANCE,
@@ -293,3 +296,18 @@ def test_independent_columns_are_those_of_a_pivoted_qr(near):
         independent = sizes > RANK_TOLERANCE * own
         assert rank == independent.sum()
         assert set(kept) == set(order[:rank])
+
+
+@pytest.mark.slow
+def test_a_held_cylinder_breaks_away_while_another_moves():
+    """Without stiction it gives way at zero acceleration, from a velocity of exactly zero.
+
+    The coordinates of the integration are not the strokes.
+    """
+    machine = crane.load(machine_templates()["loader_zbar"]["10t"])
+    friction = {x: replace(law, stiction=0.0) for x, law in machine.friction.items()}
+    machine = machine.replace(friction=friction)
+    found = crane.simulate(machine, crane.joystick(machine, "load"), step=1e-2)
+    tilt, held = found.v[:, 1], found.channels["rest_X_tilt"] != 0.0
+    assert held.sum() > 100 and (np.diff(held.astype(int)) == -1).sum() > 3
+    assert np.abs(tilt[held]).max() < 1e-7  # what integration errors leave

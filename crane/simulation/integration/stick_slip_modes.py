@@ -81,8 +81,6 @@ class StickSlipModes:
         self._inverse_velocities = (
             machine.closure.characteristic_time / machine.closure.units[self.columns]
         )
-        # (k, n) which active coordinate each of them is
-        self._is_active = np.equal.outer(self.columns, machine.closure.active)
         self.slip_signs = np.zeros(len(columns))
         self.is_held = np.zeros(len(columns), dtype=bool)
         self.is_moving, self.has_modes, self.is_undetermined = True, False, False
@@ -137,7 +135,9 @@ class StickSlipModes:
         parts = dynamics.evaluate_closed("resting", q, v_a, tau)
         mass, rows = parts[: n * n].reshape(n, n), parts[n * n : n * (n + k)].reshape(k, n)
         v = rows @ v_a
-        resting: Indices = np.flatnonzero(np.abs(v) * self._inverse_velocities <= REST_VELOCITY)
+        # rounding moves held joints
+        rest_velocities = np.where(self.is_held, MAX_VELOCITY_CHANGE, REST_VELOCITY)
+        resting: Indices = np.flatnonzero(np.abs(v) * self._inverse_velocities <= rest_velocities)
         try:
             whitening = np.linalg.inv(np.linalg.cholesky(mass)).astype(np.float64)
         except np.linalg.LinAlgError as error:
@@ -204,7 +204,7 @@ class StickSlipModes:
         if basis.shape[1] < len(v_a):
             momentum = whitening @ (mass @ v_a)  # C^T v
             out[:] = whitening.T @ (momentum - basis @ (basis.T @ momentum))
-        out[self._is_active[candidates].any(axis=0)] = 0.0
+        out[np.isin(closure.active, np.take(self.columns, candidates))] = 0.0
         return out if np.abs((out - v_a) * rates).max() <= MAX_VELOCITY_CHANGE else v_a
 
 

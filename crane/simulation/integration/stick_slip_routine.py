@@ -130,17 +130,19 @@ def add_stick_slip_routines(
             r.return_value(0)
         resting = r.local_array("resting", k)
         resting_count = r.new_variable(0)
-        with m.each_column() as j:
-            r.store(resting, j, 0.0)
-            with r.if_then(_magnitude(found.element_pointer("speeds")[j]) <= REST_VELOCITY):
-                r.store(resting, j, 1.0)
+        *places, moving = mode_indices
+        for joint in range(k):  # rounding moves held ones
+            is_held = r.numbers[places[3 * joint + 1]] > 0.0
+            limit = select(is_held, MAX_VELOCITY_CHANGE, REST_VELOCITY)
+            r.store(resting, joint, 0.0)
+            with r.if_then(_magnitude(found.element_pointer("speeds")[joint]) <= limit):
+                r.store(resting, joint, 1.0)
                 r.assign(resting_count, resting_count + 1)
         v_a = r.state.element_pointer(state_layout.start_index("v_a"))
         with r.if_then((resting_count > 0) & (found["motion"] > 0.0)):
             _write_stop(m, found, resting, v_a, rates, active_of_joint)
             r.call("stiction", *arguments, found)
         # modes without joints at rest, in which the forces are evaluated
-        *places, moving = mode_indices
         for joint in range(k):
             sign = _sign(found.element_pointer("speeds")[joint])
             r.store(r.numbers, places[3 * joint], select(resting[joint] > 0.0, 0.0, sign))
