@@ -111,8 +111,9 @@ def identify_cylinder_friction(
     """Identify the friction of one joint, with the load by the masses of the machine.
 
     The load is tau_A of `Dynamics.inverse` without friction for the smoothed motion. Samples are
-    used where the speed was steady for `settle` seconds and the joint slides; where the speed
-    rings at a constant valve signal, if their means over its period were. Stiction and its
+    used where the speed was steady for `settle` seconds and the joint slides. If there are none at
+    two speeds both ways, means over the period of a speed that rings at a constant valve signal
+    are used as well. Stiction and its
     velocity are estimated if there are speeds below that velocity and the stiction is significant;
     otherwise they are 0 and the note of the result gives the reason.
 
@@ -137,23 +138,23 @@ def identify_cylinder_friction(
     slow = max(
         _SLIDING_FACTOR * described_friction.smoothing, _REST_SPEED_SHARE * float(np.abs(v).max())
     )
+    force = motion.tau[:, index] - load
+    is_steady = steady_mask(motion.time, settle, v, share=_STEADY_SHARE, relative=True)
     signal = recording.channels.get(VALVE_SIGNAL_PREFIX + joint)
-    is_steady, v, force = _steady_speeds(
-        motion.time, settle, signal, v, motion.tau[:, index] - load
-    )
+    if _sense_without_speeds(v[is_steady & (np.abs(v) > slow)]) and signal is not None:
+        is_steady, v, force = _steady_means(motion.time, settle, signal, is_steady, v, force)
     if not is_steady.any():
         raise RecordingError(
             f"no speed of '{joint}' is steady for {settle:g} s, record longer constant speeds"
         )
     at = np.flatnonzero(is_steady & (np.abs(v) > slow))
     speed, force = v[at], force[at]
-    for sense, word in ((1, "extends"), (-1, "retracts")):
-        sizes = np.abs(speed[sense * speed > 0])
-        if len(sizes) < 2 or sizes.max() < 1.5 * sizes.min():
-            raise RecordingError(
-                f"'{joint}' never {word} steadily at two speeds above "
-                f"{slow:.3g} {machine.unit(joint)}/s, record constant speeds both ways"
-            )
+    if sense := _sense_without_speeds(speed):
+        word = "extends" if sense > 0 else "retracts"
+        raise RecordingError(
+            f"'{joint}' never {word} steadily at two speeds above "
+            f"{slow:.3g} {machine.unit(joint)}/s, record constant speeds both ways"
+        )
     every = max(1, len(at) // _MAX_SAMPLES)
     at, speed, force = at[::every], speed[::every], force[::every]
     note, estimate = "", None
@@ -177,20 +178,26 @@ def identify_cylinder_friction(
     )
 
 
-def _steady_speeds(
-    time: Array, settle: float, signal: Array | None, v: Array, force: Array
+def _sense_without_speeds(speed: Array) -> int:
+    """Sense in which there are no two steady speeds, 0 if there are both ways."""
+    for sense in (1, -1):
+        sizes = np.abs(speed[sense * speed > 0])
+        if len(sizes) < 2 or sizes.max() < 1.5 * sizes.min():
+            return sense
+    return 0
+
+
+def _steady_means(
+    time: Array, settle: float, signal: Array, plain: NDArray[np.bool_], v: Array, force: Array
 ) -> tuple[NDArray[np.bool_], Array, Array]:
     """Mask (N,) of samples with a steady speed, speeds and forces.
 
     They are means over the periods of a speed that rings, without a reversal, at a held valve
     signal. The sign of friction and the part that is linear in the speed have the same mean as
-    the speed.
+    the speed; stiction has not.
     """
     from scipy.ndimage import maximum_filter1d
 
-    plain = steady_mask(time, settle, v, share=_STEADY_SHARE, relative=True)
-    if signal is None or plain.all():
-        return plain, v, force
     try:
         means = steady_means(time, settle, signal, v, force, share=_STEADY_SHARE, relative=True)
     except RecordingError:  # no held signal
