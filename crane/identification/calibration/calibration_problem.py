@@ -35,12 +35,12 @@ from crane.simulation.sensitivity.variational_integration import VariationalInte
 from crane.simulation.simulation_run import simulate
 from crane.simulation.simulation_setup import initial_motion
 
-DERIVATIVE_TOLERANCE = 1e-3  # relative error of derivatives
+DERIVATIVE_TOLERANCE = 1e-4  # relative error of derivatives
 _DIFFERENCE_STEP = 1e-5  # of the scale of an unknown, for differences of simulation constants
 # [rad/s], [m/s] over which smoothed friction changes its sign
 _FRICTION_SMOOTHING = {"rad": 5e-3, "m": 2e-3}
-# largest steps [s] of a simulation, and of one with derivatives
-_MAX_STEP, _MAX_SENSITIVITY_STEP = 1e-2, 5e-3
+# largest steps [s] of a simulation, of one with derivatives, and with coarse ones
+_MAX_STEP, _MAX_SENSITIVITY_STEP, _MAX_COARSE_STEP = 1e-2, 2e-3, 5e-3
 _MAX_CACHED_MACHINES = 100  # machines with changed parameters in the cache
 
 
@@ -239,7 +239,9 @@ class CalibrationProblem:
         machine = self.simulated_machine(z, friction_smoothing)
         inputs = self._inputs_with_start(case, z)
         drive, dynamics = inputs.valve_drive(machine), Dynamics(machine)
-        step, steps = _step_size_and_count(case, _MAX_SENSITIVITY_STEP, True)
+        is_coarse = self.derivative_tolerance > DERIVATIVE_TOLERANCE
+        largest_step = _MAX_COARSE_STEP if is_coarse else _MAX_SENSITIVITY_STEP
+        step, steps = _step_size_and_count(case, largest_step, True)
         start_unknowns = case.first_start_index + np.flatnonzero(case.start_std)
         varied_unknowns = [i for i in range(len(self.unknowns)) if i not in fixed_unknowns]
         # compared sensors affect the simulation only if its start depends on them

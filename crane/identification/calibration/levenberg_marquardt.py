@@ -30,19 +30,18 @@ _SMOOTHING_SCHEDULE, FINAL_SMOOTHING = (
 )
 _COVARIANCE_SMOOTHING = 0.1  # smoothing for derivatives of the covariance
 _MAX_ITERATIONS = 40  # iterations per round
-# relative change of the cost that ends the iterations
-_COST_TOLERANCE, INITIAL_COST_TOLERANCE = 1e-4, 1e-2
+# relative change of the cost that ends the iterations; where sets of parameters are compared
+_COST_TOLERANCE, INITIAL_COST_TOLERANCE, COMPARED_COST_TOLERANCE = 1e-4, 1e-2, 3e-4
 # largest cost that the change is relative to: much left of some channels shall not hide others
 _MAX_COMPARED_COST = 500.0
-# relative change, where sets of parameters are compared
-COMPARED_COST_TOLERANCE = 3e-4
 # least scale per largest value of a channel, and absolute [SI]
 _MIN_RELATIVE_SCALE, _MIN_SCALE = 1e-6, 1e-9
 # largest scale of a channel, the usual error of a model, per range of its unit in the recordings
 _MAX_SCALE_SHARE = 5e-3
 _INITIAL_DAMPING = 1e-3
 _DAMPING_INCREASE, _DAMPING_DECREASE, _MAX_DAMPING = 10.0, 0.2, 1e8  # of the damping
-_COARSE_DERIVATIVE_TOLERANCE = 1e-2  # relative error of derivatives far from the minimum
+# relative error of derivatives far from the minimum, and of searches
+_COARSE_DERIVATIVE_TOLERANCE, _SEARCH_DERIVATIVE_TOLERANCE = 1e-2, 1e-3
 _BLOCK_COUNT_RANGE = 8, 40  # range of the number of blocks of a covariance
 LOG_COLUMNS = (
     "search", "iteration", "cost", "damping", "ended", "all iterations", "simulations", "unknowns",
@@ -179,7 +178,7 @@ class LevenbergMarquardt:
     def sharpen_friction(self, z: Array) -> Array:
         """Follow the minimum of smoothed friction near to that of the friction model."""
         problem = self.problem
-        problem.derivative_tolerance = DERIVATIVE_TOLERANCE
+        problem.derivative_tolerance = _SEARCH_DERIVATIVE_TOLERANCE
         # residuals with smoothed friction do not give the final scales: they are updated
         for problem.smooth, problem.slopes in _SMOOTHING_SCHEDULE if self._has_stiction else ():
             is_last = not problem.smooth
@@ -206,8 +205,10 @@ class LevenbergMarquardt:
 
     def linearize_for_covariance(self, z: Array) -> None:
         """Linearize with derivatives that hold over an interval."""
-        self.problem.slopes = _COVARIANCE_SMOOTHING
+        problem, tolerance = self.problem, self.problem.derivative_tolerance
+        problem.slopes, problem.derivative_tolerance = _COVARIANCE_SMOOTHING, DERIVATIVE_TOLERANCE
         self.linearize(z)
+        problem.derivative_tolerance = tolerance
 
     def _training_residuals(self, z: Array) -> dict[str, Array]:
         """Residuals of each channel over the training data."""
