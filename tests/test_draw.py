@@ -323,12 +323,15 @@ def test_the_picture_is_kept_in_the_file_and_found_again(tmp_path):
         (["--out", "plain.yaml"], "plain.yaml: exists already"),
         (["loader.yaml", "--page", "2"], "--page is for --picture, add it"),
         (["bad.yaml"], "bad.yaml:7: point 'A' has 1 coordinates"),
+        (["own.yaml"], "body 'boom' has coordinates of its own, which 'crane draw' cannot edit"),
         (["loader.yaml", "--host", "no.such.host.invalid"], "is not known"),
     ],
 )
 def test_errors_are_one_line(arguments, text, tmp_path):
     (tmp_path / "loader.yaml").write_text(LOADER)
     (tmp_path / "bad.yaml").write_text(LOADER.replace("A: [0.0, 2.0]", "\n    A: [0]"))
+    own = "name: own\ndrawing: {points: {}, bodies: {boom: {points: {A: [0, 0], B: [1, 0]}}}}\n"
+    (tmp_path / "own.yaml").write_text(own)
     (tmp_path / "plain.yaml").write_text("name: plain\n")
     done = typed("draw", *arguments, "--no-open", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")

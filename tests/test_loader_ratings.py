@@ -329,6 +329,7 @@ def test_postures_that_are_not_there_are_said_in_one_line(loader):
         (("--over", "X_lift,X_lift"), "'X_lift' is swept or given twice, name it once"),
         (("--over", ""), "'' does not move 'edge'"),
         (("--zones", "1000"), "--zones are over two strokes, name them with --over"),
+        (("--over", "X_lift", "--zones", "1000"), "zones are over two strokes, not over 'X_lift'"),
         (("--over", "X_lift,X_tilt", "--zones", "1000,-1"), "the load of a zone is -1"),
         (("--over", "X_lift,X_tilt", "--zones", "heavy"), "--zones heavy are no loads"),
         (("--over", "X_lift", "--at", "angle=400deg"), "reaches no such posture over X_lift"),

@@ -164,7 +164,7 @@ class ValveDrive(ControlLaw):
         if motion and start:
             raise SimulationError(
                 f"the oil has no static equilibrium: {motion}, through a valve, relief valve or "
-                "element that is open: close it, or leave 'start' out"
+                "element that is open: close it"
             )
         return state if motion else equilibrium.state
 

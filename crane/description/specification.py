@@ -353,7 +353,7 @@ class MachineParts:
     estimation: EstimationSettings = EstimationSettings()
     external_forces: tuple[ExternalForce, ...] = ()
     supports: tuple[str, ...] = ()
-    start: str = ""  # of `START_CHOICES`; "": at rest where something would fall
+    start: str = ""  # "equilibrium", "home"; "": at rest where something would fall
     pin_capacities: Mapping[str, float] = field(default_factory=dict)
     written_numbers: Mapping[KeyPath, WrittenNumber] = field(default_factory=dict)
 

@@ -242,8 +242,8 @@ def lift_chart(
         friction: See `capacity`.
 
     Raises:
-        InputError: A joint does not move the frame, is given twice, or three are; there is no such
-            posture; or as `capacity`.
+        InputError: A joint does not move the frame, is given twice, or three are; zones are given
+            over one stroke; there is no such posture; or as `capacity`.
     """
     places = Strokes(machine, frame)
     machine, names = places.machine, [places.machine.active[i] for i in places.moving]
@@ -256,6 +256,8 @@ def lift_chart(
             f"a lift chart takes one stroke or two, not {', '.join(over) or 'none'}: name them "
             "with --over, or lock the others"
         )
+    if zones is not None and len(over) == 1:
+        raise InputError(f"zones are over two strokes, not over '{over[0]}' alone, leave them out")
     conditions = load_conditions(places, rule, raising, slope, friction)
     indices = [machine.active.index(x) for x in over]
     counts = _VALUE_COUNTS[len(over)]

@@ -57,7 +57,8 @@ class StandingMachine(OneLineRepr):
         lines += _table(("contact", "normal force", "deflection", "along the ground"), rows)
         lines += _table(
             ("drive", "holds"),
-            [(x, f"{run.tau[0, machine.active.index(x)]:.1f} {FORCE_UNITS[machine.unit(x)]}")
+            [(x, f"{run.tau[0, machine.active.index(x)].round(1) + 0.0:.1f} "
+              f"{FORCE_UNITS[machine.unit(x)]}")
              for x in machine.driven_joints],
         )  # fmt: skip
         pressures = [name for name in run.channels if name.startswith("pressure_")]

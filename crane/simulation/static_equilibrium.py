@@ -65,7 +65,7 @@ def rest_state(dynamics: Dynamics, q_a: Array) -> RestState:
         if requested:
             raise SimulationError(
                 f"'{machine.name}' has no static equilibrium near home: {equilibrium.failure}, "
-                "change home or what holds it, or leave 'start' out"
+                "change home or what holds it"
             )
         return RestState(
             q_a, contact_states, "at home, near which it has no static equilibrium on its contacts"

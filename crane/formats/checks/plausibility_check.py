@@ -269,8 +269,8 @@ def flow_shortages(spec: MachineSpec) -> list[str]:
         if supply.flow > 0 and demand > _MAX_DEMAND_RATIO * supply.flow:
             messages.append(
                 f"hydraulics: fully open valves of pump '{name}' need "
-                f"{demand * _LITRES_PER_MINUTE:.3g} l/min together, it delivers at most "
-                f"{supply.flow * _LITRES_PER_MINUTE:.3g} l/min"
+                f"{demand * _LITRES_PER_MINUTE:.4g} l/min together, it delivers at most "
+                f"{supply.flow * _LITRES_PER_MINUTE:.4g} l/min"
             )
     return messages
 

@@ -100,6 +100,9 @@ def _coordinates(points: YamlSection, name: str) -> list[float]:
 
 def _item_values(_: str, item: YamlSection) -> dict[str, Any]:
     """Return the values of a body and the like, whose names are lists of texts."""
+    if "points" in item and isinstance(item.raw_value("points"), dict):
+        problem = "has coordinates of its own, which 'crane draw' cannot edit: list its points"
+        raise item.error_at("points", f"{item.title} {problem} and give them to the drawing")
     names = {key: list(item.names(key)) for key in item if key in ("points", "bodies")}
     return {key: item.raw_value(key) for key in item} | names
 
