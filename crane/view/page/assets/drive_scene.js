@@ -1,6 +1,7 @@
 // What the page draws beside the machine: goals, the load, forces; and at what expense.
 
-const SMOOTH = 1000 / 40; // interval of frames above which fewer pixels are drawn [ms]
+// interval of frames above which fewer pixels are drawn [ms]; displays may have 50 Hz
+const SMOOTH = 1000 / (isSoftware ? 57 : 40);
 
 // The shapes of a link as one mesh with a colour at each corner, which is drawn by one call.
 function merge(group) {
@@ -41,7 +42,7 @@ class DriveSpace extends Space {
         this.load = this.ball(1, 0x8a6a3b, 1);
         this.marks.add(this.load);
         this.arrows = drive.loads.map(() => this.arrow());
-        this.ratio = Math.min(window.devicePixelRatio, isSoftware ? 1 : 2);
+        this.ratio = this.most = Math.min(window.devicePixelRatio, isSoftware ? 1 : 2);
         [this.interval, this.last, this.checked, this.goal] = [16, 0, 0, null];
         for (const group of Object.values(this.groups)) merge(group);
         if (isSoftware) this.dim();
@@ -126,15 +127,16 @@ class DriveSpace extends Space {
         });
     }
 
-    // Draw; where frames take long, with fewer pixels.
+    // Draw; where frames take long, with fewer pixels, and never again with as many as took long.
     draw(now) {
         const passed = now - this.last;
         this.last = now;
         if (passed < 500) this.interval += 0.1 * (passed - this.interval);
         if (now - this.checked > 700) {
             this.checked = now;
-            const most = Math.min(window.devicePixelRatio, isSoftware ? 1 : 2);
-            const wished = this.interval > SMOOTH ? Math.max(0.6, 0.8 * this.ratio) : this.interval < 18 ? Math.min(most, 1.1 * this.ratio) : this.ratio;
+            const isSlow = this.interval > SMOOTH;
+            if (isSlow) this.most = Math.max(0.6, 0.95 * this.ratio);
+            const wished = isSlow ? Math.max(0.6, 0.85 * this.ratio) : Math.min(this.most, 1.05 * this.ratio);
             if (Math.abs(wished - this.ratio) > 0.02) {
                 this.ratio = wished;
                 viewer.renderer.setPixelRatio(wished); // which clears the canvas
