@@ -494,7 +494,8 @@ MECHANISM = [
     seen(
         [
             "rocker.urdf:3: warning: passive joint 'rocker' is at 1.378 with the loops "
-            "closed at home, outside of its limits 0 to 0.5, widen them or correct the home"
+            "closed at home, outside of its limits 0 to 0.5, widen them or correct the home or "
+            "what is locked"
         ],
         swap('name="rocker" type="continuous"', 'name="rocker" type="revolute"', ROCKER),
         swap(

@@ -19,6 +19,7 @@ from crane.formats.drawing.body_inertia import (
 )
 from crane.formats.steel_cylinder import SteelCylinder
 
+BACKHOE = Path(__file__).parent / "data" / "backhoe.yaml"
 LOADER = """
 name: loader
 drawing:
@@ -324,6 +325,8 @@ def test_a_platform_on_six_legs_by_ball_joints(tmp_path):
          "cylinder 'X_lift' has both pins on 'frame', which is rigid"),
         (("base: frame", "base: chassis"), "loader.yaml:4: 'base' is the unknown body 'chassis'"),
         (("A: [0.0, 2.0]", "A: [0.0]"), "point 'A' has 1 coordinates, give [x, z] or [x, y, z]"),
+        (("A: [0.0, 2.0]", "A: [0.0, 2000]"),
+         "loader.yaml:6: point 'A' is at 2000 m: looks like mm, write 2000e-3"),
         (("rod: 0.07", "rod: 0.13"), "the rod of 0.13 m does not fit into the bore of 0.12 m"),
         (("inertia: [3e+3, 9e+3, 8e+3]", "inertia: [3e+3, 9e+3]"),
          "the inertia of body 'frame' has 2 numbers, give 1, 3 or 6"),
@@ -348,6 +351,44 @@ def test_errors_are_in_terms_of_the_drawing(loaded, changes, message):
     with pytest.raises(DescriptionError) as error:
         quiet(loaded, *changes)
     assert message in str(error.value)
+
+
+def checked(folder, *changes):
+    """What `crane check` says of the backhoe with changes, without its counts."""
+    text = BACKHOE.read_text()
+    for old, new in zip(changes[::2], changes[1::2], strict=True):
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    (folder / "backhoe.yaml").write_text(text)
+    return [x.message for x in crane.check(folder / "backhoe.yaml").findings]
+
+
+def test_all_errors_of_a_drawing_are_told_at_once_and_each_alone(tmp_path):
+    found = checked(tmp_path, "longest: 2.44", "longest: 2.6", "longest: 1.24", "longest: 1.3")
+    assert [x.split(" is ")[0] for x in found] == ["cylinder 'X_boom'", "cylinder 'X_dipper'"]
+    found = checked(tmp_path, "A: [0.3, 0.75]", "A: [0,3, 0,75]", "mass: 320", "mass: -320",
+                    "width: 0.25", "width: -0.25")  # fmt: skip
+    assert found == [
+        "point 'A' has 4 coordinates, give [x, z] or [x, y, z], with decimal points",
+        "'width' of body 'dipper' is -0.25, give at least 0",
+    ]
+    found = checked(tmp_path, "mass: 320", "mass: -320", "mass: 25}", "mass: 25, width: -1}")
+    assert [x.split(" is ")[0] for x in found] == [
+        "'mass' of body 'boom'",
+        "'width' of body 'link'",
+    ]
+
+
+@pytest.mark.slow
+def test_a_backhoe_written_by_hand_digs_as_its_data_sheet_says():
+    """JCB 3CX of 2007: depth 5.46 m, reach 6.52 m; 5700 kg and 3010 kg at bucket and dipper."""
+    machine = crane.load(BACKHOE)
+    found = crane.working_range(machine)
+    assert found["digging depth"].value == pytest.approx(5.46, rel=0.05)
+    assert found["reach at ground level"].value == pytest.approx(6.52, rel=0.05)
+    forces = crane.ratings.breakout(machine)
+    assert forces.bucket.isolated_force == pytest.approx(5700 * 9.80665, rel=0.05)
+    assert forces.arm.isolated_force == pytest.approx(3010 * 9.80665, rel=0.05)
 
 
 def own_coordinates(names, angle, origin):

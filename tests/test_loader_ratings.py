@@ -1,6 +1,7 @@
 """Ratings of loaders, telehandlers and lifts: statics, circles and virtual work by hand."""
 
 import csv
+import json
 import math
 import re
 
@@ -12,6 +13,7 @@ from command_line import typed
 from free_bodies import balance, moment
 from scipy.optimize import brentq
 from test_wheel_loader import Linkage
+from warned import quiet
 
 import crane
 from crane.common.errors import CraneError
@@ -260,6 +262,44 @@ def test_what_lock_leaves_is_the_curve_over_it(loader, lift):
     )
 
 
+STEERED = {  # two cylinders in place of the driven pin
+    "steer: {axis: z, driven: yes, ": "steer: {axis: z, ",
+    "rear: {points: [steer, ": "rear: {points: [steer, left_rear, right_rear, ",
+    "front: {points: [steer, ": "front: {points: [steer, left_front, right_front, ",
+    "    edge: ": "    left_rear: [-1.9, 0.3, 0.8]\n    right_rear: [-1.9, -0.3, 0.8]\n"
+    "    left_front: [-0.75, 0.35, 0.8]\n    right_front: [-0.75, -0.35, 0.8]\n    edge: ",
+    "    X_tilt: {points: [T": "".join(
+        f"    X_{x}: {{points: [{x}_rear, {x}_front], bore: 0.07, rod: 0.04, shortest: 0.86, "
+        "longest: 1.33}\n" for x in ("left", "right")
+    ) + "    X_tilt: {points: [T",
+}  # fmt: skip
+
+
+@pytest.mark.slow
+def test_steering_cylinders_at_full_steer_tip_as_statics_by_hand(folder, lift):
+    """The pin locked at 40 degrees, moments of all links about the line of the turned wheels."""
+    text = (folder / "loader.yaml").read_text().split("hydraulics:")[0]
+    for old, new in STEERED.items():
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    path = folder / "steered.yaml"
+    path.write_text(text)
+    with pytest.raises(CraneError, match="choose them: --active X_lift,X_left,X_tilt"):
+        crane.ratings.lift_chart(quiet(crane.load, path), ["X_lift"], "heap")
+    machine = crane.load(path, lock={"steer": TURN}, active=["X_lift", "X_tilt"])
+    tips, at = crane.ratings.lift_chart(machine, ["X_lift"], "heap", rule="iso14397").least_load(
+        0, only_tipping=True
+    )
+    q = machine.closure.solve(at.q_a[0, 0, 0])
+    line = [turned([0.3, y, 0.0], TURN) for y in (-0.95, 0.95)]
+    over = moment(machine, q, np.array(machine.gravity), tips, "heap", *line)
+    assert over == pytest.approx(0.0, abs=1e-9 * 12000 * G * 3)
+    assert tips == pytest.approx(lift.least_load(1, only_tipping=True)[0], rel=0.01)  # steel more
+    with pytest.warns(UserWarning, match="passive joint 'X_left' is at -0.0728"):
+        path.write_text(text.replace("left_rear: [-1.9", "left_rear: [-1.82"))
+        crane.load(path, lock={"steer": TURN}, active=["X_lift", "X_tilt"])
+
+
 @pytest.fixture(scope="module")
 def zones(folder):
     machine = crane.load(folder / "telehandler.yaml")
@@ -310,8 +350,13 @@ def test_postures_that_are_not_there_are_said_in_one_line(loader):
     for at, over, said in (
         ({"X_lift": 1.0}, (), r"'X_lift' goes from 0 to 0.855 m, not to 1"),
         ({"X_lft": 0.1}, (), r"'X_lft' is no active joint, did you mean 'X_lift'"),
-        ({"angle": 0.0}, (), "left for it: X_lift, X_tilt; name or lock"),
-        ({"angle": 0.0, "X_lift": 0.1, "X_tilt": 0.1}, (), "left for it: none; name"),
+        (
+            {"angle": 0.0},
+            (),
+            "1 of the strokes would follow, in .*, and X_lift, X_tilt may; name or",
+        ),
+        ({"angle": 40.0}, ("X_lift",), "the angle is 40 rad, more than a turn: write degrees as"),
+        ({"angle": 0.0, "X_lift": 0.1, "X_tilt": 0.1}, (), "and none may; name"),
         ({"X_lift": 0.1}, ("X_lift",), "'X_lift' is swept or given twice"),
         ({"angle": 2.0, "X_lift": 0.1}, (), "reaches no posture with angle 2 within its strokes"),
         ({"angle": math.nan, "X_lift": 0.1}, (), "the angle is nan rad, give a number"),
@@ -332,7 +377,8 @@ def test_postures_that_are_not_there_are_said_in_one_line(loader):
         (("--over", "X_lift", "--zones", "1000"), "zones are over two strokes, not over 'X_lift'"),
         (("--over", "X_lift,X_tilt", "--zones", "1000,-1"), "the load of a zone is -1"),
         (("--over", "X_lift,X_tilt", "--zones", "heavy"), "--zones heavy are no loads"),
-        (("--over", "X_lift", "--at", "angle=400deg"), "reaches no such posture over X_lift"),
+        (("--over", "X_lift", "--at", "angle=400deg"), "more than a turn: write degrees"),
+        (("--over", "X_lift", "--at", "angle=170deg"), "reaches no such posture over X_lift"),
         (("--over", "X_lift", "--at", "tilt=1"), "'tilt' is no active joint"),
         (("--over", "X_lift", "--at", "X_tilt"), "--at"),
     ],
@@ -359,6 +405,34 @@ def test_the_command_writes_curve_and_figure(folder, tmp_path):
     values = np.genfromtxt(lines[1:], delimiter=",")
     assert len(values) == 2 * 65 and values[:, 3] == pytest.approx(math.radians(5), abs=1e-10)
     assert (out / "lift_chart.png").stat().st_size > 10_000
+    data = page_data(out)
+    assert ["over", "X_lift"] in data["facts"] and data["slews"] == ["front", "40°"]
+    cells = np.array([row[:3] for cells in data["cells"] for row in cells])
+    wanted = values[:, [names.index(x) for x in ("radius", "height", "load")]]
+    assert cells == pytest.approx(wanted, rel=1e-4)
+    for cell in data["cells"][1][::16]:  # the machine is drawn where it holds the load
+        corners = data["unit"] * np.concatenate(data["shapes"][cell[7]][0]).reshape(-1, 2)
+        assert np.linalg.norm(corners - cell[:2], axis=1).min() < data["unit"]
+        assert cell[8] == pytest.approx(5.0, abs=1e-6)
+
+
+def page_data(folder):
+    """The data within the page of a lift chart."""
+    text = (folder / "lift_chart.html").read_text(encoding="utf-8")
+    (inside,) = re.findall(r'id="data">(.*?)</script>', text, re.S)
+    return json.loads(inside)
+
+
+@pytest.mark.slow
+def test_zones_are_lines_of_the_page(zones, tmp_path):
+    zones.write(tmp_path / "out")
+    data = page_data(tmp_path / "out")
+    (_, (words, (line,))) = data["contours"][0]
+    assert words == "4000 kg"
+    edge = np.column_stack([zones.strokes[0, :, 0], zones.zone_edges[0, 1]])
+    places = zones.at_strokes(edge[np.isfinite(edge[:, 1])][None]).positions[0]
+    drawn = data["unit"] * np.array(line).reshape(-1, 2)
+    assert drawn == pytest.approx(places, abs=data["unit"])
 
 
 def test_supports_that_leave_the_ground_are_refused(folder, tmp_path):

@@ -149,7 +149,7 @@ CASES = {
     "LiftChart": (
         lambda _: crane.ratings.lift_chart(crane.load("patu655"), ["X_lift"]),
         {},
-        "lift_chart.md lift_chart.csv lift_chart.png",
+        "lift_chart.md lift_chart.csv lift_chart.png lift_chart.html",
     ),
     "ToolForce": (
         lambda _: crane.ratings.tool_force(crane.load("patu655"), "up", step=2.0),

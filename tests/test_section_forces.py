@@ -6,6 +6,7 @@ import yaml
 
 import crane
 from crane.common.errors import InputError
+from crane.description import machine_templates
 
 G, DENSITY = 9.81, 7850.0
 HEIGHT, WIDTH, WALL = 0.3, 0.2, 0.012  # of the boom's tube
@@ -170,6 +171,17 @@ def test_the_chart_of_a_run_has_its_extremes_and_loads(boom, tmp_path):
     assert "| bending moment | -" in text and " MPa |" in text
     names = {x.name for x in (tmp_path / "sections").iterdir()}
     assert names == {"sections.md", "sections.csv", "sections.png"}
+
+
+def test_rods_of_a_delta_robot_have_sections_in_the_plane_alone():
+    """The tubes begin exactly at a pin; two pairs of rods are beside the plane of the drawing."""
+    machine = crane.load(machine_templates()["delta"]["1kg"])
+    rods = crane.dynamics.SectionForces(machine, "rods_1")
+    home = machine.coordinates.configuration(machine.home)[None]
+    assert rods.positions[1] == 0
+    assert np.isfinite(rods.evaluate(home, 0 * home, 0 * home)).all()
+    with pytest.raises(InputError, match="'rods_2' has pins beside the plane of the drawing"):
+        crane.dynamics.SectionForces(machine, "rods_2")
 
 
 @pytest.mark.parametrize(

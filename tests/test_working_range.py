@@ -156,7 +156,7 @@ def test_tables_and_lines(found, tmp_path):
         ("excavator", {"frame": "nothing"}, "frame 'nothing' is unknown"),
         ("excavator", {"bucket": "slew"}, "'slew' does not turn"),
         ("excavator", {"frame": "upper"}, "no driven joint moves 'upper'"),
-        ("patu655", {"frame": "lift_boom"}, "moves in no upright plane"),
+        ("patu655", {"frame": "lift_boom"}, "covers no area of an upright plane"),
     ],
 )
 def test_what_has_no_range_is_said_in_one_line(name, given, said):

@@ -30,6 +30,7 @@ from crane.cli.show import active_coordinates
 from crane.cli.terminal import status
 from crane.common.errors import CraneWarning, InputError
 from crane.common.result import Result
+from crane.common.units import format_quantity
 
 Posture = Annotated[
     str | None,
@@ -287,7 +288,9 @@ def stability(
             load_text = f"{mass:.5g} kg at '{name}' tip it about {line}"
     print("| tipping line | held by | of the weight |\n| --- | ---: | ---: |")
     for names, moment, share in zip(tipping.line_names, moments, shares, strict=True):
-        print(f"| {' to '.join(names)} | {moment:.4g} N m | {100 * share:.1f} % |")
+        print(
+            f"| {' to '.join(names)} | {format_quantity(moment, 'N m', 4)} | {100 * share:.1f} % |"
+        )
     if load_text:
         print(f"\n{load_text}")
     if found is not None:

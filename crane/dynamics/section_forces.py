@@ -30,6 +30,7 @@ SECTION_UNITS = {"axial_force": "N", "shear_force": "N", "bending_moment": "N m"
           "lower_stress": "Pa", "upper_stress": "Pa"}  # fmt: skip
 _PLANE = [0, 2]  # axes of the plane of a drawing
 _ZERO_MASS = 1e-9  # share of the mass of a body
+_FLATNESS_TOLERANCE = 1e-6  # slope of an axis out of the plane of the drawing
 
 
 class SectionForces(OneLineRepr):
@@ -59,7 +60,7 @@ class SectionForces(OneLineRepr):
         sections: (S, 5) A [m2], u_c [m], I [m4], lowest and highest u [m]; nan without section.
 
     Raises:
-        InputError: The body has no sections, or does not move.
+        InputError: The body has no sections, does not move, or leaves the plane of the drawing.
 
     Source: Gross et al., Engineering Mechanics 1 and 3 (stress resultants, d'Alembert).
     """
@@ -99,6 +100,10 @@ class SectionForces(OneLineRepr):
         if not length:
             raise InputError(f"body '{body}' has one pin and no axis, name one with two")
         self._first, self._axis = first, (last - first) / length
+        if abs(self._axis[1]) > _FLATNESS_TOLERANCE:
+            raise InputError(
+                f"body '{body}' has pins beside the plane of the drawing, name one within it"
+            )
         self._up = np.cross(self._axis, [0.0, 1.0, 0.0])
         name = drawn.points[0]
         link = f"{body}_{name}" if self._model.existFrame(f"{body}_{name}") else name

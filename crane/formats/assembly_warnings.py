@@ -7,7 +7,7 @@ from crane.closure.assembly_modes import AssemblyMode, find_alternative_assembly
 from crane.closure.closure import Closure
 from crane.closure.constraint_structure import OpenLoopError
 from crane.closure.constraint_tolerances import CLOSED_TOLERANCE
-from crane.closure.home_search import HomeSearchResult
+from crane.closure.home_search import HomeSearchResult, within_limits
 from crane.common.errors import MechanismError, warn
 from crane.common.package_search import NEAREST_ASSEMBLY, own_argument
 from crane.common.samples import Array
@@ -183,6 +183,20 @@ def warn_about_assembly_modes(
         alternatives = alternatives[:1]
     for alternative in alternatives:
         warn(_alternative_text(spec, closure, alternative) + remainder, stacklevel=3)
+
+
+def warn_about_limits(spec: MachineSpec, closure: Closure) -> None:
+    """Warn of passive joints that are outside of their limits at home."""
+    coordinates = closure.equations.coordinates
+    is_within_limits = within_limits(closure.equations, closure.home)
+    for column in closure.passive[~is_within_limits[closure.passive]]:
+        name = coordinates.names[int(column)]
+        lower, upper = coordinates.lower[column], coordinates.upper[column]
+        warn(
+            f"{spec.tree.joints[name].source_location}: passive joint '{name}' is at "
+            f"{closure.home[column]:.4g} with the loops closed at home, outside of its limits "
+            f"{lower:g} to {upper:g}, widen them or correct the home or what is locked"
+        )
 
 
 def alternative_configurations(machine: Machine) -> list[Array]:

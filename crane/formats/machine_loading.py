@@ -37,7 +37,12 @@ from crane.description.parameter_changes import (
 )
 from crane.description.rotation_vectors import add_floating_base, check_freedoms
 from crane.description.specification import Coupling, LoopSpec, MachineSpec
-from crane.formats.assembly_warnings import add_remedy, check_home, warn_about_assembly_modes
+from crane.formats.assembly_warnings import (
+    add_remedy,
+    check_home,
+    warn_about_assembly_modes,
+    warn_about_limits,
+)
 from crane.formats.machine_file.machine_reader import read_machine_spec
 from crane.machine.drive_selection import select_free_joints, select_motors
 from crane.machine.machine import Machine
@@ -244,6 +249,8 @@ def _assemble_machine(
     closure = closure_provider(model, spec.loops, spec.couplings) or _build_closure(
         spec, model, is_modified
     )
+    if lock:
+        warn_about_limits(spec, closure)
     _SPEC_BEFORE_CHANGES[closure] = spec_before_changes
     spec, model = replace_infeasible_inertias(spec, model, closure)
     held = [closure.active_names[i] for i in check_masses(spec, model, closure)]

@@ -141,16 +141,18 @@ class LiftChart(RatingLoads):
             **{f"force_{x}": ("N" if unit(x) == "m" else "N m", force) for x, force in forces},
         }  # fmt: skip
 
+    def facts(self) -> list[tuple[str, str]]:
+        """Return the conditions as (name, text)."""
+        held = ", ".join(f"{x} = {value:.4g}" for x, value in self.postures.at.items())
+        over = ("over", " and ".join(self.over)), ("held", held or "all at home")
+        return [*capacity_facts(self), *over]
+
     def to_markdown(self) -> str:
         """Return the conditions, the loads and, over one stroke, the smallest ones as Markdown."""
-        held = (
-            ", ".join(f"{x} = {value:.4g}" for x, value in self.postures.at.items())
-            or "all at home"
-        )
-        facts = [*capacity_facts(self), ("over", " and ".join(self.over)), ("held", held)]
         tables = self._curve_tables() if len(self.over) == 1 else self._chart_tables()
         return "\n".join([
-            f"# Lift chart of {self.machine.name}\n", *(f"- {x}: {text}" for x, text in facts), "",
+            f"# Lift chart of {self.machine.name}\n",
+            *(f"- {x}: {text}" for x, text in self.facts()), "",
             *tables, "\n* limited by drives or pins, all others by tipping\n",
         ])  # fmt: skip
 

@@ -74,9 +74,14 @@ class PostureSearch:
         if len(self._following) != len(self._rows) or (section.is_radial and ANGLE in at):
             raise InputError(
                 f"{' and '.join(x for x in _FRAME_UNITS if x in at)} of "
-                f"'{strokes.statics.frame}' would be set by as many strokes in an upright plane, "
-                f"left for it: {', '.join(machine.active[i] for i in free) or 'none'}; name or "
-                "lock the others"
+                f"'{strokes.statics.frame}': {len(self._rows)} of the strokes would follow, in an "
+                f"upright plane, and {', '.join(machine.active[i] for i in free) or 'none'} may; "
+                "name or lock the others"
+            )
+        if abs(self._targets[0]) > 2 * np.pi:
+            raise InputError(
+                f"the {ANGLE} is {self._targets[0]:g} rad, more than a turn: "
+                "write degrees as 40deg"
             )
         # the x axis points forwards at home, whichever way the section's first axis does
         self._forward = section.first_direction

@@ -140,6 +140,11 @@ class RatingChart(RatingValues):
     radii: Array
     heights: Array
 
+    @property
+    def positions(self) -> Array:
+        """(b, a, 2) radius and height of the values [m]."""
+        return np.stack(np.meshgrid(self.radii, self.heights), axis=-1)
+
     def derivatives(self, parameter_names: Sequence[str]) -> Array:
         """Compute derivatives of the values by parameters, see `rating_derivatives`.
 

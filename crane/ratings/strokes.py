@@ -52,7 +52,8 @@ class Strokes:
         drives = machine.explicit_drives or ()
         if any(x.name not in machine.active or len(x.factors) > 1 for x in drives):
             raise InputError(
-                f"the drives of '{machine.name}' are not its active joints, choose them: --active"
+                f"the drives of '{machine.name}' are not its active joints, choose them: --active "
+                + ",".join(machine.active)
             )
         statics = self.statics = StaticsEvaluator(machine, frame)
         machine = self.machine = statics.machine
@@ -262,8 +263,8 @@ def bucket_and_arm_strokes(
     if bucket is None and len(cylinders) < 3:
         text = ", ".join(f"{machine.active[i]} about {pivots[i]}" for i in cylinders)
         raise InputError(
-            f"'{machine.name}' has no bucket: {len(cylinders)} cylinders turn '{frame}' "
-            f"({text or 'none'}), boom, arm and bucket are three; name its joint with --bucket"
+            f"'{machine.name}' has no bucket: '{frame}' is turned by {text or 'no cylinder'}, "
+            "and boom, arm and bucket are three; name its joint with --bucket"
         )
     order = list(pivots)
     bucket_stroke = cylinders[-1] if bucket is None else machine.active.index(bucket)

@@ -120,8 +120,8 @@ def working_range(
     is_upright = abs(reach.section.second_direction @ machine.up_direction) >= 1 - 1e-9
     if not reach.area or not is_upright:
         raise InputError(
-            f"'{reach.frame}' of '{machine.name}' moves in no upright plane, a working range is "
-            "drawn in one: name another frame"
+            f"'{reach.frame}' of '{machine.name}' covers no area of an upright plane, in which a "
+            "working range is drawn: name another frame"
         )
     joint = pivot_joint = None
     strokes = Strokes(machine, frame)

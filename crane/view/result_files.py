@@ -423,6 +423,7 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         summary="lift_chart.md",
         tables={"lift_chart.csv": "to_csv"},
         figures={"lift_chart.png": "plots.rating_figures.lift_figure"},
+        documents={"lift_chart.html": "page.capacity_page.write_capacity_page"},
     ),
     "ToolForce": ResultFiles(
         summary="tool_force.md",

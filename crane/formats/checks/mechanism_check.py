@@ -8,7 +8,6 @@ import pinocchio as pin
 from crane.closure.closure import Closure
 from crane.closure.constraint_structure import OpenLoopError
 from crane.closure.constraint_tolerances import least_squares_step
-from crane.closure.home_search import within_limits
 from crane.closure.loop_equations import LoopEquations
 from crane.closure.multi_start_search import low_discrepancy_steps
 from crane.common.errors import ClosureError, MechanismError, warn
@@ -16,7 +15,12 @@ from crane.common.samples import Array
 from crane.description.findings import Findings, report_error
 from crane.description.kinematic_tree import path_to_root
 from crane.description.specification import TIP_COORDINATES, MachineSpec, Task
-from crane.formats.assembly_warnings import add_remedy, check_home, warn_about_assembly_modes
+from crane.formats.assembly_warnings import (
+    add_remedy,
+    check_home,
+    warn_about_assembly_modes,
+    warn_about_limits,
+)
 from crane.machine.machine_assembly import assemble_tree, build_closure, home_initial_guess
 from crane.machine.machine_checks import (
     check_frame_elements,
@@ -59,7 +63,7 @@ def check_mechanism(spec: MachineSpec, findings: Findings) -> Closure | None:
     spec, model = replace_infeasible_inertias(spec, model, closure)
     check_masses(spec, model, closure)
     check_frame_elements(spec, closure)
-    _warn_about_limits(spec, closure)
+    warn_about_limits(spec, closure)
     check_home(spec, closure, initial_guess)
     warn_about_assembly_modes(spec, closure, initial_guess, thorough=True)
     if findings.can_be_assembled:
@@ -113,19 +117,6 @@ def _loop_gaps(spec: MachineSpec, model: pin.Model, initial_guess: Array) -> dic
         if open_parts := [text for gap, text in parts if gap > _OPEN_TOLERANCE]:
             gap_texts[f"loop {loop.name}"] = " and ".join(open_parts)
     return gap_texts
-
-
-def _warn_about_limits(spec: MachineSpec, closure: Closure) -> None:
-    coordinates = closure.equations.coordinates
-    is_within_limits = within_limits(closure.equations, closure.home)
-    for column in closure.passive[~is_within_limits[closure.passive]]:
-        name = coordinates.names[int(column)]
-        lower, upper = coordinates.lower[column], coordinates.upper[column]
-        warn(
-            f"{spec.tree.joints[name].source_location}: passive joint '{name}' is at "
-            f"{closure.home[column]:.4g} with the loops closed at home, outside of its limits "
-            f"{lower:g} to {upper:g}, widen them or correct the home"
-        )
 
 
 _MAX_SAMPLES, _MAX_SAMPLED_JOINTS = 150, 6000  # of the strokes; samples times joints

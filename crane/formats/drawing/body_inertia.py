@@ -22,7 +22,7 @@ def polygon_moments(outline: Array) -> tuple[float, Array, Array]:
     second = np.roll(first, -1, axis=0)
     cross = first[:, 0] * second[:, 1] - second[:, 0] * first[:, 1]
     area = cross.sum() / 2
-    centroid = (first + second).T @ cross / (6 * area)
+    centroid = (first + second).T @ cross / (6 * area or 1.0)  # a line has none: its first point
     products = np.einsum("k,ki,kj->ij", cross, first, second)
     squares = np.einsum("k,ki,kj->ij", cross, first, first)
     squares += np.einsum("k,ki,kj->ij", cross, second, second)
@@ -40,6 +40,19 @@ def plate_inertia(outline: Array, thickness: float, y: float, density: float) ->
     return inertia_from_moments(mass, np.array([centroid[0], y, centroid[1]]), second_moments)
 
 
+def bar_axes(ends: Array) -> tuple[float, Array, Array, Array]:
+    """Return length [m] and direction of a bar, and the axes of its width and of its height."""
+    axis = ends[1] - ends[0]
+    length = float(np.linalg.norm(axis))
+    direction = axis / length
+    side = np.array([0.0, 1.0, 0.0])
+    if abs(direction[1]) > 0.9:
+        side = np.array([1.0, 0.0, 0.0])
+    side -= (side @ direction) * direction
+    side /= np.linalg.norm(side)
+    return length, direction, side, np.cross(direction, side)
+
+
 def tube_inertia(
     ends: Array, height: float, width: float | None, wall: float | None, density: float
 ) -> pin.Inertia:
@@ -52,21 +65,13 @@ def tube_inertia(
         wall: Thickness of the wall [m]; None: solid.
         density: [kg/m3].
     """
-    axis = ends[1] - ends[0]
-    length = float(np.linalg.norm(axis))
+    length, direction, side, up = bar_axes(ends)
     is_round, outer = width is None, np.array([height, height if width is None else width])
     inner = np.zeros(2) if wall is None else np.maximum(outer - 2 * wall, 0.0)
     shape, divisor = (np.pi / 4, 16.0) if is_round else (1.0, 12.0)
     masses = density * length * shape * np.array([outer.prod(), inner.prod()])
     mass = masses[0] - masses[1]
     across, along = (masses[0] * outer**2 - masses[1] * inner**2) / divisor, mass * length**2 / 12
-    direction = axis / length
-    side = np.array([0.0, 1.0, 0.0])
-    if abs(direction[1]) > 0.9:
-        side = np.array([1.0, 0.0, 0.0])
-    side -= (side @ direction) * direction
-    side /= np.linalg.norm(side)
-    up = np.cross(direction, side)
     second_moments = sum(
         moment * np.outer(x, x)
         for moment, x in ((along, direction), (across[0], up), (across[1], side))

@@ -6,9 +6,11 @@ from itertools import combinations
 import numpy as np
 import pinocchio as pin
 
+from crane.common.plausible_ranges import LONGEST
 from crane.common.samples import Array
 from crane.formats.machine_file.yaml_section import YamlSection
 
+_FARTHEST = 5 * LONGEST  # [m], farther away than any point of a machine
 _TOLERANCE = 1e-3  # of the extent of a body, up to which shared points may differ
 
 
@@ -71,7 +73,13 @@ def read_point(section: YamlSection, name: str) -> Array:
     values = section.numbers(name)
     if len(values) not in (2, 3):
         raise section.error_at(
-            name, f"point '{name}' has {len(values)} coordinates, give [x, z] or [x, y, z]"
+            name,
+            f"point '{name}' has {len(values)} coordinates, give [x, z] or [x, y, z], with "
+            "decimal points",
+        )
+    if abs(farthest := max(values, key=abs)) > _FARTHEST:
+        raise section.error_at(
+            name, f"point '{name}' is at {farthest:g} m: looks like mm, write {farthest:g}e-3"
         )
     return np.array(values if len(values) == 3 else (values[0], 0.0, values[1]))
 

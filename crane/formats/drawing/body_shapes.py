@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 
 from crane.common.samples import Array
+from crane.formats.drawing.body_inertia import bar_axes
 
 
 @dataclass(frozen=True)
@@ -42,10 +43,8 @@ class PlateShape:
 
 def equivalent_plate(bar: BarShape, inertia: pin.Inertia, density: float) -> PlateShape:
     """Return the plate with the mass, area A and moment I of a tube: height root(12 I / A)."""
-    axis = bar.ends[1] - bar.ends[0]
-    length = float(np.linalg.norm(axis))
-    height = float(np.sqrt(12.0 * inertia.inertia[1, 1] / inertia.mass - length**2))
-    up = height / 2 * np.array([-axis[2], 0.0, axis[0]]) / length
-    outline = bar.ends[[0, 1, 1, 0]] + np.array([-up, -up, up, up])
+    length, _, side, up = bar_axes(bar.ends)
+    height = float(np.sqrt(12.0 * side @ inertia.inertia @ side / inertia.mass - length**2))
+    outline = bar.ends[[0, 1, 1, 0]] + height / 2 * np.array([-up, -up, up, up])
     thickness = inertia.mass / (density * length * height)
     return PlateShape(outline, thickness, density, bar.height / height)

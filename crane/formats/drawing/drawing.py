@@ -183,7 +183,8 @@ class _DrawingReader:
             base, self._points, bodies, pins, cylinders | slides, section.source_location()
         )
         for name in cylinders:
-            _check_reach(drawing, name)
+            with error_recovery():
+                _check_reach(drawing, name)
         return drawing
 
     def _check_pin(self, name: str, location: str) -> None:
@@ -196,6 +197,8 @@ class _DrawingReader:
         names = item.names(key)
         for name in names:
             problem = f"{item.title} has the unknown point '{name}'"
+            if name not in self._points and name in self._section.item_names("points"):
+                raise FollowUpError("the point has been refused")
             item.check_name(key, name, self._points, problem)
         size = getattr(item.schema.keys[key], "size", None)
         if len(names) < least or (size is not None and len(names) != size):
@@ -271,6 +274,7 @@ class _DrawingReader:
         self._plates: list[PlateShape] = []
         parts = [*self._read_plates(item), *self._read_tubes(item)]
         mass = item.number("mass") if "mass" in item else None
+        width = item.number("width") if "width" in item else 0.0
         bars = [bar for bars, _ in parts for bar in bars]
         if parts:
             body = sum_inertias(*(inertia for _, inertia in parts))
@@ -279,15 +283,15 @@ class _DrawingReader:
             if mass is None:  # the base does not move
                 is_base = name == self._section.text("base")
                 mass = 0.0 if is_base else self._estimate_mass(name, item, points)
-            body = spread_inertia(
-                mass, self._coordinates(points), item.number("width") if "width" in item else 0.0
-            )
+            body = spread_inertia(mass, self._coordinates(points), width)
         centre, tensor = body.lever, body.inertia
         if "centre" in item:
             centre = self._read_centre(item, placement or pin.SE3.Identity())
         if "inertia" in item:
             turn = np.eye(3) if placement is None else placement.rotation
             tensor = turn @ _read_tensor(item) @ turn.T
+        if not np.isfinite([body.mass, width, *centre, *tensor.ravel()]).all():
+            raise FollowUpError("a number of the body has been refused")
         return DrawnBody(
             points,
             tuple(bars or self._outline_bars(points)),

@@ -10,6 +10,7 @@ from crane.common.samples import Array
 from crane.common.units import display_unit
 from crane.ratings.capacity_report import capacity_facts, slew_labels
 from crane.ratings.drive_force_limits import drive_force_limits
+from crane.ratings.lift_charts import LiftChart
 from crane.ratings.lifting_capacity import Capacity
 from crane.view.page.html_document import filled_template, write_page
 from crane.view.plots.rating_figures import (
@@ -18,6 +19,7 @@ from crane.view.plots.rating_figures import (
     factor_colours,
     home_outlines,
     load_contours,
+    zone_lines,
 )
 from crane.view.sketches.mechanism_projection import machine_outline
 
@@ -26,11 +28,11 @@ _OUTLINE_RESOLUTION = 4000.0  # of the extent, to which outlines are rounded
 _SIGNIFICANT_DIGITS, _LOAD_DIGITS = 5, 7
 
 
-def write_capacity_page(chart: Capacity, path: str | Path) -> Path:
-    """Write a load chart as one self-contained HTML file.
+def write_capacity_page(chart: Capacity | LiftChart, path: str | Path) -> Path:
+    """Write a load chart or a lift chart as one self-contained HTML file.
 
     Args:
-        chart: Load chart; positions are thinned to 1500 per slew angle.
+        chart: The chart; positions are thinned to 1500 per slew angle.
         path: The file to write; replaced if it exists.
 
     Returns:
@@ -48,7 +50,7 @@ def write_capacity_page(chart: Capacity, path: str | Path) -> Path:
     )
 
 
-def capacity_page_data(chart: Capacity) -> dict[str, Any]:
+def capacity_page_data(chart: Capacity | LiftChart) -> dict[str, Any]:
     """Return the data of the page for JSON; outlines in multiples of `unit` metres."""
     lower, upper = drawing_extent(chart)
     unit = float((upper - lower).max()) / _OUTLINE_RESOLUTION
@@ -59,11 +61,15 @@ def capacity_page_data(chart: Capacity) -> dict[str, Any]:
     }
     max_count = int((~np.isnan(chart.loads)).sum(axis=(1, 2)).max())
     stride = max(int(np.ceil(np.sqrt(max_count / _MAX_CELLS))), 1)
+    places = chart.positions[::stride, ::stride]
+    ways = [np.abs(np.diff(places, axis=axis)).reshape(-1, 2) for axis in (0, 1)]
     shapes: dict[str, int] = {}
     cells, contours = [], []
     for k in range(len(chart.slews)):
         cells.append(_cell_rows(chart, k, stride, pressures, unit, shapes))
-        lines_by_load = load_contours(chart, k)
+        lines_by_load = (
+            zone_lines(chart, k) if isinstance(chart, LiftChart) else load_contours(chart, k)
+        )
         name, scale = display_unit("kg", max((load for load, _ in lines_by_load), default=0.0))
         contours.append(
             [
@@ -73,16 +79,13 @@ def capacity_page_data(chart: Capacity) -> dict[str, Any]:
             ]
         )
     return {
-        "facts": capacity_facts(chart),
+        "facts": chart.facts() if isinstance(chart, LiftChart) else capacity_facts(chart),
         "names": chart.section.coordinate_names,
         "slews": slew_labels(chart),
         "low": lower.tolist(),
         "high": upper.tolist(),
         "unit": unit,
-        "step": [
-            stride * float(np.diff(x).min()) if len(x) > 1 else 0.0
-            for x in (chart.radii, chart.heights)
-        ],
+        "step": np.nanmax(np.concatenate([np.zeros((1, 2)), *ways]), axis=0).tolist(),
         "causes": [str(cause) for cause in chart.limiting_factors],
         "tints": factor_colours(chart),
         "drives": [
@@ -104,7 +107,7 @@ def capacity_page_data(chart: Capacity) -> dict[str, Any]:
 
 
 def _cell_rows(
-    chart: Capacity,
+    chart: Capacity | LiftChart,
     k: int,
     stride: int,
     pressures: dict[str, Array],
@@ -114,7 +117,7 @@ def _cell_rows(
     """Return one row per position at a slew angle.
 
     Radius, height, load, limiting factor, loads by factor, strokes to 0.1 mm or deg, pressures by
-    joint, outline index.
+    joint, outline index; in lift charts the angle of the frame [deg].
     """
     machine, active = chart.machine, chart.machine.closure.active
     b, a = np.nonzero(~np.isnan(chart.loads[k])[::stride, ::stride])
@@ -128,8 +131,7 @@ def _cell_rows(
         shape = json.dumps([[_round_points(x, unit) for x in part] for part in parts])
         out.append(
             [
-                _rounded_or_none(chart.radii[j]),
-                _rounded_or_none(chart.heights[i]),
+                *map(_rounded_or_none, chart.positions[i, j]),
                 _rounded_or_none(chart.loads[k, i, j], _LOAD_DIGITS),
                 int(chart.limiting_factor_index[k, i, j]),
                 [_rounded_or_none(x, _LOAD_DIGITS) for x in chart.values_by_factor[k, i, j]],
@@ -141,6 +143,7 @@ def _cell_rows(
                     for joint in machine.active
                 ],
                 shapes.setdefault(shape, len(shapes)),
+                *([np.rad2deg(chart.angles[i, j])] if isinstance(chart, LiftChart) else []),
             ]
         )
     return out

@@ -140,10 +140,9 @@ def home_outlines(chart: RatingValues) -> list[MachineOutline]:
     return outlines
 
 
-def drawing_extent(chart: Capacity) -> tuple[Array, Array]:
+def drawing_extent(chart: Capacity | LiftChart) -> tuple[Array, Array]:
     """Return the lower and upper corner (2,) of the drawing [m]."""
-    b, a = np.nonzero(~np.isnan(chart.loads).all(axis=0))
-    reached = np.column_stack([chart.radii[a], chart.heights[b]])
+    reached = chart.positions[~np.isnan(chart.loads).all(axis=0)]
     all_points = np.concatenate([reached, *(x.points for x in home_outlines(chart))])
     margin = 0.03 * float(np.ptp(all_points, axis=0).max())
     return all_points.min(axis=0) - margin, all_points.max(axis=0) + margin
@@ -315,14 +314,20 @@ def _draw_zones(axes: Axes, chart: LiftChart, k: int) -> None:
     for line, angle in list(zip(np.swapaxes(chart.positions, 0, 1), chart.boom_angles(),
                                 strict=True))[:: _DENSE // 2]:  # fmt: skip
         axes.annotate(f" {np.rad2deg(angle):.0f}°", line[-1], fontsize=_LABEL_SIZE)
-    for edge, load, colour in zip(chart.zone_edges[k], chart.zones, CURVE_COLOURS, strict=False):
-        strokes = np.column_stack([chart.strokes[0, :, 0], edge])[np.isfinite(edge)]
-        if len(strokes):
-            places = chart.at_strokes(strokes[None]).positions[0]
-            axes.plot(*places.T, color=colour, linewidth=2.0, zorder=5)
-            axes.annotate(
-                f"{load:g} kg", places[len(places) // 4], ha="center", rotation=90, **style
-            )
+    for (load, [places]), colour in zip(zone_lines(chart, k), CURVE_COLOURS, strict=False):
+        axes.plot(*places.T, color=colour, linewidth=2.0, zorder=5)
+        axes.annotate(f"{load:g} kg", places[len(places) // 4], ha="center", rotation=90, **style)
+
+
+def zone_lines(chart: LiftChart, k: int) -> list[tuple[float, list[Array]]]:
+    """Return the edge (n, 2) of each zone at slew angle k by load [kg]; none over one stroke."""
+    edges = chart.zone_edges[k] if len(chart.over) > 1 else ()
+    rows = [np.column_stack([chart.strokes[0, :, 0], x])[np.isfinite(x)] for x in edges]
+    return [
+        (load, [chart.at_strokes(strokes[None]).positions[0]])
+        for load, strokes in zip(chart.zones, rows, strict=False)
+        if len(strokes)
+    ]
 
 
 _MAX_ARROWS = 12  # along the larger side

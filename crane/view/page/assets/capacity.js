@@ -2,7 +2,7 @@
 // A chart of rated loads: cells in the colour of what ends their load, contours, and the machine
 // in the posture of the cell under the cursor.
 const data = JSON.parse(document.getElementById("data").textContent);
-const [RADIUS, HEIGHT, LOAD, CAUSE, EACH, STROKES, PRESSURES, SHAPE] = [0, 1, 2, 3, 4, 5, 6, 7];
+const [RADIUS, HEIGHT, LOAD, CAUSE, EACH, STROKES, PRESSURES, SHAPE, ANGLE] = [0, 1, 2, 3, 4, 5, 6, 7, 8];
 const byId = (id) => document.getElementById(id);
 const chart = byId("chart");
 const EDGE = { left: 46, right: 10, top: 10, bottom: 38 };  // pixels around the chart
@@ -135,7 +135,8 @@ function row(kind, ...cells) {
 function show() {
   byId("cursor").replaceChildren(machine(here));
   const load = here[LOAD] === null ? kg(null) : `${kg(here[LOAD])} kg`;
-  const place = `at ${number(here[RADIUS])} m, ${data.names[1]} ${number(here[HEIGHT])} m`;
+  const angle = here.length > ANGLE ? `, angle ${number(+here[ANGLE].toFixed(1))}\u00b0` : "";
+  const place = `at ${number(here[RADIUS])} m, ${data.names[1]} ${number(here[HEIGHT])} m${angle}`;
   byId("load").replaceChildren(load, " ", make("small", {}, place));
   byId("why").textContent = data.causes[here[CAUSE]] ?? "";
   const order = here[EACH].map((x, k) => [x, k]).filter(([x]) => x !== null).sort((a, b) => a[0] - b[0]);
