@@ -19,9 +19,10 @@ from crane.export.c_sources import CSources
 from crane.simulation.integration.machine_code_stepper import RungeKuttaStepper
 
 STEPS, STEP, INTERVAL = 500, 1e-3, 0.01  # joints of the mini forwarder stick for 0.5 s
-NATIVE = ("-march=native", "-ffp-contract=fast")  # as CRANE_NATIVE of the CMakeLists.txt
+FLAGS = ("-fno-math-errno", "-fno-tree-slp-vectorize")  # as in the CMakeLists.txt
+NATIVE = ("-march=native", "-ffp-contract=fast", "-mtune=generic")  # as with its CRANE_NATIVE
 BUILDS = [
-    (*compiler, *flags, "-fno-math-errno")
+    (*compiler, *flags, *FLAGS)
     for flags in ((), NATIVE)
     for compiler in (("gcc", "-O2"), ("gcc", "-O3"), ("clang", "-O2"))
 ]

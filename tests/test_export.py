@@ -15,6 +15,7 @@ from scipy.interpolate import CubicHermiteSpline
 from warned import quiet
 
 import crane
+from crane.codegen.c_emitter import C_PRELUDE
 from crane.codegen.wasm_emitter import emit_wasm_module
 from crane.common.errors import InputError
 from crane.control import interpolate_references
@@ -235,6 +236,33 @@ def test_single_precision_keeps_its_digits(tmp_path, name):
     status, output = run(compiled(tmp_path, "m", "-O0", "-Dm_real=float"))
     assert status == 0, output
     assert 1e-9 < largest_relative_difference(output) < 1e-5
+
+
+@pytest.mark.parametrize("flags", [[], ["-march=native", "-ffp-contract=fast"]])
+def test_sines_in_c_are_exact_to_the_last_digits(tmp_path, flags):
+    """Against libm in long double, in units in the last place."""
+    if np.finfo(np.longdouble).eps > 1e-18 or not COMPILERS:
+        pytest.skip("no long double, or no compiler")
+    head = "#include <math.h>\n#include <string.h>\ntypedef double real;\n#define R(x) (real)(x)\n"
+    call = "void f(int n, const double *x, double *s, double *c, double *m)\n"
+    body = (
+        "{ while (n--) { s[n] = SIN(x[n]); c[n] = COS(x[n]); m[n] = maximum_of(x[n], 1.0); } }\n"
+    )
+    (tmp_path / "f.c").write_text(head + C_PRELUDE + call + body)
+    command = [COMPILERS[0], "-O2", "-std=c99", "-shared", "-fPIC", *flags, "f.c", "-o", "f.so"]
+    subprocess.run([*command, "-lm"], cwd=tmp_path, check=True)
+    x = np.concatenate([
+        np.random.default_rng(0).uniform(-size, size, 20_000) for size in (1.0, 1e3, 2.9e9)
+    ])  # fmt: skip
+    x = np.concatenate([x, [0.0, np.nan, np.inf, -4e9]])
+    found = np.empty((3, len(x)))
+    pointers = [ctypes.c_void_p(row.ctypes.data) for row in (x, *found)]
+    ctypes.CDLL(str(tmp_path / "f.so")).f(len(x), *pointers)
+    for values, function in zip(found, (np.sin, np.cos), strict=False):
+        exact = function(x[:-3].astype(np.longdouble))
+        assert (np.abs(values[:-3] - exact) <= 2.5 * np.spacing(np.abs(values[:-3]))).all()
+        assert np.isnan(values[-3:]).all()
+    np.testing.assert_array_equal(found[2], np.maximum(x, 1.0))
 
 
 def test_parameters_have_names_and_change_the_motion():

@@ -9,7 +9,9 @@ import crane
 from crane.control import ValveDrive, ValveSignals
 from crane.hydraulics.circuit_equations import CircuitEquations
 from crane.hydraulics.flow_equations import (
+    CHECK_VALVE_OPENING,
     LAMINAR_PRESSURE_DROP,
+    forward_drop,
     series_coefficient,
     signed_square_root,
 )
@@ -44,6 +46,16 @@ def test_root_is_exact_beyond_laminar_flow_and_smooth_within():
     assert max(slope) == pytest.approx(1.25 / np.sqrt(LAMINAR_PRESSURE_DROP), rel=1e-6)
     assert np.abs(np.diff(slope)).max() < 0.03 * max(slope)  # no kink
     assert signed_square_root(0.0) == 0.0
+
+
+def test_check_valves_open_smoothly_within_ten_pascals():
+    drops = np.linspace(-2.0, 2.0, 4001) * CHECK_VALVE_OPENING
+    found = np.array([forward_drop(float(d)) for d in drops])
+    outside = (drops <= 0) | (drops >= CHECK_VALVE_OPENING)
+    np.testing.assert_allclose(found[outside], np.maximum(drops, 0.0)[outside], rtol=1e-14)
+    slope = np.diff(found) / np.diff(drops)
+    assert slope[drops[1:] > 0].min() > 0
+    assert np.abs(np.diff(slope)).max() < 0.005 * slope.max()  # no kink
 
 
 @pytest.mark.parametrize("seed", range(20))

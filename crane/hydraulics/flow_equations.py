@@ -19,6 +19,7 @@ from crane.codegen.symbolic import (
 from crane.hydraulics.circuit_elements import TANK_NODE, CircuitElement
 
 LAMINAR_PRESSURE_DROP = 1.0e4  # pressure drop below which the flow of an orifice is smooth [Pa]
+CHECK_VALVE_OPENING = 10.0  # pressure drop over which a check valve opens [Pa]
 GAS_PRESSURE = 1.0e5  # reference pressure of volumes of entrapped gas [Pa]
 SENSING_OPENING_GAIN = 100.0  # one over the opening from which on the full load is sensed
 _EMPTY_SHARE = 1e-3  # share of the precharge or volume within which an accumulator runs empty
@@ -70,6 +71,19 @@ def signed_square_root(drop: Scalar) -> Scalar:
         - LAMINAR_PRESSURE_DROP**0.5
     )
     return cubic + copysign(turbulent, drop)
+
+
+def forward_drop(drop: Scalar) -> Scalar:
+    """Pressure drop that drives the flow through a check valve, 0 against it [Pa].
+
+    d beyond B = `CHECK_VALVE_OPENING`; from 0 to B, where the valve opens, the cubic that
+    continues it with equal derivatives, d (d / B) (2 - d / B). With a kink at 0, steps would
+    be the shorter, and depend on rounding, the stiffer a chamber is that rests at the pressure of
+    the tank.
+    """
+    share = clip(drop * (1.0 / CHECK_VALVE_OPENING), 0.0, 1.0)
+    opening = CHECK_VALVE_OPENING * share * share * (2.0 - share)
+    return opening + (maximum(drop, CHECK_VALVE_OPENING) - CHECK_VALVE_OPENING)
 
 
 def series_coefficient(orifice: Scalar, holding: Scalar | None, cushion: Scalar) -> Scalar:
@@ -263,7 +277,9 @@ def element_flow(
         openings: Openings y of the valves in both directions, by joint.
     """
     drop = pressures[element.source] - pressures[element.target]
-    if element.kind in ("check", "relief"):
+    if element.kind == "check":
+        drop = forward_drop(drop - constants["pressure"])
+    elif element.kind == "relief":
         drop = maximum(drop - constants["pressure"], 0.0)
     if element.kind in ("orifice", "check"):
         rate = constants["coefficient"] * signed_square_root(drop)

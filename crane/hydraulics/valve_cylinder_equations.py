@@ -13,6 +13,7 @@ from crane.hydraulics.flow_equations import (
     Flow,
     clip,
     directional_flow,
+    forward_drop,
     largest_of,
     series_coefficient,
     signed_square_root,
@@ -207,7 +208,7 @@ class ValveCylinderEquations:
                 constants["regeneration"] * self.requested_openings[0],
                 *self._outflow_restrictions(1),
             )
-            rate = orifice * signed_square_root(maximum(-difference, 0.0))
+            rate = orifice * signed_square_root(forward_drop(-difference))
             flows.append(Flow(node_b, node_a, self._limit_outflow(rate, 1), "regeneration"))
         if self.valve.float_from > 0:
             excess = -self._spool_positions[0] - self._constants["float_from"]
@@ -243,7 +244,7 @@ class ValveCylinderEquations:
                 rate = constants["relief_gain"] * maximum(p - constants["relief"], 0.0)
                 flows.append(Flow(node, TANK_NODE, rate, "relief"))
             if self._cylinder.refill > 0:
-                rate = constants["refill"] * signed_square_root(maximum(tank - p, 0.0))
+                rate = constants["refill"] * signed_square_root(forward_drop(tank - p))
                 flows.append(Flow(TANK_NODE, node, rate, "refill"))
         return flows
 

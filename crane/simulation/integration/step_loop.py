@@ -19,6 +19,9 @@ _MIN_TRIAL_SHARE = 0.02  # least share of a step that is tried to locate an even
 _SECANT_TRIALS = 24  # trials of the Illinois method before bisection
 _END_SHARE = 1.0 - 2.0**-41  # share of the remaining time from which a step ends at its goal
 
+_GRID_RATIO = 0.95  # of step sizes on the grid
+_GRID_SHARE = 1e-3  # least size on the grid, as a share of the output interval
+
 StepWriter = Callable[[RoutineValue, RoutineValue], None]
 """Writes code for a start time and a step size."""
 
@@ -145,7 +148,8 @@ class StepLoop:
         self._attempt_step(self._time, length)
         change = self.step_result["change"]
         # NaN: slower
-        next_length = r.new_variable(length * select(change > 0.0, change, MIN_STEP_RATIO))
+        ratio = select(change > 0.0, change, MIN_STEP_RATIO)
+        next_length = self._size_on_grid(r.new_variable(length * ratio))
         error = self.step_result["error"]
         # no step over a jump is short enough for its tolerance
         with r.if_then((error <= 1.0) | ((self._is_located > 0) & (error < _MAX_JUMP_ERROR))):
@@ -164,6 +168,20 @@ class StepLoop:
             r.store(r.h, 1, next_length)
             if self._event_distance_count:
                 self._detect_jump()
+
+    def _size_on_grid(self, proposed: RoutineValue) -> RoutineValue:
+        """The largest size on the grid up to a proposed one within the range of the grid.
+
+        Rounding errors of the error of a step thus hardly ever change the sizes of later ones.
+        """
+        r, interval = self.routine, self._output_interval
+        size, least = r.new_variable(interval), r.new_variable(interval * _GRID_SHARE)
+        with r.loop_forever():
+            with r.if_then((size <= proposed) | (size < least)):
+                r.break_loop()
+            r.assign(size, size * _GRID_RATIO)
+        is_inside = (proposed > least) & (proposed < interval)
+        return r.new_variable(select(is_inside, size, proposed))
 
     def _detect_jump(self) -> None:
         """Detect an event at which rates jump, in a step that has become short for that."""

@@ -132,6 +132,7 @@ function step() {
     if (holds) holdWeight();
     for (const [name, value] of Object.entries(inputs)) instance[given.inputs[name]] = value;
     status = machine.advance(HERE);
+    if (status === 1) instance[0] = given.interval * rows.length; // sums of intervals round
 }
 
 // Where the tip is: position, Jacobian and bias follow each other.
