@@ -16,7 +16,7 @@ from warned import quiet
 
 import crane
 from crane.codegen.c_emitter import C_PRELUDE
-from crane.codegen.wasm_emitter import emit_wasm_module
+from crane.codegen.llvm.wasm_emitter import emit_wasm_module
 from crane.common.errors import InputError
 from crane.control import interpolate_references
 from crane.control.force_inputs import ForceInputs

@@ -168,6 +168,15 @@ def test_files_are_valid(fmus, name):
     outputs = {x.variable.name: x.dependencies for x in found.outputs}
     stroke = "X1.stroke" if name == "mini_forwarder" else "X_lift.stroke"
     assert [x.name for x in outputs[stroke]] == [stroke]  # of itself alone: no algebraic loop
+    units = {x.name: x.unit for x in found.modelVariables}
+    if name == "patu655":  # a motor and a cylinder
+        wanted = {"slew.area_a": "m3/rad", "slew.stroke": "rad", "X_lift.area_a": "m2"}
+        wanted |= {"X_lift.stroke_": "m", "X_lift.per_stroke": None, "common_hose": None}
+        assert {x: units[x] for x in wanted} == wanted
+    sources = os.path.join(fmpy.extract(str(path)), "sources")
+    for compiler in filter(shutil.which, ("gcc", "clang")):
+        command = [compiler, *STRICT[:-2], "-fsyntax-only", "fmu.c"]
+        subprocess.run(command, cwd=sources, check=True, timeout=60)
     members = zipfile.ZipFile(path).namelist()
     assert {"sources/fmu.c", "documentation/index.html", "modelDescription.xml"} <= {*members}
 

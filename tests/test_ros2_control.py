@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,18 @@ HEADERS = (
     "pluginlib/class_list_macros.hpp", "transmission_interface/exception.hpp",
     "transmission_interface/transmission.hpp", "transmission_interface/transmission_loader.hpp",
 )  # fmt: skip
-needs_compiler = pytest.mark.skipif(not shutil.which("g++"), reason="no C++ compiler is here")
+CASADI = find_spec("casadi")  # whose wheel has Eigen, as ROS has
+EIGEN = [
+    folder / "eigen3"
+    for folder in (
+        Path("/usr/include"),
+        *(Path(x) / "include" for x in (CASADI and CASADI.submodule_search_locations) or ()),
+    )
+    if (folder / "eigen3").is_dir()
+]
+needs_compiler = pytest.mark.skipif(
+    not (shutil.which("g++") and EIGEN), reason="no C++ compiler with Eigen is here"
+)
 
 
 class Plugin:
@@ -32,7 +44,8 @@ class Plugin:
             (folder / header).write_text('#include "interface.hpp"\n')
         strict = ["-Wall", "-Wextra", "-Werror", "-pedantic", "-O1"]
         subprocess.run(["gcc", "-std=c99", *strict, "-c", "m.c"], cwd=folder, check=True)
-        command = ["g++", "-std=c++17", *strict, f"-I{DATA}", "-I.", "m_transmission.cpp", "m.o"]
+        folders = [f"-I{DATA}", "-I.", "-isystem", str(EIGEN[0])]
+        command = ["g++", "-std=c++17", *strict, *folders, "m_transmission.cpp", "m.o"]
         subprocess.run([*command, str(DATA / "run.cpp"), "-o", "run"], cwd=folder, check=True)
         self.machine, self.folder = machine, folder
 

@@ -83,6 +83,21 @@ class LinkedFunction:
         return frozenset(found & {*self.function.arguments})
 
     @cached_property
+    def formula_lengths(self) -> dict[str, int]:
+        """Operations of the formulas that it is or calls, by name."""
+        if isinstance(self.function, Formula):
+            return {self.name: len(self.function.order)}
+        return {k: n for x in self.callees.values() for k, n in x.formula_lengths.items()}
+
+    @cached_property
+    def stack_numbers(self) -> int:
+        """Most elements of local arrays of routines, while it is executed."""
+        if isinstance(self.function, Formula):
+            return 0
+        inner = max((x.stack_numbers for x in self.callees.values()), default=0)
+        return sum(self.function.local_arrays.values()) + inner
+
+    @cached_property
     def loads(self) -> dict[str, frozenset[int]]:
         """Elements that formulas read, which it is or calls, by array argument."""
         found: dict[str, set[int]] = {}

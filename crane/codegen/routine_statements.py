@@ -82,6 +82,11 @@ def select(condition: RoutineValue, if_true: Operand, if_false: Operand) -> Rout
     )
 
 
+def magnitude(value: RoutineValue) -> RoutineValue:
+    """Absolute value."""
+    return select(value < 0.0, value * -1.0, value)
+
+
 @dataclass(frozen=True, eq=False)
 class ArrayPointer:
     """Position in an argument or local array of a routine, or a function argument.

@@ -48,6 +48,10 @@ class Layout:
         """Index of a part's first element."""
         return int(self._slices[name].start)
 
+    def indices(self, name: str) -> range:
+        """Indices of a part's elements."""
+        return range(self._slices[name].start, self._slices[name].stop)
+
     def view(self, array: Any) -> "LayoutView":
         """The parts of an array (..., size) or of a sequence, by name."""
         return LayoutView(self, array)

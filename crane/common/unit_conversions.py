@@ -7,7 +7,7 @@ offset: whether one is absolute is said of the key, not by the unit; temperature
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from decimal import Context, Decimal
 from fractions import Fraction
 from functools import cache
@@ -225,6 +225,12 @@ def _registry() -> Any:
     registry: Any = pint.UnitRegistry(None, non_int_type=Fraction, cache_folder=None)
     registry.load_definitions(UNIT_DEFINITIONS.strip().splitlines())
     return registry
+
+
+def unit_dimension(unit: str) -> Mapping[str, float] | None:
+    """Exponents of a unit's dimension, of "[mass]" and so on; None of one that is not known."""
+    found = _dimension(unit)
+    return None if found is None else found[1]
 
 
 @cache

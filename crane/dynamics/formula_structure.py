@@ -166,3 +166,11 @@ class FormulaStructure:
             first + PARAMETER_COUNT * i + k for i in self.stick_slip_columns for k in range(3)
         ]
         return [*modes, layout.start_index("moving_factor")]
+
+    @property
+    def tip_inertia(self) -> range:
+        """Indices in `dynamics_constants` of the inertia of the tip's body; none on the world."""
+        if not self.tip_body:
+            return range(0)
+        start = self.constants_layout.start_index("inertias") + BODY_SIZE * (self.tip_body - 1)
+        return range(start, start + BODY_SIZE)

@@ -1,8 +1,10 @@
 """C99 sources of a machine: header, functions, self-test with recorded vectors, examples."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
+from functools import cached_property
 from importlib.resources import files
+from itertools import groupby
 from pathlib import Path
 from types import MappingProxyType
 
@@ -11,7 +13,6 @@ import numpy as np
 import crane
 from crane.codegen.c_emitter import C_PRELUDE, c_parameters, emit_c_function
 from crane.codegen.linked_functions import LinkedFunction
-from crane.codegen.vector_layout import Formula
 from crane.common.atomic_output import check_folder_is_writable, replace_folder
 from crane.common.samples import Array
 from crane.control.control_law import Controller
@@ -19,7 +20,7 @@ from crane.control.valve_commands import ValveCommand
 from crane.export.instance_program import InstanceProgram
 from crane.export.instance_routines import STATUS_TEXTS
 from crane.export.kinematics_program import KinematicsProgram
-from crane.export.recorded_values import random_vectors, recorded_motion
+from crane.export.recorded_values import TEST_STEP, random_vectors, recorded_motion
 from crane.formats.machine_loading import load
 from crane.machine.machine import Machine
 
@@ -116,15 +117,15 @@ def write_texts(folder: str | Path, texts: Mapping[str, str], overwrite: bool) -
     return Path(folder)
 
 
-class FunctionSources:
-    """Header and functions of a machine in C.
+class CSources:
+    """The C sources of a machine.
 
     Args:
         program: The machine as a program.
         name: Prefix of all public names; that of the machine by default.
     """
 
-    def __init__(self, program: InstanceProgram | KinematicsProgram, name: str = ""):
+    def __init__(self, program: KinematicsProgram, name: str = ""):
         self._program, self.name = program, c_identifier(name or program.machine.name)
         self._values = [
             c_number(x)
@@ -136,68 +137,49 @@ class FunctionSources:
     def fill(self, template: str, further: Mapping[str, str] = MappingProxyType({})) -> str:
         """The text of a template with the values of the machine in place of @VALUE@."""
         text = (files("crane.export") / "templates" / f"{template}.template").read_text("utf-8")
-        machine, inputs = self._program.machine, _inputs_of(self._program)
+        machine, inputs = self._program.machine, self._program.layout.indices("inputs")
         values = {
             "NAME": self.name, "UPPER": self.name.upper(), "MACHINE": machine.name,
             "VERSION": crane.__version__, "NQ": str(machine.model.nv),
             "N": str(len(machine.active)), "INPUT_COUNT": str(len(inputs)),
-            "FIRST_INPUT": self.members()[inputs[0]] if inputs else "time",
+            "FIRST_INPUT": self._first_input(),
             "OUTPUTS": str(self._program.output_count), **further,
         }  # fmt: skip
         return re.sub(r"@([A-Z_]+)@", lambda match: values[match[1]], text)
 
-    def members(self) -> dict[int, str]:
-        """Member of the struct for each element of an instance."""
-        found: dict[int, str] = {}
-        taken: set[str] = {*_ARRAYS}
-        for part, size in self._program.layout.parts.items():
-            start = self._program.layout.start_index(part)
-            for i in range(size):
-                if part in _ARRAYS:
-                    found[start + i] = f"{part}[{i}]"
-                    continue
-                name = c_identifier(self._program.names[start + i])
-                while name in taken:
-                    name += "_"
-                taken.add(name)
-                found[start + i] = name
+    @cached_property
+    def _members(self) -> dict[str, list[int]]:
+        """Elements of each member of the struct; arrays have brackets in their names."""
+        program, found = self._program, dict[str, list[int]]()
+        parts = [part for part, size in program.layout.parts.items() for _ in range(size)]
+
+        def array_name(i: int) -> str:
+            is_unused = parts[i] in _PARAMETERS and i not in program.loads
+            return parts[i] if parts[i] in _ARRAYS else "unused" if is_unused else f"{i}"
+
+        for array, group in groupby(range(program.layout.size), array_name):
+            indices = [*group]
+            name = f"{array}[{len(indices)}]"
+            if array == "unused":
+                name = f"unused_{indices[0]}[{len(indices)}]"
+            elif array not in _ARRAYS:
+                name = c_identifier(program.names[indices[0]])
+            while name in found or name in _ARRAYS:
+                name += "_"
+            found[name] = indices
         return found
 
-    def _struct_lines(self) -> Iterator[tuple[str, str]]:
-        """Declaration of each member, and the initial values."""
-        members, layout = self.members(), self._program.layout
-        unused: list[int] = []
-
-        def padding() -> Iterator[tuple[str, str]]:
-            if unused:
-                values = ", ".join(self._values[i] for i in unused)
-                yield f"{self.name}_real unused_{unused[0]}[{len(unused)}];", f"{{{values}}}"
-                unused.clear()
-
-        for part, size in layout.parts.items():
-            start = layout.start_index(part)
-            if part in _ARRAYS:
-                yield from padding()
-                if size:
-                    values = ", ".join(self._values[start : start + size])
-                    yield f"{self.name}_real {part}[{size}];", f"{{{values}}}"
-                continue
-            for i in range(start, start + size):
-                if part in _PARAMETERS and i not in self._program.loads:
-                    unused.append(i)
-                    continue
-                yield from padding()
-                unit = self._program.units[i]
-                comment = f" /* {unit} */" if unit else ""
-                yield f"{self.name}_real {members[i]};{comment}", self._values[i]
-        yield from padding()
+    def _first_input(self) -> str:
+        """Member of the first input; the time where there is none."""
+        inputs = self._program.layout.indices("inputs")
+        return next((name for name, (i, *_) in self._members.items() if i in inputs), "time")
 
     def header(self) -> str:
         """The header."""
         program, upper = self._program, self.name.upper()
         machine, prototypes = program.machine, []
         for entry, linked in program.entries.items():
-            operations, memory = _costs(linked)
+            operations, memory = sum(linked.formula_lengths.values()), 8 * linked.stack_numbers
             cost = f"{operations} operations where nothing is repeated, arrays of {memory} bytes."
             text = "\n * ".join([*_TEXTS[entry].split("\n"), cost])
             prototypes.append(f"/* {text} */\n{self._prototype(entry, linked)};")
@@ -206,10 +188,18 @@ class FunctionSources:
             "STATUSES": "\n".join(f" *  {code}: {text}" for code, text in STATUS_TEXTS.items()),
             "ACTIVE": ", ".join(map(str, machine.closure.active.tolist())),
             "JOINTS": joints,
-            "MEMBERS": _join([line for line, _ in self._struct_lines()]),
+            "MEMBERS": _join(map(self._declaration, self._members)),
             "PROTOTYPES": "\n".join(prototypes),
         }
         return self.fill("machine.h", values)
+
+    def _declaration(self, member: str) -> str:
+        unit = "" if member.endswith("]") else self._program.units[self._members[member][0]]
+        return f"{self.name}_real {member};{f' /* {unit} */' if unit else ''}"
+
+    def _initial_value(self, member: str) -> str:
+        values = ", ".join(self._values[i] for i in self._members[member])
+        return f"{{{values}}}," if member.endswith("]") else f"{values},"
 
     def _prototype(self, entry: str, linked: LinkedFunction) -> str:
         real, parameters = f"{self.name}_real", c_parameters(linked).replace("real *", "@*")
@@ -227,26 +217,13 @@ class FunctionSources:
             wrappers.append(f"{self._prototype(entry, linked)}\n{{\n    {call}\n}}\n")
         values = {
             "FUNCTIONS": "\n".join([C_PRELUDE, *map(emit_c_function, self._program.functions)]),
-            "DEFAULTS": _join([f"{value}," for _, value in self._struct_lines()]),
+            "DEFAULTS": _join(map(self._initial_value, self._members)),
             "WRAPPERS": "\n".join(wrappers),
         }
         return self.fill("machine.c", values)
 
-
-class CSources(FunctionSources):
-    """The C sources of a machine.
-
-    Args:
-        program: The machine as a program.
-        name: Prefix of all public names; that of the machine by default.
-    """
-
-    def __init__(self, program: InstanceProgram, name: str = ""):
-        super().__init__(program, name)
-        self._instance_program = program
-
     def files(self) -> dict[str, str]:
-        """Texts of all files by name."""
+        """Texts of all files of an `InstanceProgram` by name."""
         name = self.name
         found = {
             f"{name}.h": self.header(),
@@ -259,35 +236,32 @@ class CSources(FunctionSources):
 
     def test(self) -> str:
         """A program that compares the functions with recorded values of crane."""
-        program, name = self._instance_program, self.name
-        vectors, motion = random_vectors(program), recorded_motion(program)
+        program, name = self._program, self.name
+        assert isinstance(program, InstanceProgram)
+        vectors, (inputs, motion) = random_vectors(program), recorded_motion(program)
         sizes = {key: rows[0].size for key, rows in vectors.values.items()}
         checks, bounds = [], {}
         for key, rows in vectors.values.items():
             # rounding errors of n operations grow as sqrt(n) where they are independent
-            growth = np.sqrt(_costs(program.entries[key])[0])
+            growth = np.sqrt(sum(program.entries[key].formula_lengths.values()))
             bounds[f"bound_of_{key}"] = growth * vectors.changes[key]
             scale = c_number(float(np.abs(rows).max()) or 1.0)
             arguments = f'"{key}", found, {key}[i], {sizes[key]}, {scale}, bound_of_{key}[i][0]'
             checks += [f"{name}_{key}(&m, q, v, x, found);", f"compare({arguments});"]
-        inputs = _inputs_of(program)
-        set_inputs = f"for (j = 0; j < {len(inputs)}; ++j)\n            " + (
-            f"(&m.{self.members()[inputs[0]]})[j] = ({name}_real)inputs[i][j];" if inputs else ";"
+        set_inputs = f"for (j = 0; j < {inputs.shape[1]}; ++j)\n            " + (
+            f"(&m.{self._first_input()})[j] = ({name}_real)inputs[i][j];" if inputs.size else ";"
         )
-        tables = {
-            **vectors.states, **vectors.values, **bounds, "inputs": motion.inputs,
-            "motion": motion.q,
-        }  # fmt: skip
+        tables = vectors.states | vectors.values | bounds | {"inputs": inputs, "motion": motion}
         values = {
             "TABLES": "\n".join(_table(key, np.array(rows)) for key, rows in tables.items()),
-            "STATES": str(len(vectors.states["second"])), "STEPS": str(len(motion.q)),
-            "STEP": repr(motion.step), "LARGEST": str(max(sizes.values())),
+            "STATES": str(len(vectors.states["second"])), "STEPS": str(len(motion)),
+            "STEP": repr(TEST_STEP), "LARGEST": str(max(sizes.values())),
             "CHECKS": "\n        ".join(checks), "SET_INPUTS": set_inputs,
         }  # fmt: skip
         return self.fill("self_test.c", values)
 
 
-def _join(lines: list[str]) -> str:
+def _join(lines: Iterable[str]) -> str:
     return "\n    ".join(lines)
 
 
@@ -299,26 +273,6 @@ def c_number(value: float) -> str:
 def c_numbers(values: Iterable[float]) -> str:
     """Numbers of C in a list."""
     return ", ".join(map(c_number, values))
-
-
-def _inputs_of(program: InstanceProgram | KinematicsProgram) -> range:
-    start = program.layout.start_index("inputs")
-    return range(start, start + program.layout.parts["inputs"])
-
-
-def _costs(linked: LinkedFunction) -> tuple[int, int]:
-    """Operations of all formulas that are called, each once, and bytes of arrays on the stack."""
-    seen: dict[str, int] = {}
-
-    def memory(function: LinkedFunction) -> int:
-        if isinstance(function.function, Formula):
-            seen[function.name] = len(function.function.order)
-            return 0
-        own = 8 * sum(function.function.local_arrays.values())
-        return own + max((memory(x) for x in function.callees.values()), default=0)
-
-    size = memory(linked)
-    return sum(seen.values()), size
 
 
 def _table(name: str, rows: Array) -> str:

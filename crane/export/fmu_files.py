@@ -3,7 +3,6 @@
 import hashlib
 import warnings
 import zipfile
-from functools import cached_property
 from html import escape
 from math import inf
 from pathlib import Path
@@ -16,19 +15,7 @@ from crane.control.control_law import Controller
 from crane.control.valve_commands import ValveCommand
 from crane.export.c_sources import CSources, c_numbers
 from crane.export.fmu_libraries import PLATFORMS, compile_libraries, library_compilers
-from crane.export.fmu_variables import (
-    FIXED,
-    GUESS,
-    INPUT,
-    LOCAL,
-    OUTPUT,
-    STATE_START,
-    TIME,
-    TUNABLE,
-    FmuVariable,
-    FmuVariables,
-    base_unit,
-)  # fmt: skip
+from crane.export.fmu_variables import FmuVariable, FmuVariables, base_unit
 from crane.export.instance_program import InstanceProgram
 from crane.export.instance_routines import STATUS_TEXTS
 from crane.formats.machine_loading import load
@@ -38,23 +25,15 @@ from crane.simulation.integration.stick_slip_modes import EVENT_TOLERANCE
 
 VERSIONS = ("3", "2")
 _DATE = (1980, 1, 1, 0, 0, 0)  # of all members, so that equal machines give equal files
-_ATTRIBUTES = {
-    TIME: {"causality": "independent", "variability": "continuous"},
-    INPUT: {"causality": "input", "variability": "continuous"},
-    TUNABLE: {"causality": "parameter", "variability": "tunable"},
-    FIXED: {"causality": "parameter", "variability": "fixed"},
-    STATE_START: {"causality": "output", "variability": "continuous", "initial": "exact"},
-    GUESS: {"causality": "output", "variability": "continuous", "initial": "approx"},
-    OUTPUT: {"causality": "output", "variability": "continuous", "initial": "calculated"},
-    LOCAL: {"causality": "local", "variability": "continuous", "initial": "calculated"},
-}
 # words of C that differ between the versions
 _WORDS = {
     3: {"FLAG": "bool", "STATE": "State", "DESERIALIZE": "DeserializeFMUState",
         "GET_DERIVATIVES": "GetContinuousStateDerivatives", "LOGGER_NAME": "",
+        "REAL": "Float64", "BEGIN": "EnterInitializationMode",
         "LOGGER": "int, const char *, const char *"},
     2: {"FLAG": "int", "STATE": "state", "DESERIALIZE": "DeSerializeFMUstate",
-        "GET_DERIVATIVES": "GetDerivatives", "LOGGER_NAME": "c->name, ",
+        "GET_DERIVATIVES": "GetDerivatives", "LOGGER_NAME": "c->name, ", "REAL": "Real",
+        "BEGIN": "SetupExperiment",
         "LOGGER": "const char *, int, const char *, const char *, ..."},
 }  # fmt: skip
 
@@ -104,7 +83,7 @@ def write_fmu(
             stacklevel=2,
         )
     files = FmuFiles(program, fmi)
-    members = files.texts(about) | files.icon_members(icon)
+    members = files.members(icon, about)
     for key, library in compile_libraries(compilers, files.sources, files.name).items():
         platform = PLATFORMS[key]
         folder = key if fmi == 3 else platform.name_in_fmi2
@@ -133,60 +112,47 @@ class FmuFiles:
         self._program, self._fmi, self._c = program, fmi, CSources(program)
         self._values, self.name = FmuVariables(program), self._c.name
         self._variables = self._values.variables
+        self._places = {x.reference: i for i, x in enumerate(self._variables, start=1)}
         self.sources = {f"{self.name}.h": self._c.header(), f"{self.name}.c": self._c.source()}
         self._names = [f'[{x.reference}] = "{x.kind}{x.name}",' for x in self._variables]
         text = "".join((crane.__version__, str(fmi), *self.sources.values(), *self._names))
         self._token = hashlib.sha256(text.encode()).hexdigest()
         self.sources["fmu.c"] = self._runtime()
         self._source_files = ("fmu.c", f"{self.name}.c")
-        self._has_derivatives = "directional_derivatives" in program.entries
 
-    def texts(self, about: str) -> dict[str, str | bytes]:
-        """Contents of all text files by path; see `write_fmu`."""
+    def members(self, icon: bytes, about: str) -> dict[str, str | bytes]:
+        """Contents of all files by path, without libraries; see `write_fmu`."""
         found: dict[str, str | bytes] = {
             "modelDescription.xml": self.description(),
             "documentation/index.html": self._documentation(about),
             **{f"sources/{name}": text for name, text in self.sources.items()},
         }
         if self._fmi == 2:
-            return found
+            return found | ({"model.png": icon} if icon else {})
         root = ET.Element("fmiBuildDescription", fmiVersion="3.0")
         build = ET.SubElement(root, "BuildConfiguration", modelIdentifier=self.name)
         files = ET.SubElement(build, "SourceFileSet", language="C99")
-        for name in self._source_files:
-            ET.SubElement(files, "SourceFile", name=name)
+        files.extend(ET.Element("SourceFile", name=name) for name in self._source_files)
         found["sources/buildDescription.xml"] = _xml(root)
+        if icon:
+            root = ET.Element("fmiTerminalsAndIcons", fmiVersion="3.0")
+            picture = ET.SubElement(root, "GraphicalRepresentation")
+            corners = {"x1": "-100", "y1": "-100", "x2": "100", "y2": "100"}
+            ET.SubElement(picture, "CoordinateSystem", corners, suggestedScalingFactorTo_mm="0.1")
+            ET.SubElement(picture, "Icon", corners)
+            found["terminalsAndIcons/terminalsAndIcons.xml"] = _xml(root)
+            found["terminalsAndIcons/icon.png"] = icon
         return found
-
-    def icon_members(self, icon: bytes) -> dict[str, str | bytes]:
-        """Contents of the files of an icon by path."""
-        if not icon or self._fmi == 2:
-            return {"model.png": icon} if icon else {}
-        root = ET.Element("fmiTerminalsAndIcons", fmiVersion="3.0")
-        picture = ET.SubElement(root, "GraphicalRepresentation")
-        corners = {"x1": "-100", "y1": "-100", "x2": "100", "y2": "100"}
-        ET.SubElement(picture, "CoordinateSystem", corners, suggestedScalingFactorTo_mm="0.1")
-        ET.SubElement(picture, "Icon", corners)
-        folder = "terminalsAndIcons"
-        return {f"{folder}/terminalsAndIcons.xml": _xml(root), f"{folder}/icon.png": icon}
 
     def _runtime(self) -> str:
         """The C source between the functions of FMI and those of the machine."""
         values, program, machine = self._values, self._program, self._program.machine
         layout, events = values.layout, program.routines.event_parts
-        starts = {
-            name.upper(): layout.start_index(name)
-            for name in ("time", "step", "inputs_start", "inputs", "q", "lengths", "cursor",
-                         "derivatives", "event", "tip_position", "unladen", "payload", "delays",
-                         "history")
-        }  # fmt: skip
-        indices = starts | {
-            "SIZE": layout.size, "INPUT_COUNT": layout.parts["inputs"],
-            "STATE_SIZE": program.chart.state_layout.size,
-            "OUTPUT_SIZE": program.chart.output_layout.size,
-            "CURSOR_SIZE": layout.parts["cursor"], "EVENT_SIZE": layout.parts["event"],
-            "TIP_SIZE": layout.parts["tip_position"], "HAS_MARGIN": int("margin" in events),
-            "UNLADEN_SIZE": layout.parts["unladen"],
+        indices = {
+            "SIZE": layout.size, "STATE_SIZE": program.chart.state_layout.size,
+            "OUTPUT_SIZE": program.output_count, "HAS_MARGIN": int("margin" in events),
+            **{x.upper(): layout.start_index(x) for x in layout.parts},
+            **{f"{x.upper()}_SIZE": size for x, size in layout.parts.items()},
         }  # fmt: skip
         stubs = {
             "event_indicators": "(m, x) 1", "tip": "(m, q, v, tip) ((void)(m), 1)",
@@ -226,7 +192,8 @@ class FmuFiles:
         abilities = {
             "modelIdentifier": self.name, f"canGetAndSet{state}": "true",
             f"canSerialize{state}": "true",
-            f"providesDirectionalDerivative{end}": str(self._has_derivatives).lower(),
+            f"providesDirectionalDerivative{end}":
+                str("directional_derivatives" in self._program.entries).lower(),
         }  # fmt: skip
         steps = {"canHandleVariableCommunicationStepSize": "true"}
         steps |= {"canInterpolateInputs": "true"} if fmi == 2 else {}
@@ -251,9 +218,9 @@ class FmuFiles:
 
     def _add_variable(self, parent: ET.Element, variable: FmuVariable) -> None:
         attributes = {"name": variable.name, "valueReference": str(variable.reference)}
-        attributes |= _ATTRIBUTES[variable.kind]
+        attributes |= variable.attributes
         number = {"unit": variable.unit} if variable.unit else {}
-        if variable.kind in (INPUT, TUNABLE, FIXED, STATE_START, GUESS):
+        if variable.has_start:
             number["start"] = repr(variable.start)
         if variable.state >= 0:
             number["derivative"] = self._index(variable.state)
@@ -266,27 +233,22 @@ class FmuFiles:
         """What names a variable: its value reference, in FMI 2 its place from 1 on."""
         return str(reference if self._fmi == 3 else self._places[reference])
 
-    @cached_property
-    def _places(self) -> dict[int, int]:
-        return {x.reference: i for i, x in enumerate(self._variables, start=1)}
-
     def _add_structure(self, structure: ET.Element) -> None:
+        outputs = [x for x in self._variables if x.attributes["causality"] == "output"]
         derivatives = [x for x in self._variables if x.state >= 0]
-        states = {x.state for x in derivatives}
+        computed = {x.reference for x in [*outputs, *derivatives]} | {x.state for x in derivatives}
         unknowns = {
-            "Output": [x for x in self._variables if x.kind in (STATE_START, GUESS, OUTPUT)],
+            "Output": outputs,
             "ContinuousStateDerivative": derivatives,
             "InitialUnknown": [
                 x for x in self._variables
-                if x.kind in (GUESS, OUTPUT) or x.state >= 0
-                or (x.kind == LOCAL and x.reference in states)
+                if x.reference in computed and x.attributes["initial"] != "exact"
             ],
             "EventIndicator": [x for x in self._variables if x.name.startswith("event_indicator")],
         }  # fmt: skip
         names = {"Output": "Outputs", "ContinuousStateDerivative": "Derivatives",
                  "InitialUnknown": "InitialUnknowns"}  # fmt: skip
-        kinds = unknowns if self._fmi == 3 else names
-        for kind in kinds:
+        for kind in unknowns if self._fmi == 3 else names:
             parent = structure if self._fmi == 3 else ET.SubElement(structure, names[kind])
             for variable in unknowns[kind]:
                 self._add_unknown(parent, kind, variable)
@@ -300,17 +262,10 @@ class FmuFiles:
         ET.SubElement(parent, kind if self._fmi == 3 else "Unknown", given)
 
     def _documentation(self, about: str) -> str:
-        rows = "".join(
-            f"<tr><td>{escape(x.name)}</td><td>{x.unit}</td>"
-            f"<td>{_ATTRIBUTES[x.kind]['causality']}</td><td>{x.start:.6g}</td></tr>\n"
-            for x in self._variables
-        )
         title = escape(self._program.machine.name)
         return (
             f'<!DOCTYPE html><html><head><meta charset="utf-8"><title>{title}</title></head><body>'
-            f"<h1>{title}</h1>{about}<p>Written by crane {crane.__version__}.</p><table>"
-            f"<tr><th>variable</th><th>unit</th><th>kind</th><th>start</th></tr>\n{rows}</table>"
-            "</body></html>\n"
+            f"<h1>{title}</h1>{about}<p>Written by crane {crane.__version__}.</p></body></html>\n"
         )
 
 

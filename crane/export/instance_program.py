@@ -29,8 +29,8 @@ from crane.dynamics.formula_structure import BODY_SIZE, FormulaStructure
 from crane.dynamics.joint_forces import LAW_PARAMETER_NAMES, PARAMETER_COUNT
 from crane.export.dead_times import dead_time_row
 from crane.export.instance_routines import InstanceRoutines
-from crane.export.kinematics_program import SINGLE_PRECISION_BOUNDS, LinkedProgram, check_formulas
-from crane.export.parameter_names import parameter_names
+from crane.export.kinematics_program import KinematicsProgram, compiled_loops
+from crane.export.parameter_names import instance_elements, named_elements
 from crane.machine.machine import Machine
 from crane.motion.frame_kinematics import CompiledFrame
 from crane.simulation.integration.charts import Chart
@@ -95,7 +95,7 @@ def _exported_control(
     return control
 
 
-class InstanceProgram(LinkedProgram):
+class InstanceProgram(KinematicsProgram):
     """A machine with its drives as one program.
 
     The inputs are the forces of the drives [N], [N m], or the signals at the valves [V] of a
@@ -117,6 +117,7 @@ class InstanceProgram(LinkedProgram):
         control: What turns the inputs into forces.
         chart: The machine with `control`.
         stepper: The method of `advance`.
+        quantities: Its quantities by routine.
         layout: Parts of an instance.
         names: Name of each element of an instance.
         units: Unit of each.
@@ -151,12 +152,11 @@ class InstanceProgram(LinkedProgram):
         is_valve_drive = isinstance(control, ValveDrive)
         self._stepper_class = RosenbrockStepper if is_valve_drive else DormandPrinceStepper
         self.stepper = self._make_stepper(self.chart)
-        self._quantities = {name: DYNAMICS_ROUTINES[name] for name in quantities}
-        self._nq, self._n = machine.model.nv, len(machine.active)
-        self._k = len(self.chart.stick_slip.columns)
+        self.quantities = {name: DYNAMICS_ROUTINES[name] for name in quantities}
         self._closure = machine.closure.compiled_closure
         self.layout = self._make_layout()
-        self.names, self.units = parameter_names(self)
+        self.output_count = self.chart.output_layout.size
+        self.names, self.units = named_elements(self.layout, instance_elements(self))
         self.defaults = self._default_instance(self.chart)
         self.variant_defaults = []
         for other in others:  # of the same formulas
@@ -185,7 +185,7 @@ class InstanceProgram(LinkedProgram):
             geometry=self._closure.geometry.constants.size,
             dynamics=self.chart.dynamics.formula_constants.size,
             settings=control.settings.size, delays=spools, history=rows * dead_time_row(spools),
-            unladen=BODY_SIZE if _tip_inertia(self.chart.dynamics.formula_structure) else 0,
+            unladen=BODY_SIZE if self.chart.dynamics.formula_structure.tip_inertia else 0,
         )  # fmt: skip
 
     def _default_instance(self, chart: Chart) -> Array:
@@ -205,22 +205,21 @@ class InstanceProgram(LinkedProgram):
         smoothed = sorted({*machine.closure.active.tolist()} - {*structure.stick_slip_columns})
         sharpness = _law_indices(structure, smoothed, "sharpness")
         at.dynamics[sharpness] = np.minimum(at.dynamics[sharpness], _SHARPNESS)
-        at.unladen[:] = at.dynamics[_tip_inertia(structure)]
+        at.unladen[:] = at.dynamics[structure.tip_inertia]
         references = chart.control.references(np.zeros(1))[0]
         at.inputs[: len(references)] = at.inputs_start[: len(references)] = references
         if at.delays.size:
             at.delays[:] = chart.control.delays
             calls = at.history.reshape(-1, dead_time_row(at.delays.size))
-            calls[1:, 0], calls[0, 1:] = np.inf, np.tile(references, 2)
+            calls[:, 0], calls[:, 1:] = np.arange(1 - len(calls), 1), np.tile(references, 2)
         return values
 
-    @cached_property
+    @property
     def single_precision_defaults(self) -> Array:
         """`defaults` with tolerances that single precision reaches."""
-        values = self.defaults.copy()
-        at = self.layout.view(values)
-        at.bounds[:3] *= SINGLE_PRECISION_BOUNDS
-        at.tolerances[:] = self._stepper_class(self.chart, SINGLE_PRECISION_TOLERANCE).tolerance
+        values = super().single_precision_defaults
+        stepper = self._stepper_class(self.chart, SINGLE_PRECISION_TOLERANCE)
+        self.layout.view(values).tolerances[:] = stepper.tolerance
         return values
 
     @cached_property
@@ -230,14 +229,15 @@ class InstanceProgram(LinkedProgram):
         return None if tip is None else CompiledFrame(self.machine, self.machine.frame(tip))
 
     @cached_property
-    def _programs(self) -> dict[str, Program]:
-        """Programs of the parts of the machine."""
+    def programs(self) -> dict[str, Program]:
+        """Programs of the parts of the machine, by the prefix of their functions."""
         dynamics, programs = self.chart.dynamics, {"loops": self._closure.new_program()}
-        for name, quantity in self._quantities.items():
+        for name, quantity in self.quantities.items():
             program = Program()
             try:
                 build_quantity(
-                    program, quantity, self._closure, dynamics.constant_pattern, self._n,
+                    program, quantity, self._closure, dynamics.constant_pattern,
+                    len(self.machine.active),
                     dynamics.formula_structure,
                 )  # fmt: skip
             except FormulaTooLongError as error:
@@ -282,21 +282,12 @@ class InstanceProgram(LinkedProgram):
     @cached_property
     def routines(self) -> InstanceRoutines:
         """The writer of its routines."""
-        offset = None if self.tip_frame is None else self.tip_frame.frame_offset
-        quantities = [name for name in self._quantities if name in self._programs]
-        return InstanceRoutines(
-            self.chart, self.stepper, self.layout, self._programs, quantities, offset
-        )
+        return InstanceRoutines(self)
 
     @property
     def has_dead_times(self) -> bool:
         """Whether valves have dead times."""
         return self.layout.parts["delays"] > 0
-
-    @property
-    def output_count(self) -> int:
-        """Elements of an instance that `update_outputs` writes."""
-        return sum(self.chart.output_layout.parts.values())
 
 
 def _controlled_chart(machine: Machine, controller: Controller | ValveCommand | None) -> Chart:
@@ -309,7 +300,7 @@ def _controlled_chart(machine: Machine, controller: Controller | ValveCommand | 
     machine = machine.with_external_forces(*loads)
     control = _exported_control(machine, controller)
     machine = machine_under_control(machine, control)
-    check_formulas(machine)
+    compiled_loops(machine)
     if not machine.has_traceable_forces:
         raise InputError(
             f"a load of '{machine.name}' is a function in Python, which no other target has: "
@@ -322,13 +313,6 @@ def _controlled_chart(machine: Machine, controller: Controller | ValveCommand | 
     return Chart.from_dynamics(dynamics, control, states)
 
 
-def _tip_inertia(structure: FormulaStructure) -> list[int]:
-    """Indices in `dynamics_constants` of the inertia of the body of the tip; none on the world."""
-    start = structure.constants_layout.start_index("inertias")
-    start += BODY_SIZE * ((structure.tip_body or 0) - 1)
-    return [*range(start, start + BODY_SIZE)] if structure.tip_body else []
-
-
 def _law_indices(structure: FormulaStructure, columns: Iterable[int], field: str) -> list[int]:
     """Indices in `dynamics_constants` of a value of the force laws of joints."""
     start = structure.constants_layout.start_index("joint_laws") + LAW_PARAMETER_NAMES.index(field)
@@ -337,13 +321,10 @@ def _law_indices(structure: FormulaStructure, columns: Iterable[int], field: str
 
 def _parameter_indices(structure: FormulaStructure, active: Iterable[int]) -> list[int]:
     """Indices in `dynamics_constants` of what stays a parameter where it is 0, 1 or -1."""
-    gravity, joints = (
-        structure.constants_layout["gravity"],
-        range(len(structure.motion_parents) - 1),
-    )
+    joints = range(len(structure.motion_parents) - 1)
     return [
-        *range(gravity.start, gravity.stop),
-        *_tip_inertia(structure),
+        *structure.constants_layout.indices("gravity"),
+        *structure.tip_inertia,
         *_law_indices(structure, active, "coulomb"),
         *_law_indices(structure, joints, "coulomb_offset"),
         *_law_indices(structure, joints, "viscous"),

@@ -1,29 +1,30 @@
 """Routines of an instance of a machine, see `crane.export.instance_program`."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from itertools import combinations_with_replacement
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
-from crane.codegen import (
-    ArrayPointer,
-    Layout,
-    Program,
-    Routine,
-    RoutineValue,
-    Scalar,
-    Tape,
-    select,
-)
+from crane.codegen import ArrayPointer, Program, Routine, RoutineValue, Scalar, Tape, select
 from crane.codegen.routine_statements import as_value
-from crane.codegen.symbolic import add_vectors, scale_vector, subtract_vectors
-from crane.common.samples import Array
+from crane.codegen.symbolic import (
+    add_vectors,
+    dot,
+    matmul,
+    matvec,
+    maximum,
+    scale_vector,
+    subtract_vectors,
+    transpose,
+)
+from crane.codegen.vector_layout import Formula
 from crane.control.valve_drive import ValveDrive
 from crane.dynamics.formula_structure import BODY_SIZE
 from crane.dynamics.frame_jacobians import frame_placement
-from crane.export.dead_times import DEAD_TIME_ROUTINES
-from crane.export.evaluation_routines import EvaluationRoutines
+from crane.export.dead_times import DeadTimes
 from crane.export.kinematics_program import (
     BEYOND_CHART,
     DONE,
@@ -31,12 +32,14 @@ from crane.export.kinematics_program import (
     NOT_CLOSED,
     TOO_MANY_CALLS,
     TOO_MANY_EVENTS,
+    KinematicsRoutines,
 )
-from crane.export.laden_inertia import laden_inertia
-from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.error_controlled_stepper import ErrorControlledStepper
-from crane.simulation.integration.machine_code_stepper import HELD_INDEX
+from crane.simulation.integration.machine_code_stepper import HELD_INDEX, exceeds_chart_limits
+from crane.simulation.integration.machine_formulas import AT_REST_SUFFIX
 from crane.simulation.integration.stick_slip_routine import add_stick_slip_routines
+
+if TYPE_CHECKING:
+    from crane.export.instance_program import InstanceProgram
 
 STATUS_TEXTS = MappingProxyType(
     {
@@ -52,50 +55,35 @@ STATUS_TEXTS = MappingProxyType(
 _FIRST_STEP_SHARE, _LONGEST_FIRST_STEP = 0.01, 5e-4  # as `ErrorControlledStepper.run`
 _STEP_REDUCTION_AFTER_EVENT = 0.2
 _TIME_TOLERANCE = 1e-9  # of a step
+_LEAST_MASS = 1e-30  # by which moments are divided [kg]
 
 
-class InstanceRoutines(EvaluationRoutines):
+class InstanceRoutines(KinematicsRoutines):
     """Writer of the routines of an instance.
 
     Args:
-        chart: The machine with its drives.
-        stepper: The method of `advance`.
-        layout: Layout of an instance.
-        programs: Programs that the routines call, by the prefix of their functions.
-        quantities: Names of the routines of dynamics.
-        tip_offset: Origin of the tip in its body; None without a tip.
+        program: The program of the instance.
     """
 
-    inner_routines = (
-        "find_modes", "orthogonalize", "least_squares", "transposed_least_squares",
-        "bounded_least_squares", *DEAD_TIME_ROUTINES,
-    )  # fmt: skip
-
-    def __init__(
-        self,
-        chart: Chart,
-        stepper: ErrorControlledStepper,
-        layout: Layout,
-        programs: Mapping[str, Program],
-        quantities: Sequence[str],
-        tip_offset: Array | None,
-    ):
-        closure = chart.machine.closure.compiled_closure
-        super().__init__(layout, closure, programs, len(chart.stick_slip.columns))
-        self.chart, self.stepper = chart, stepper
-        self._quantities, self._tip_offset = quantities, tip_offset
-        machine = self.machine = chart.machine
-        self.control = chart.control
-        self._nq, self._n = machine.model.nv, len(machine.active)
+    def __init__(self, program: "InstanceProgram"):
+        super().__init__(program.layout, program.machine.closure.compiled_closure)
+        self._programs, self.chart = program.programs, program.chart
+        self._k = len(self.chart.stick_slip.columns)
+        self._dead_times = DeadTimes(self.layout) if self.layout.parts["delays"] else None
+        self.stepper, self.control = program.stepper, program.control
+        self.machine, self._nq = program.machine, program.machine.model.nv
+        self._quantities, self._tip = program.quantities, program.tip_frame
 
     def add_to(self, program: Program) -> None:
         """Add all routines to a program that has the functions of `programs`."""
         if self._dead_times is not None:
             self._dead_times.add_to(program)
-        self._add_stiction(program)
+        if self._k:
+            formulas = self.stepper.trace_controlled_machine(Tape())
+            add_stick_slip_routines(program, self.chart, formulas)
         self._add_initialize(program)
         self._add_advance(program)
-        self.add_evaluations(program)
+        self._add_evaluations(program)
         super().add_to(program)
         self._add_tip(program)
         self._add_dynamics(program)
@@ -110,46 +98,18 @@ class InstanceRoutines(EvaluationRoutines):
         body = machine.coordinates.body_of_joint[joint]
         frame = pin.SE3(self._closure.geometry.body_rotations[body].T, np.zeros(3)) * pose
         unladen, payload = (tape.load_vector(i, 0, BODY_SIZE) for i in range(2))
-        program.add_formula("laden", 2, laden_inertia(unladen, payload, frame))
-        first = self.layout.start_index("dynamics")
-        first += self.chart.dynamics.formula_structure.constants_layout.start_index("inertias")
-        with program.add_routine("set_payload", arrays=("instance", "payload")) as r:
-            inertia = ArrayPointer("instance").element_pointer(first + BODY_SIZE * (body - 1))
+        program.add_formula("laden", 2, _laden_inertia(unladen, payload, frame))
+        first = self.chart.dynamics.formula_structure.tip_inertia.start
+        with self._entry(program, "set_payload", "payload") as r:
+            inertia = self._part("dynamics").element_pointer(first)
             r.call("laden", self._part("unladen"), r.payload, inertia)
-            r.return_value(DONE)
-
-    def _add_stiction(self, program: Program) -> None:
-        """find_modes, see `add_stick_slip_routines`."""
-        if not self._k:
-            return
-        chart, machine = self.chart, self.machine
-        closure = machine.closure
-        inverse_velocities = closure.characteristic_time / closure.units[chart.stick_slip.columns]
-        parts = self.stepper.trace_controlled_machine(Tape()).stiction_problem(
-            inverse_velocities.tolist()
-        )
-        problem = program.add_formula("stiction", 5, parts)
-        active = closure.active.tolist()
-        add_stick_slip_routines(
-            program,
-            problem,
-            n=self._n,
-            k=self._k,
-            rates=closure.characteristic_time / closure.units[closure.active],
-            active_of_joint=[
-                active.index(x) if x in active else None for x in chart.stick_slip.columns
-            ],
-            state_layout=chart.state_layout,
-            mode_indices=chart.dynamics.formula_structure.stick_slip_mode_indices,
-        )
 
     def _write_find_modes(self, r: Routine, refs: ArrayPointer) -> None:
         """Write `find_modes` at the state, and whether joints are held."""
         if not self._k:
             return
         arguments = *self._machine_arguments, refs, self._part("q")
-        with r.if_then(r.call("find_modes", *arguments) < 1):
-            r.return_value(HALTED)
+        self._call_or_return(r, HALTED, "find_modes", *arguments)
         held = r.new_variable(0.0)
         *places, _ = self.chart.dynamics.formula_structure.stick_slip_mode_indices
         for place in places[1::3]:
@@ -171,33 +131,9 @@ class InstanceRoutines(EvaluationRoutines):
 
         inputs = machine.inputs._replace(inverse=inverse)
         program.add_formula("start", 5, {"state": list(self.control.initial_state(inputs))})
-        with program.add_routine("initialize", arrays=("instance",)) as r:
-            result = r.local_array("result", self._closure.formula_outputs("newton"))
-            state, states = self._part("q"), layout.parts["controller"]
-            values = r.local_array("values", max(1, states))
-            size = self._closure.formula_outputs("newton").parts["gamma"]
-            bounds = self._part("bounds")
-            arguments = self._part("geometry"), state, result, bounds
-            with r.if_then(r.call(self._close_name, *arguments) < 1):
-                r.return_value(NOT_CLOSED)
-            with r.loop(as_value(layout.size - self._nq, "integer")) as i:
-                r.store(state, i + self._nq, 0.0)
-            refs = self._part("inputs")
-            if states:
-                r.call("start", *self._machine_arguments, refs, state, values)
-                start = layout.start_index("controller")
-                r.copy(state.element_pointer(start), values, states)
-            r.copy(self._part("inputs_start"), refs, self.layout.parts["inputs"])
-            if self._dead_times is not None:
-                self._dead_times.write_start(r)
-            cursor = self._part("cursor")
-            r.copy(cursor, state, self._nq)
-            r.copy(cursor.element_pointer(self._nq), result.element_pointer("gamma"), size)
-            self._store(r, "time", 0.0)
-            self._store(r, "lengths", 0.0)
-            self._write_find_modes(r, refs)
-            r.return_value(DONE)
-        with program.add_routine("update_modes", arrays=("instance",)) as r:
+        with self._entry(program, "initialize") as r:
+            self._write_start(r)
+        with self._entry(program, "update_modes") as r:
             self._store(r, "lengths", 0.0)
             if self.stepper.has_rotation_vectors:
                 state = self._part("q")
@@ -206,31 +142,38 @@ class InstanceRoutines(EvaluationRoutines):
                 r.copy(state, wrapped, self._nq)
                 r.copy(self._part("cursor"), state, self._nq)
             self._write_find_modes(r, self._part("inputs"))
-            r.return_value(DONE)
 
-    @property
-    def _close_name(self) -> str:
-        return "loops_project" if self._closure.has_partly_active_rotations else "loops_close"
+    def _write_start(self, r: Routine) -> None:
+        layout, newton = self.chart.state_layout, self._closure.formula_outputs("newton")
+        result, state = r.local_array("result", newton), self._part("q")
+        cursor, refs = self._part("cursor"), self._part("inputs")
+        close = "project" if self._closure.has_partly_active_rotations else "close"
+        arguments = self._part("geometry"), state, result, self._part("bounds")
+        self._call_or_return(r, NOT_CLOSED, f"loops_{close}", *arguments)
+        with r.loop(as_value(layout.size - self._nq, "integer")) as i:
+            r.store(state, i + self._nq, 0.0)
+        if states := layout.parts["controller"]:
+            values = r.local_array("values", states)
+            r.call("start", *self._machine_arguments, refs, state, values)
+            r.copy(self._part("controller"), values, states)
+        r.copy(self._part("inputs_start"), refs, self.layout.parts["inputs"])
+        if self._dead_times is not None:
+            self._dead_times.write_start(r)
+        r.copy(cursor, state, self._nq)
+        gamma = result.element_pointer("gamma")
+        r.copy(cursor.element_pointer(self._nq), gamma, newton.parts["gamma"])
+        self._store(r, "lengths", 0.0)
+        self._write_find_modes(r, refs)
 
     def _add_advance(self, program: Program) -> None:
         """advance(instance): integrate over `step`, inputs linear from `inputs_start`.
 
         advance_fixed(instance): one step of the classical Runge-Kutta method.
         """
-        columns = self.stepper.reference_columns
-        tape = Tape()
-        start, end = (tape.load_vector(i, 0, columns) for i in range(2))
-        first, last = tape.load_vector(2, 0, 2)
-        ramp = subtract_vectors(end, start)
-        rows = [
-            add_vectors(start, scale_vector(share, ramp))
-            for share in (first, 0.5 * (first + last), last)
-        ]
-        program.add_formula("ramp", 3, [x for row in rows for x in row])
-        with program.add_routine("advance", arrays=("instance",)) as r:
+        with self._entry(program, "advance") as r:
             self._write_advance(r)
         if not isinstance(self.control, ValveDrive):
-            with program.add_routine("advance_fixed", arrays=("instance",)) as r:
+            with self._entry(program, "advance_fixed") as r:
                 self._write_fixed_step(r)
 
     def _write_advance(self, r: Routine) -> None:
@@ -242,21 +185,18 @@ class InstanceRoutines(EvaluationRoutines):
         with r.if_then(~(step > 0.0)):
             r.return_value(HALTED)
         if self._dead_times is not None:
-            with r.if_then(r.call("append_call", r.instance) < 1):
-                r.return_value(TOO_MANY_CALLS)
+            self._call_or_return(r, TOO_MANY_CALLS, "append_call", r.instance)
         # a run that goes on to the next output instant, see `ErrorControlledStepper.run`
         with r.if_then(~((lengths[0] >= step) & (lengths[0] <= step))):
             r.store(lengths, 0, step)
             longest = select(step < _LONGEST_FIRST_STEP, step, _LONGEST_FIRST_STEP)
             r.store(lengths, 1, longest * _FIRST_STEP_SHARE)
         time, end, events = (r.new_variable(x) for x in (step * -1.0, 0.0, 0.0))
-        write_references = self._references_writer(r, refs, step)
+        arrays = refs, r.local_array("now", 2), r.local_array("kink", 1)
         with r.loop_forever():
-            write_references(time, end)
-            r.store(lengths, 2, time)
-            r.store(lengths, 3, end - time)
-            r.store(lengths, 4, end)
-            r.store(lengths, 6, 0.0)
+            self._write_references(r, arrays, step, (time, end))
+            for place, length in ((2, time), (3, end - time), (4, end), (6, 0.0)):
+                r.store(lengths, place, length)
             r.call(
                 "steps_run", 1, *self._machine_arguments, refs, state, row, lengths,
                 bounds, tolerances,
@@ -268,7 +208,7 @@ class InstanceRoutines(EvaluationRoutines):
                 with r.if_then(events > self._element("max_events")):
                     self._write_elapsed(r, step + time)
                     r.return_value(TOO_MANY_EVENTS)
-                write_references(time, end)
+                self._write_references(r, arrays, step, (time, end))
                 self._write_find_modes(r, refs)
             with r.if_else(), r.if_then(time < end - step * _TIME_TOLERANCE):
                 self._write_elapsed(r, step + time)
@@ -277,40 +217,45 @@ class InstanceRoutines(EvaluationRoutines):
                 r.break_loop()
         self._write_elapsed(r, step)
         r.copy(self._part("inputs_start"), self._part("inputs"), columns)
-        r.return_value(DONE)
 
     def _write_elapsed(self, r: Routine, elapsed: RoutineValue) -> None:
         self._store(r, "time", self._element("time") + elapsed)
 
-    def _references_writer(
-        self, r: Routine, refs: ArrayPointer, step: RoutineValue
-    ) -> Callable[[RoutineValue, RoutineValue], None]:
-        """Function that writes the references from a time to `end`, before the end of the call.
+    def _write_references(
+        self,
+        r: Routine,
+        arrays: tuple[ArrayPointer, ArrayPointer, ArrayPointer],
+        step: RoutineValue,
+        span: tuple[RoutineValue, RoutineValue],
+    ) -> None:
+        """Write the references from a time to an end, both before the end of the call.
 
-        It sets `end` to the next change of a slope, or 0, where valves have dead times.
+        Where valves have dead times the end becomes the next change of a slope, or 0.
         """
-        columns, shares = self.stepper.reference_columns, r.local_array("shares", 2)
-        now, kink = r.local_array("now", 2), r.local_array("kink", 1)
-        inputs, start = (self._part(x) for x in ("inputs", "inputs_start"))
+        (time, end), (refs, now, kink) = span, arrays
         goal = r.new_variable(self._element("time") + step)
-
-        def write(time: RoutineValue, end: RoutineValue) -> None:
-            if self._dead_times is not None:
-                r.store(now, 0, goal + time)
-                r.call("find_kink", r.instance, now, kink)
-                r.assign(end, kink[0] - goal)
-                r.assign(end, select(end < step * -_TIME_TOLERANCE, end, 0.0))
-            r.store(shares, 0, (time + step) / step)
-            r.store(shares, 1, (end + step) / step)
-            r.call("ramp", start, inputs, shares, refs)
-            if self._dead_times is None:
-                return
+        if self._dead_times is not None:
+            r.store(now, 0, goal + time)
+            r.call("find_kink", r.instance, now, kink)
+            r.assign(end, kink[0] - goal)
+            r.assign(end, select(end < step * -_TIME_TOLERANCE, end, 0.0))
+        self._write_ramp(r, refs, (time + step) / step, (end + step) / step)
+        for i, share in enumerate((0.0, 0.5, 1.0) if self._dead_times is not None else ()):
             r.store(now, 1, goal + time + (end - time) * 0.5)
-            for i, share in enumerate((0.0, 0.5, 1.0)):
-                r.store(now, 0, goal + time + (end - time) * share)
-                r.call("delay_signals", r.instance, now, refs.row_pointer(i, columns))
+            r.store(now, 0, goal + time + (end - time) * share)
+            row = refs.row_pointer(i, self.stepper.reference_columns)
+            r.call("delay_signals", r.instance, now, row)
 
-        return write
+    def _write_ramp(
+        self, r: Routine, refs: ArrayPointer, first: RoutineValue, last: RoutineValue
+    ) -> None:
+        """Write the inputs at two shares of the step, and between them, to the rows of `refs`."""
+        columns = self.stepper.reference_columns
+        inputs, start = (self._part(x) for x in ("inputs", "inputs_start"))
+        for row, share in enumerate((first, (first + last) * 0.5, last)):
+            with r.loop(as_value(columns, "integer")) as i:
+                value = start[i] + share * (inputs[i] - start[i])
+                r.store(refs.row_pointer(row, columns), i, value)
 
     def _write_halt(self, r: Routine) -> None:
         """Return why a step failed."""
@@ -320,17 +265,13 @@ class InstanceRoutines(EvaluationRoutines):
 
     def _write_fixed_step(self, r: Routine) -> None:
         columns, size = self.stepper.reference_columns, self.chart.row_layout.size
-        refs, shares = r.local_array("refs", max(1, 3 * columns)), r.local_array("shares", 2)
+        refs = r.local_array("refs", max(1, 3 * columns))
         row, sizes = r.local_array("row", size), r.local_array("sizes", 3)
         state, bounds = self._part("q"), self._part("bounds")
-        inputs, start = (self._part(x) for x in ("inputs", "inputs_start"))
         step = r.new_variable(self._element("step"))
-        r.store(shares, 0, 0.0)
-        r.store(shares, 1, 1.0)
-        r.call("ramp", start, inputs, shares, refs)
-        r.store(sizes, 0, step)
-        r.store(sizes, 1, step * 0.5)
-        r.store(sizes, 2, 0.0)
+        self._write_ramp(r, refs, as_value(0.0, "real"), as_value(1.0, "real"))
+        for i, share in enumerate((1.0, 0.5, 0.0)):
+            r.store(sizes, i, step * share)
         arguments = refs, state, row, sizes, bounds
         done = r.call("fixed_run", 1, *self._machine_arguments, *arguments)
         with r.if_then((done < 1) & (sizes[2] > 0.0)):  # joints begin to slip, or stop
@@ -341,28 +282,139 @@ class InstanceRoutines(EvaluationRoutines):
         with r.if_then(done < 1):
             self._write_halt(r)
         self._write_elapsed(r, step)
-        r.copy(start, inputs, columns)
-        r.return_value(DONE)
+        r.copy(self._part("inputs_start"), self._part("inputs"), columns)
 
     def _add_tip(self, program: Program) -> None:
         """tip(instance, q, v_a, tip)."""
-        if self._tip_offset is None:
+        if self._tip is None:
             return
-        with program.add_routine("tip", arrays=("instance", "q", "v_a", "tip")) as r:
+        with self._entry(program, "tip", "q", "v_a", "tip") as r:
             offset = r.local_array("offset", 3)
-            for i, x in enumerate(self._tip_offset.tolist()):
+            for i, x in enumerate(self._tip.frame_offset.tolist()):
                 r.store(offset, i, x)
-            geometry = self._part("geometry")
-            r.call("tip_formula", geometry, offset, r.q, r.v_a, r.tip)
-            r.return_value(DONE)
+            r.call("tip_formula", self._part("geometry"), offset, r.q, r.v_a, r.tip)
 
     def _add_dynamics(self, program: Program) -> None:
         """The routines of `DYNAMICS_ROUTINES`: (instance, q, v_a, x, result)."""
         for name in self._quantities:
-            with program.add_routine(name, arrays=("instance", "q", "v_a", "x", "result")) as r:
-                inputs = r.local_array("values", 2 * self._n)
-                r.copy(inputs, r.v_a, self._n)
-                r.copy(inputs.element_pointer(self._n), r.x, self._n)
+            if name not in self._programs:
+                continue
+            with self._entry(program, name, "q", "v_a", "x", "result") as r:
+                n = len(self.machine.active)
+                inputs = r.local_array("values", 2 * n)
+                r.copy(inputs, r.v_a, n)
+                r.copy(inputs.element_pointer(n), r.x, n)
                 geometry, dynamics = (self._part(x) for x in ("geometry", "dynamics"))
                 r.call(f"{name}_formula", geometry, dynamics, r.q, inputs, r.result)
-                r.return_value(DONE)
+
+    @property
+    def _machine_arguments(self) -> tuple[ArrayPointer, ...]:
+        return tuple(self._part(x) for x in ("geometry", "dynamics", "settings"))
+
+    def _add_evaluations(self, program: Program) -> None:
+        """Add update_outputs(instance) and derivatives(instance, rate) of the state.
+
+        event_indicators(instance, indicators); directional_derivatives(instance, direction,
+        result) of rate and outputs.
+        """
+        with self._entry(program, "update_outputs") as r:
+            self._write_evaluation(r, "steps_observe", ["outputs"], self._part("tau"))
+        with self._entry(program, "derivatives", "rate") as r:
+            self._write_chart_check(r)
+            self._write_evaluation(r, "steps_rate", ["rate"], r.rate)
+        if self.event_parts:
+            with self._entry(program, "event_indicators", "indicators") as r:
+                self._write_evaluation(r, "steps_rate", [*self.event_parts], r.indicators)
+        if "tangent" in self._programs:
+            with self._entry(program, "directional_derivatives", "direction", "result") as r:
+                self._write_evaluation(r, "tangent_rate", ["all"], r.result, r.direction)
+
+    def _write_chart_check(self, r: Routine) -> None:
+        """Write a return where the active joints do not determine the motion, see `Chart`."""
+        result = r.local_array("result", self._closure.formula_outputs("newton"))
+        geometry, state, bounds = (self._part(x) for x in ("geometry", "q", "bounds"))
+        r.call("loops_newton", geometry, state, result)
+        with r.if_then(exceeds_chart_limits(bounds, result)):
+            r.return_value(BEYOND_CHART)
+
+    @property
+    def step_functions(self) -> Mapping[str, Formula | Routine]:
+        """Functions of the stepper by name."""
+        return self._programs["steps"].functions
+
+    @property
+    def event_parts(self) -> dict[str, int]:
+        """Numbers of event indicators by part of the formula `rate`."""
+        parts = self._programs["steps"].formula_outputs("rate").parts
+        events = {"margin": min(self._k, 1), "event_distances": parts["event_distances"]}
+        return {name: count for name, count in events.items() if count}
+
+    def _write_evaluation(
+        self,
+        r: Routine,
+        formula: str,
+        parts: Sequence[str],
+        target: ArrayPointer,
+        *further: ArrayPointer,
+    ) -> None:
+        """Write the evaluation of parts of a formula at the state, the inputs and `further`."""
+        program, own_name = formula.split("_")
+        layout = self._programs[program].formula_outputs(own_name)
+        values = r.local_array("values", layout)
+        inputs, state = (self._part(x) for x in ("inputs", "q"))
+        if self._dead_times is not None:
+            row, now = r.local_array("row", self.layout.parts["inputs"]), r.local_array("now", 2)
+            r.copy(row, inputs, self.layout.parts["inputs"])
+            for i in range(2):
+                r.store(now, i, self._element("time"))
+            r.call("delay_signals", r.instance, now, row)
+            inputs = row
+        arguments = *self._machine_arguments, inputs, state, *further, values
+        if self._k:
+            with r.if_then(self._element("bounds", HELD_INDEX) > 0.5):
+                r.call(formula + AT_REST_SUFFIX, *arguments)
+            with r.if_else():
+                r.call(formula, *arguments)
+        else:
+            r.call(formula, *arguments)
+        count = sum(layout.parts[part] for part in parts)
+        r.copy(target, values.element_pointer(parts[0]), count)
+
+
+def _laden_inertia(
+    unladen: Sequence[Scalar], payload: Sequence[Scalar], frame: pin.SE3
+) -> list[Scalar]:
+    """Inertia of a body with a payload on one of its frames.
+
+    With masses m_i, centres c_i and inertias I_i about them, d = c_2 - c_1 and
+    mu = m_1 m_2 / (m_1 + m_2),
+
+        m = m_1 + m_2,    c = c_1 + m_2 / m d,    I = I_1 + I_2 + mu (d.d 1 - d d^T).
+
+    Args:
+        unladen: (10,) mass, centre of mass (3), inertia about it (xx, xy, xz, yy, yz, zz) in the
+            axes of the body.
+        payload: (10,) the same in the frame.
+        frame: The frame in the body.
+
+    Returns:
+        (10,) like `unladen`.
+    """
+    turn = frame.rotation.tolist()
+    mass = unladen[0] + payload[0]
+    share = payload[0] / maximum(mass, _LEAST_MASS)
+    centre = add_vectors(matvec(turn, payload[1:4]), frame.translation.tolist())
+    distance = subtract_vectors(centre, unladen[1:4])
+    xx, xy, xz, yy, yz, zz = payload[4:]
+    tensor = matmul(matmul(turn, [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), transpose(turn))
+    square, reduced = dot(distance, distance), unladen[0] * share
+    moments = [
+        inertia
+        + tensor[i][k]
+        + reduced * ((square if i == k else 0.0) - distance[i] * distance[k])
+        for inertia, (i, k) in zip(
+            unladen[4:], combinations_with_replacement(range(3), 2), strict=True
+        )
+    ]
+    moved = add_vectors(unladen[1:4], scale_vector(share, distance))
+    return [mass, *moved, *moments]

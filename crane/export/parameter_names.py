@@ -1,10 +1,12 @@
 """Names and units of the elements of an instance, in the order of `InstanceProgram.layout`."""
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from crane.codegen import Layout
 from crane.control.valve_drive import ValveDrive
 from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.dynamics.external_forces import reference_counts
@@ -19,25 +21,38 @@ _ROTATION = [f"rotation_{i}{j}" for i in "xyz" for j in "xyz"]
 _POSITION = ["position_x", "position_y", "position_z"]
 _INERTIA = {"mass": "kg"} | {f"com_{x}": "m" for x in "xyz"}
 _INERTIA |= {f"inertia_{x}": "kg m2" for x in ("xx", "xy", "xz", "yy", "yz", "zz")}
+_SETTING_UNITS = {  # of names of settings that end so, of cylinders
+    "area_[ab]": "m2", "hose_[ab]": "m3", "leakage(_[ab])?": "m3/Pa/s", "neutral": "V",
+    "relief|margin|vapour|tank|pressure": "Pa", "(?<!per_)(stroke|lower_limit)": "m",
+    "flow": "m3/s",
+}  # fmt: skip
+_MOTOR_UNITS = {"m2": "m3/rad", "m": "rad"}
+_LAW_UNITS = {  # by units of the force and of the coordinate
+    "{0}": ("coulomb", "coulomb_offset", "stiction", "stiction_2", "memory", "constant",
+            "gas_force"),
+    "{0} s/{1}": ("viscous", "viscous_offset", "damping", "stop_damping"),
+    "{0}/{1}": ("stiffness", "stop_stiffness"),
+    "{1}": ("lower_limit", "upper_limit", "gas_rest_position"), "J": ("energy_offset",),
+}  # fmt: skip
 _WRENCH = [*zip(WRENCH_COMPONENTS, ("N", "N", "N", "N m", "N m", "N m"), strict=True)]
 
 
-def parameter_names(program: "InstanceProgram") -> tuple[list[str], list[str]]:
-    """Names and units of all elements of an instance."""
-    pairs = list(_elements(program))
-    sizes = program.layout.parts
-    found: dict[str, list[tuple[str, str]]] = {name: [] for name in sizes}
-    for part, name, unit in pairs:
+def named_elements(
+    layout: Layout, elements: Iterable[tuple[str, str, str]]
+) -> tuple[list[str], list[str]]:
+    """Names and units of all elements of a layout, from part, name and unit of those with one."""
+    found: dict[str, list[tuple[str, str]]] = {name: [] for name in layout.parts}
+    for part, name, unit in elements:
         found[part].append((name, unit))
-    for part, size in sizes.items():
+    for part, size in layout.parts.items():
         if not found[part]:
             found[part] = [(f"{part}_{i}" if size > 1 else part, "") for i in range(size)]
         assert len(found[part]) == size, (part, size, len(found[part]))
-    names = [name for part in sizes for name, _ in found[part]]
-    return names, [unit for part in sizes for _, unit in found[part]]
+    pairs = [pair for part in found.values() for pair in part]
+    return [name for name, _ in pairs], [unit for _, unit in pairs]
 
 
-def _elements(program: "InstanceProgram") -> Iterator[tuple[str, str, str]]:
+def instance_elements(program: "InstanceProgram") -> Iterator[tuple[str, str, str]]:
     """Part, name and unit of the elements that have a meaning."""
     machine, chart = program.machine, program.chart
     yield from (("time", "time", "s"), ("step", "step", "s"))
@@ -60,7 +75,12 @@ def _elements(program: "InstanceProgram") -> Iterator[tuple[str, str, str]]:
             yield "controller", f"integral_{name}", unit
         for name, unit in program.control.channels:
             yield "channels", name, unit
-        yield from (("settings", name, "") for name in _setting_names(program.control))
+        motors = tuple(f"{x}_" for x in machine.joints if machine.unit(x) == "rad")
+        for name in _setting_names(program.control):
+            units = (unit for x, unit in _SETTING_UNITS.items() if re.search(f"_({x})$", name))
+            unit = next(units, "")
+            is_of_motor = name.startswith(motors)
+            yield "settings", name, _MOTOR_UNITS.get(unit, unit) if is_of_motor else unit
         command = program.control.command
         yield from (("settings", name, unit) for name, unit in command.setting_units.items())
         if program.layout.parts["delays"]:
@@ -84,7 +104,7 @@ def _elements(program: "InstanceProgram") -> Iterator[tuple[str, str, str]]:
     if machine.supports:
         for joint in machine.joints:
             yield "a", f"a_{joint}", f"{machine.unit(joint)}/s2"
-    yield from (("geometry", name, unit) for name, unit in geometry_names(program.machine))
+    yield from geometry_elements(machine)
     yield from (("dynamics", name, unit) for name, unit in _dynamics(program))
     if program.layout.parts["unladen"]:
         yield from (("unladen", f"unladen_{name}", unit) for name, unit in _INERTIA.items())
@@ -104,15 +124,15 @@ def _inputs(program: "InstanceProgram") -> Iterator[tuple[str, str]]:
         yield from ((f"{force.name}_{name}", unit) for name, unit in components)
 
 
-def geometry_names(machine: Machine) -> Iterator[tuple[str, str]]:
-    """Names and units of the constants of `TreeGeometry`."""
+def geometry_elements(machine: Machine) -> Iterator[tuple[str, str, str]]:
+    """Part, name and unit of the constants of `TreeGeometry`."""
     frames = [f"{joint}_frame" for joint in machine.joints]
     for loop in machine.closure.equations.loops:
         frames += [f"{loop.name}_predecessor", f"{loop.name}_successor"]
     for frame in frames:
-        yield from ((f"{frame}_{name}", "") for name in _ROTATION)
-        yield from ((f"{frame}_{name}", "m") for name in _POSITION)
-    yield "inverse_characteristic_length", "1/m"
+        yield from (("geometry", f"{frame}_{name}", "") for name in _ROTATION)
+        yield from (("geometry", f"{frame}_{name}", "m") for name in _POSITION)
+    yield "geometry", "inverse_characteristic_length", "1/m"
 
 
 def _dynamics(program: "InstanceProgram") -> Iterator[tuple[str, str]]:
@@ -142,7 +162,8 @@ def _dynamics(program: "InstanceProgram") -> Iterator[tuple[str, str]]:
 
 def _laws(owner: str, unit: str) -> list[tuple[str, str]]:
     """Names and units of the parameters of a force law along a coordinate of a unit."""
-    units = _law_units(unit)
+    force = "N" if unit == "m" else "N m"
+    units = {x: text.format(force, unit) for text, names in _LAW_UNITS.items() for x in names}
     return [(f"{owner}_{name}", units.get(name, "")) for name in LAW_PARAMETER_NAMES]
 
 
@@ -153,17 +174,3 @@ def _setting_names(control: ValveDrive) -> list[str]:
     names += [f"{joint}_lower_limit" for joint in circuit.hydraulics.joints]
     count = len(control.settings) - len(names) - len(control.command.setting_units)
     return names + [f"signal_setting_{i}" for i in range(count)]
-
-
-def _law_units(unit: str) -> dict[str, str]:
-    force = "N" if unit == "m" else "N m"
-    constant = dict.fromkeys(
-        ("coulomb", "coulomb_offset", "stiction", "stiction_2", "memory", "constant", "gas_force"),
-        force,
-    )
-    rates = dict.fromkeys(
-        ("viscous", "viscous_offset", "damping", "stop_damping"), f"{force} s/{unit}"
-    )
-    springs = dict.fromkeys(("stiffness", "stop_stiffness"), f"{force}/{unit}")
-    lengths = dict.fromkeys(("lower_limit", "upper_limit", "gas_rest_position"), unit)
-    return {**constant, **rates, **springs, **lengths, "energy_offset": "J"}

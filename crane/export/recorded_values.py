@@ -15,34 +15,24 @@ from crane.dynamics.dynamics import Dynamics
 from crane.export.instance_program import DYNAMICS_ROUTINES, InstanceProgram
 from crane.simulation.simulation_run import simulate
 
-_TEST_STATES, _TEST_STEPS, _TEST_STEP = 20, 50, 0.01
+TEST_STEP = 0.01  # [s]
+_TEST_STATES, _TEST_STEPS = 20, 50
 _FOLLOWED = 0.01  # displacement of references [m], [rad]
 _ROUNDED_STATES = 8
 _SHARES = 1.0, 0.1, 0.01  # of the random offsets from home
 _ROUNDING = float(np.finfo(float).eps)
 
 
-class RecordedMotion(NamedTuple):
-    """A motion from home.
-
-    Attributes:
-        step: [s].
-        inputs: (k, inputs) at the end of each step.
-        q: (k, nq) coordinates there.
-    """
-
-    step: float
-    inputs: Array
-    q: Array
-
-
-def recorded_motion(program: InstanceProgram) -> RecordedMotion:
+def recorded_motion(program: InstanceProgram) -> tuple[Array, Array]:
     """A motion by `simulate`: valves open slowly, or the machine follows or moves freely.
 
     It ends before a dead centre, which exported programs do not pass.
+
+    Returns:
+        Inputs (k, inputs) at the ends of steps of `TEST_STEP`, and coordinates (k, nq) there.
     """
     machine, control = program.machine, program.control
-    times = np.linspace(0.0, _TEST_STEP * _TEST_STEPS, _TEST_STEPS + 1)
+    times = np.linspace(0.0, TEST_STEP * _TEST_STEPS, _TEST_STEPS + 1)
     start = program.layout.view(program.defaults).inputs
     inputs, shares = np.tile(start, (len(times), 1)), times / times[-1]
     controller: ControlLaw | ValveCommand = control
@@ -61,14 +51,9 @@ def recorded_motion(program: InstanceProgram) -> RecordedMotion:
         controller = interpolate_references(controller, times, rows)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
-        recording = simulate(machine, controller, duration=times[-1], step=_TEST_STEP)
-    columns = [
-        recording.q[:, machine.active.index(joint)]
-        if joint in machine.active
-        else recording.channels[joint]
-        for joint in machine.joints
-    ]
-    q, chart = np.column_stack(columns), program.chart
+        recording = simulate(machine, controller, duration=times[-1], step=TEST_STEP)
+    columns = {**recording.channels, **dict(zip(machine.active, recording.q.T, strict=True))}
+    q, chart = np.column_stack([columns[x] for x in machine.joints]), program.chart
     determinant = machine.closure.compiled_closure.least_determinant
     beyond = [
         chart.largest_gamma_entry(x) > chart.chart_limits[0]
@@ -76,7 +61,7 @@ def recorded_motion(program: InstanceProgram) -> RecordedMotion:
         for x in q
     ]
     end = beyond.index(True) - 1 if any(beyond) else len(q)
-    return RecordedMotion(_TEST_STEP, inputs[1:end], q[1:end])
+    return inputs[1:end], q[1:end]
 
 
 class RandomVectors(NamedTuple):

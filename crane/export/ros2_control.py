@@ -5,7 +5,7 @@ from pathlib import Path
 
 from crane.common.atomic_output import check_folder_is_writable
 from crane.common.errors import InputError
-from crane.export.c_sources import FunctionSources, c_identifier, write_texts
+from crane.export.c_sources import CSources, c_identifier, write_texts
 from crane.export.kinematics_program import KinematicsProgram
 from crane.formats.machine_loading import load
 from crane.machine.machine import Machine
@@ -36,7 +36,7 @@ def write_ros2_control(
     """
     check_folder_is_writable(Path(folder), overwrite)
     loaded = machine if isinstance(machine, Machine) else load(machine)
-    sources = FunctionSources(KinematicsProgram(loaded), package_name(name or loaded.name))
+    sources = CSources(KinematicsProgram(loaded), package_name(name or loaded.name))
     balls = {i + k for i in loaded.coordinates.rotation_columns for k in range(3)}
     active = loaded.closure.active.tolist()
     if loaded.coordinates.floating_base_columns or balls.intersection(active):

@@ -10,6 +10,7 @@ one.
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from crane.codegen.linked_functions import LinkedFunction
 from crane.codegen.llvm.vector_functions import MAX_VECTOR_WIDTH, VECTOR_FUNCTIONS, format_real
 from crane.codegen.symbolic import Scalar, SymbolicExpression
 from crane.codegen.vector_layout import Formula, assign_memory_slots, operand_indices
@@ -121,8 +122,16 @@ _VECTORIZED = VECTOR_FUNCTIONS | {"dot"}
 _FUNCTION_END = "  ret void\n}"
 
 
-def emit_formula(formula: Formula, functions: set[tuple[str, int]]) -> str:
-    """A formula as a function; adds the vector functions that it calls to `functions`."""
+def emit_formula(
+    formula: Formula, functions: set[tuple[str, int]], linked: LinkedFunction | None = None
+) -> str:
+    """A formula as a function, or an internal one that is linked with others.
+
+    Adds the vector functions that it calls to `functions`.
+    """
+    name, inputs = formula.name, [f"in{i}" for i in range(formula.input_count)]
+    if linked is not None:
+        name, inputs = linked.name, [*linked.arguments[:-1]]
     operations = formula.operations
     steps = _group_operations(operations, formula)
     # pieces of about equal length; a short formula is a single piece
@@ -147,25 +156,19 @@ def emit_formula(formula: Formula, functions: set[tuple[str, int]]) -> str:
         )
     if len(pieces) == 1 and len(copied_outputs) <= PIECE_LENGTH:
         texts = [[line for text in texts for line in text]]
-    arguments = ", ".join(
-        [*[f"ptr noalias readonly %in{i}" for i in range(formula.input_count)], "ptr noalias %out"]
-    )
-    head = f"define void @{formula.name}({arguments}) "
+    arguments = ", ".join([*(f"ptr noalias readonly %{x}" for x in inputs), "ptr noalias %out"])
+    head = f"define {'internal ' if linked else ''}void @{name}({arguments}) "
     if len(texts) <= 1:
         head += f"{_FRAME_POINTER_ATTRIBUTES} {{"
         return "\n".join([head, *(line for text in texts for line in text), _FUNCTION_END])
     shared = f"{arguments}, ptr noalias %between"
-    words = ", ".join(
-        [*(f"ptr %in{i}" for i in range(formula.input_count)), "ptr %out, ptr %between"]
-    )
+    words = ", ".join([*(f"ptr %{x}" for x in inputs), "ptr %out, ptr %between"])
     between = f"  %between = alloca [{1 + max(memory_slots.values(), default=0)} x double]"
     definitions, calls = [], [f"{head}{{", between]
     for number, text in enumerate(texts):
-        name = f"@{formula.name}.{number}"
-        definitions += [
-            f"define internal void {name}({shared}) noinline {{", *text, _FUNCTION_END,
-        ]  # fmt: skip
-        calls.append(f"  call void {name}({words})")
+        head = f"define internal void @{name}.{number}({shared}) noinline {{"
+        definitions += [head, *text, _FUNCTION_END]
+        calls.append(f"  call void @{name}.{number}({words})")
     return "\n".join([*definitions, *calls, _FUNCTION_END])
 
 

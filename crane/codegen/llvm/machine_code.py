@@ -13,7 +13,7 @@ from crane.codegen.vector_layout import Formula
 from crane.common.file_cache import cached_object_code, entry_name, read_entry
 
 ENTRY_POINT_NAME = "{}.entry"  # the function that takes all arguments by one pointer
-_DECLARATIONS = """
+DECLARATIONS = """
 declare double @llvm.sqrt.f64(double)
 declare double @llvm.fabs.f64(double)
 declare double @llvm.copysign.f64(double, double)
@@ -36,7 +36,7 @@ define internal double @larger(double %a, double %b) alwaysinline {
 def emit_module(functions: Iterable[Formula | Routine]) -> str:
     """The LLVM IR of formulas and routines."""
     vector_functions: set[tuple[str, int]] = set()
-    texts = [_DECLARATIONS]
+    texts = [DECLARATIONS]
     for function in functions:
         if isinstance(function, Formula):
             texts += [
@@ -98,7 +98,7 @@ class MachineCode:
         depends = f"{compiler_settings()} {text}"
         return cls(
             entry_name(depends),
-            cached_object_code(depends, lambda: _compile_to_object_code(text, _target_machine())),
+            cached_object_code(depends, lambda: compile_to_object_code(text, _target_machine())),
         )
 
     @classmethod
@@ -156,7 +156,8 @@ def _target_machine() -> Any:
     )
 
 
-def _compile_to_object_code(text: str, target: Any) -> bytes:
+def compile_to_object_code(text: str, target: Any) -> bytes:
+    """Compile LLVM IR for a target machine."""
     import llvmlite.binding as llvm
 
     module = llvm.parse_assembly(text)

@@ -1,7 +1,8 @@
 """Routines in LLVM IR; variables live in memory, and LLVM moves them to registers."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+from crane.codegen.linked_functions import LinkedFunction
 from crane.codegen.llvm.vector_functions import format_real
 from crane.codegen.routine_statements import (
     ArrayPointer,
@@ -29,21 +30,22 @@ _COMPARISONS = {
 }
 
 
-def emit_routine(routine: Routine) -> str:
-    """A routine as a function."""
+def emit_routine(routine: Routine, linked: LinkedFunction | None = None) -> str:
+    """A routine as a function, or an internal one that is linked with others."""
+    names = routine.arguments if linked is None else linked.arguments
     arguments = ", ".join(
-        f"{'i64' if isinstance(x, RoutineValue) else 'ptr'} %{name}"
-        for name, x in routine.arguments.items()
+        f"{'i64' if isinstance(routine.arguments[x], RoutineValue) else 'ptr'} %{x}" for x in names
     )
+    head = f"i64 @{routine.name}" if linked is None else f"internal i64 @{linked.name}"
     lines = [
-        f"define i64 @{routine.name}({arguments}) {{",
+        f"define {head}({arguments}) {{",
         "entry:",
         *(
             f"  %{name} = alloca [{size} x double], align 64"
             for name, size in routine.local_arrays.items()
         ),
         *(f"  %{v.operands[0]} = alloca {_TYPES[v.kind]}" for v in routine.variables),
-        *_RoutineEmitter().lines_of(routine.statements),
+        *_RoutineEmitter(linked.callees if linked else {}).lines_of(routine.statements),
         "  ret i64 0",  # unreachable, or 0 items done
         "}",
     ]
@@ -53,7 +55,8 @@ def emit_routine(routine: Routine) -> str:
 class _RoutineEmitter:
     """Writes the statements of a routine."""
 
-    def __init__(self) -> None:
+    def __init__(self, callees: Mapping[str, LinkedFunction]):
+        self._callees = callees
         self._lines: list[str] = []
         self._number = 0  # of the next register or label
         self._loop_end_labels: list[str] = []  # of the enclosing loops
@@ -79,13 +82,16 @@ class _RoutineEmitter:
                 copied = f"ptr {to}, ptr {at}, i64 {8 * count}, i1 false"
                 self._emit_line(f"call void @llvm.memcpy.p0.p0.i64({copied})")
             case CallStatement(function, arguments, result, is_argument):
+                sigil = "%" if is_argument else "@"
+                if (callee := self._callees.get(function)) is not None:
+                    sigil, function = "@", callee.name
+                    arguments = (*callee.passed(arguments),)
                 words = [
                     f"ptr {self._emit_pointer(x)}"
                     if isinstance(x, ArrayPointer)
                     else f"i64 {self._evaluate(x)}"
                     for x in arguments
                 ]
-                sigil = "%" if is_argument else "@"
                 call = f"{sigil}{function}({', '.join(words)})"
                 if result is None:
                     self._emit_line(f"call void {call}")

@@ -230,3 +230,19 @@ def define_functions(required: Collection[tuple[str, int]]) -> str:
         writer = _VectorFunctionWriter(name, width)
         texts.append(writer.finish(_WRITERS[name](writer)))
     return "\n".join(texts)
+
+
+def call_functions(required: Collection[tuple[str, int]]) -> str:
+    """Definitions of the same functions by those of a library, @sin, @cos and so on."""
+    texts = []
+    for name in sorted({name for name, _ in required}):
+        texts.append(f"declare double @{name}(double) memory(none) nounwind willreturn")
+    for name, width in sorted(required):
+        writer, vector = _VectorFunctionWriter(name, width), "poison"
+        for lane in range(width):
+            x = writer.emit(f"extractelement {writer.kind} %x, i32 {lane}")
+            found = writer.emit(f"call double @{name}(double {x})")
+            lanes = f"{writer.kind} {vector}, double {found}, i32 {lane}"
+            vector = writer.emit(f"insertelement {lanes}")
+        texts.append(writer.finish(vector))
+    return "\n".join(texts)

@@ -12,10 +12,12 @@ from contextlib import AbstractContextManager, contextmanager
 import numpy as np
 
 from crane.codegen import ArrayPointer, Layout, Program, Routine, RoutineValue, Tape, select
-from crane.codegen.routine_statements import as_value
+from crane.codegen.routine_statements import as_value, magnitude
 from crane.codegen.symbolic import apply_function, copysign
 from crane.common.samples import Array
 from crane.dynamics.joint_forces import REST_VELOCITY
+from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.machine_formulas import MachineFormulas
 from crane.simulation.integration.stick_slip_modes import (
     MAX_LIMIT_SHARE,
     MAX_VELOCITY_CHANGE,
@@ -26,10 +28,6 @@ _MAX_SWEEPS = 40  # of Jacobi rotations, which converge quadratically
 _NO_ROTATION = 1e-32  # squared cosine of columns that count as orthogonal
 _LEAST_SIZE = 2.2e-16  # relative size of columns that count as zero, times their number
 _NO_RELEASE = 1e-13  # relative gradient by which no bound is released
-
-
-def _magnitude(x: RoutineValue) -> RoutineValue:
-    return select(x < 0.0, x * -1.0, x)
 
 
 def _sign(x: RoutineValue) -> RoutineValue:
@@ -91,33 +89,23 @@ class _ColumnLoops:
             yield j
 
 
-def add_stick_slip_routines(
-    program: Program,
-    problem: Layout,
-    *,
-    n: int,
-    k: int,
-    rates: Array,
-    active_of_joint: list[int | None],
-    state_layout: Layout,
-    mode_indices: list[int],
-) -> None:
+def add_stick_slip_routines(program: Program, chart: Chart, machine: MachineFormulas) -> None:
     """Add the routine `find_modes`(geometry, numbers, control, refs, state).
 
     It sets the modes among the numbers and stops joints at rest in the state; 1 if the mass matrix
     is definite, else 0.
 
     Args:
-        program: Program with the formula `stiction`, see `MachineFormulas.stiction_problem`.
-        problem: Layout of its outputs.
-        n: Number of active joints.
-        k: Number of joints with stiction.
-        rates: (n,) characteristic time over coordinate units of the active joints.
-        active_of_joint: Index of each of these joints among the active ones, or None.
-        state_layout: Layout of the state.
-        mode_indices: Places of the modes among the numbers: sign, held, one over a velocity for
-            each joint; whether anything moves.
+        program: A program.
+        chart: The machine with k joints that have stiction.
+        machine: Its formulas, on a tape of their own.
     """
+    columns, closure = chart.stick_slip.columns, chart.machine.closure
+    active, state_layout = closure.active.tolist(), chart.state_layout
+    n, k, times = len(active), len(columns), closure.characteristic_time / closure.units
+    parts = machine.stiction_problem(times[columns].tolist())
+    problem = program.add_formula("stiction", 5, parts)
+    active_of_joint = [active.index(x) if x in active else None for x in columns]
     _add_least_squares(program, n, k)
     _add_bounded_least_squares(program, n, k)
     arrays = ("geometry", "numbers", "control", "refs", "state")
@@ -130,17 +118,17 @@ def add_stick_slip_routines(
             r.return_value(0)
         resting = r.local_array("resting", k)
         resting_count = r.new_variable(0)
-        *places, moving = mode_indices
+        *places, moving = chart.dynamics.formula_structure.stick_slip_mode_indices
         for joint in range(k):  # rounding moves held ones
             is_held = r.numbers[places[3 * joint + 1]] > 0.0
             limit = select(is_held, MAX_VELOCITY_CHANGE, REST_VELOCITY)
             r.store(resting, joint, 0.0)
-            with r.if_then(_magnitude(found.element_pointer("speeds")[joint]) <= limit):
+            with r.if_then(magnitude(found.element_pointer("speeds")[joint]) <= limit):
                 r.store(resting, joint, 1.0)
                 r.assign(resting_count, resting_count + 1)
         v_a = r.state.element_pointer(state_layout.start_index("v_a"))
         with r.if_then((resting_count > 0) & (found["motion"] > 0.0)):
-            _write_stop(m, found, resting, v_a, rates, active_of_joint)
+            _write_stop(m, found, resting, v_a, times[active], active_of_joint)
             r.call("stiction", *arguments, found)
         # modes without joints at rest, in which the forces are evaluated
         for joint in range(k):
@@ -156,7 +144,7 @@ def add_stick_slip_routines(
         for joint in range(k):
             with r.if_then(resting[joint] > 0.0):
                 share = shares[joint]
-                below = _magnitude(share) < MAX_LIMIT_SHARE
+                below = magnitude(share) < MAX_LIMIT_SHARE
                 sign = select(below, select(held[joint] > 0.0, 0.0, share), _sign(share))
                 r.store(r.numbers, places[3 * joint], sign)
                 r.store(r.numbers, places[3 * joint + 1], held[joint])
@@ -188,7 +176,7 @@ def _write_stop(
         largest = r.new_variable(0.0)
         with m.each_row() as i:
             change = m.dot(inverse.row_pointer(i, n), momentum_change)
-            size = r.new_variable(_magnitude(change) * rate[i])
+            size = r.new_variable(magnitude(change) * rate[i])
             with r.if_then(~(size <= largest)):
                 r.assign(largest, size)
         return largest
@@ -221,7 +209,7 @@ def _write_stop(
                 r.store(stopped, position, 0.0)
         change = r.new_variable(0.0)
         with m.each_row() as i:
-            size = r.new_variable(_magnitude(stopped[i] - v_a[i]) * rate[i])
+            size = r.new_variable(magnitude(stopped[i] - v_a[i]) * rate[i])
             with r.if_then(~(size <= change)):
                 r.assign(change, size)
         with r.if_then(change <= MAX_VELOCITY_CHANGE):
@@ -256,7 +244,7 @@ def _write_holding(
     norms, rank = r.local_array("norms", k), r.new_variable(0)
     with m.each_column() as j:
         r.store(held, j, 0.0)
-        size = r.new_variable(_magnitude(shares[j]))
+        size = r.new_variable(magnitude(shares[j]))
         factor = select((resting[j] > 0.0) & (size < MAX_LIMIT_SHARE), size * -1.0 + 1.0, 0.0)
         column = m.column(columns, j)
         m.copy_scaled(column, r.new_variable(factor), column)
@@ -395,7 +383,7 @@ def _add_bounded_least_squares(program: Program, n: int, k: int) -> None:
         violated = r.new_variable(0)
         with m.each_column() as j:
             r.store(bound, j, 0.0)
-            with r.if_then(_magnitude(r.x[j]) > 1.0):
+            with r.if_then(magnitude(r.x[j]) > 1.0):
                 r.store(bound, j, _sign(r.x[j]))
                 r.store(r.x, j, bound[j])
                 r.assign(violated, violated + 1)
@@ -405,19 +393,19 @@ def _add_bounded_least_squares(program: Program, n: int, k: int) -> None:
             r.copy(rest, r.right, n)
             with m.each_column() as j:
                 column = m.column(r.columns, j)
-                is_free = r.new_variable(select(_magnitude(bound[j]) > 0.0, 0.0, 1.0))
+                is_free = r.new_variable(select(magnitude(bound[j]) > 0.0, 0.0, 1.0))
                 m.copy_scaled(m.column(free, j), is_free, column)
                 m.add_multiple(rest, r.new_variable(bound[j] * -1.0), column)
             r.call("least_squares", free, rest, r.threshold, trial, fitted)
             # the part of the way to the trial on which all stay within their bounds
             share, first = r.new_variable(1.0), r.new_variable(-1)
-            with m.each_column() as j, r.if_then(_magnitude(trial[j]) > 1.0):
+            with m.each_column() as j, r.if_then(magnitude(trial[j]) > 1.0):
                 way = (_sign(trial[j]) - r.x[j]) / (trial[j] - r.x[j])
                 part = r.new_variable(way)
                 with r.if_then((part < share) | (first < 0)):
                     r.assign(share, part)
                     r.assign(first, j)
-            with m.each_column() as j, r.if_then(~(_magnitude(bound[j]) > 0.0)):
+            with m.each_column() as j, r.if_then(~(magnitude(bound[j]) > 0.0)):
                 r.store(r.x, j, r.x[j] + share * (trial[j] - r.x[j]))
             with r.if_then(first >= 0):
                 r.store(bound, first, _sign(trial[first]))
@@ -426,7 +414,7 @@ def _add_bounded_least_squares(program: Program, n: int, k: int) -> None:
                 released, worst = r.new_variable(-1), r.new_variable(0.0)
                 with m.each_row() as i:
                     r.store(rest, i, rest[i] - fitted[i])
-                with m.each_column() as j, r.if_then(_magnitude(bound[j]) > 0.0):
+                with m.each_column() as j, r.if_then(magnitude(bound[j]) > 0.0):
                     column = m.column(r.columns, j)
                     gradient = r.new_variable(m.dot(column, rest) * bound[j])
                     limit = r.new_variable(gradient * gradient)

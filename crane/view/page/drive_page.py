@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from crane.codegen.wasm_emitter import emit_wasm_module
+from crane.codegen.llvm.wasm_emitter import emit_wasm_module
 from crane.common.atomic_output import portable_file_name
 from crane.common.errors import ClosureError
 from crane.common.samples import Array
