@@ -11,6 +11,7 @@ from crane.description.parameter_changes import parameters
 from crane.formats.machine_loading import MachineVariants
 from crane.identification.calibration.calibration_result import (
     Calibration,
+    CalibrationChannel,
     FittedParameter,
     correlation_ratio,
     group_samples,
@@ -69,6 +70,22 @@ def test_channels_that_fit_worse_than_before():
     channels = [channel("better", 2.0, 1.0, 0.1), channel("alike", 2.0, 2.1, 0.1)]
     channels += [channel("worse", 2.0, 2.3, 0.1), channel("noise", 0.01, 0.09, 0.1)]
     assert Calibration.degraded_channels.fget(SimpleNamespace(channels=channels)) == ["worse"]
+
+
+@pytest.mark.parametrize("size, exceeds", [(0.0, False), (0.1, False), (0.6, True), (2.0, True)])
+def test_residuals_that_are_more_than_noise(size, exceeds):
+    """Slow ones show in their means, though RMS grows by a sixth only; and outside of training."""
+    random, time = np.random.default_rng(3), np.arange(2000) / 100
+    measured = np.sin(time) + 0.1 * random.normal(size=2000)
+    error, mask = 0.1 * size * np.sqrt(2.0) * np.sin(3 * time), time < 15.0
+    simulated = np.sin(time) + np.where(mask, error, 5.0)
+    channel = CalibrationChannel(
+        "file", "x", "m", time, mask, measured, measured, simulated,
+    )  # fmt: skip
+    assert channel.rms(simulated, True) == pytest.approx(0.1 * np.hypot(1, size), rel=0.03)
+    assert channel.exceeds_noise == exceeds
+    one = FittedParameter("a", 1.0, 2.0, 0.1, False, False, has_model_error=exceeds)
+    assert one.remark == ("excludes model error" if exceeds else "")
 
 
 class Fake:

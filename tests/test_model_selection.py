@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import crane
+from crane.common.errors import SimulationError
 from crane.formats.machine_loading import MachineVariants
-from crane.identification.calibration import model_selection
+from crane.identification.calibration import model_selection, multi_start
 from crane.identification.calibration.levenberg_marquardt import bounded_step
 from crane.identification.calibration.model_selection import (
     LinearizedSelection,
@@ -123,6 +124,9 @@ class SimulatedSearch:
         unknowns = [x for x in linear.problem.unknowns if x.name in names]
         self.problem = SimpleNamespace(unknowns=unknowns, simulation_count=0)
         self.prior = np.ones(len(unknowns))
+        self.training_cases = [
+            SimpleNamespace(train_mask=np.ones(1200, dtype=bool), sensors=["x", "y"])
+        ]
 
     def restricted_search(self, problem, z):
         return SimulatedSearch([x.name for x in problem.unknowns], self)
@@ -157,6 +161,49 @@ def test_what_a_simulation_needs_stays(monkeypatch, is_simulated):
     names = [x.name for x in fewer.problem.unknowns]
     assert names[:2] == ["gain", "offset"] and ("twin" in names) == is_simulated
     assert [x.name for x in steps[1:3]] == ["gain", "offset"]
+
+
+class RaceSearch:
+    """A search of one unknown that found minima with smoothed friction; sharp ones lie at z^2."""
+
+    prior, start = np.array([0.5]), np.zeros(1)
+    training_cases = (SimpleNamespace(train_mask=np.arange(5) > 0, sensors=["x"]),)
+
+    def __init__(self, minima, errors):
+        self.minima = [SimpleNamespace(z=np.array([z])) for z in minima]
+        self.channel_scales, self.redundancies = {"x": 1.0}, {"x": 2.0}
+        self._errors, self.sharpened = errors, []
+
+    def sharpen_friction(self, z):
+        assert (self.channel_scales, self.redundancies) == ({"x": 1.0}, {"x": 2.0})
+        self.sharpened.append(float(z[0]))
+        if self._errors[float(z[0])] is None:
+            raise SimulationError("no motion")
+        self.channel_scales, self.redundancies = {"x": 2.0 + z[0]}, {"x": 1.0 + z[0]}
+        return z**2
+
+    def training_errors(self, z):
+        return {"x": self._errors[float(np.sqrt(z[0]))]}
+
+
+@pytest.mark.parametrize(
+    "minima, errors, best, tried",
+    [
+        ([1.0, 3.0], {1.0: 1.0, 3.0: 0.1}, 1.0, [1.0, 3.0]),  # 0.25 against 20.25 - 9.2
+        ([1.0, 2.0], {1.0: 1.0, 2.0: 0.01}, 2.0, [1.0, 2.0]),  # 0.25 against 4 - 18.4
+        ([1.0, 1.01, 2.0], {1.0: 1.0, 2.0: 0.01}, 1.0, [1.0]),  # the same one twice
+        ([1.0, 2.0], {1.0: 1.0, 2.0: None}, 1.0, [1.0, 2.0]),
+    ],
+)
+def test_the_friction_model_decides_between_two_minima(monkeypatch, minima, errors, best, tried):
+    """By the squares of independent samples and the prior, each minimum with its own scales."""
+    monkeypatch.setattr(multi_start, "_smoothed_minimum", lambda search: search.minima[0].z)
+    search = RaceSearch(minima, errors)
+    assert multi_start.lowest_minimum(search) == best**2
+    assert search.sharpened == tried and search.channel_scales == {"x": 2.0 + best}
+    search.redundancies = {"x": 2.0}
+    expected = 4 / 2.0 * np.log(errors[best] ** 2) + (0.5 * best**2) ** 2
+    assert multi_start.simulated_score(search, np.array([best**2])) == pytest.approx(expected)
 
 
 def test_pins_of_a_cylinder():

@@ -356,6 +356,21 @@ def _calibration_result(
     correlation = finite / np.outer(divisors, divisors)
     pairs = np.argwhere(np.abs(np.tril(correlation, -1)) > _MAX_CORRELATION).tolist()
     correlated = [(unknowns[j].name, unknowns[i].name, float(correlation[i, j])) for i, j in pairs]
+    final_residuals = [problem.residuals(case, z) for case in problem.cases]
+    channels = [
+        CalibrationChannel(
+            case.name,
+            name,
+            units[name],
+            case.file_time,
+            case.train_mask,
+            case.measured[:, k],
+            old[:, k] + case.measured[:, k],
+            new[:, k] + case.measured[:, k],
+        )
+        for case, old, new in zip(problem.cases, initial_residuals, final_residuals, strict=True)
+        for k, name in enumerate(case.sensors)
+    ]
     parameters = []
     for i, unknown in enumerate(unknowns):
         value, scale = values[unknown.name], unknown.scale
@@ -372,23 +387,9 @@ def _calibration_result(
                 parameter_unit(problem.machine.tree, unknown.name),
                 unknown.members,
                 estimate.profile_ends[i],
+                any(x.exceeds_noise for x in channels),
             )
         )
-    final_residuals = [problem.residuals(case, z) for case in problem.cases]
-    channels = [
-        CalibrationChannel(
-            case.name,
-            name,
-            units[name],
-            case.file_time,
-            case.train_mask,
-            case.measured[:, k],
-            old[:, k] + case.measured[:, k],
-            new[:, k] + case.measured[:, k],
-        )
-        for case, old, new in zip(problem.cases, initial_residuals, final_residuals, strict=True)
-        for k, name in enumerate(case.sensors)
-    ]
     return Calibration(
         fitted,
         tuple(parameters),

@@ -21,6 +21,7 @@ from crane.identification.calibration.recording_case import NOISE_LEVEL, noise_s
 from crane.machine.machine import Machine
 
 _DEGRADATION_FACTOR = 1.1  # times the residual before
+_WINDOW_SIZE = 20  # samples whose mean shows slow residuals
 LOWER_MINIMUM_WARNING = (
     "There is a lower minimum near these parameters: calibrate again from there, or fit fewer "
     "parameters."
@@ -43,6 +44,8 @@ class FittedParameter:
         unit: SI unit, "" for a common factor.
         members: Parameters that it changed, with their values before.
         profile_ends: Profile likelihood at the ends of the interval.
+        has_model_error: Whether residuals are more than noise: its interval is that of noise, and
+            excludes the error of the model.
     """
 
     name: str
@@ -54,6 +57,7 @@ class FittedParameter:
     unit: str = ""
     members: tuple[tuple[str, float], ...] = ()
     profile_ends: ProfileEnds = ProfileEnds()
+    has_model_error: bool = False
 
     @property
     def is_common_factor(self) -> bool:
@@ -81,7 +85,8 @@ class FittedParameter:
             if self.at_bound
             else "not determined by the recordings" * self.is_unidentifiable
         )
-        return ", ".join(filter(None, (status, self.profile_ends.remark)))
+        excluded = "excludes model error" * self.has_model_error
+        return ", ".join(filter(None, (status, self.profile_ends.remark, excluded)))
 
     @property
     def notes(self) -> dict[str, str]:
@@ -136,6 +141,14 @@ class CalibrationChannel(OneLineRepr):
         mask = self.train_mask if training else np.logical_not(self.train_mask)
         residual = (simulated - self.measured)[mask]
         return root_mean_square(residual) if len(residual) else float("nan")
+
+    @property
+    def exceeds_noise(self) -> bool:
+        """Whether the residual over the training data, or its means, are more than white noise."""
+        residual, size = (self.simulated_after - self.measured)[self.train_mask], _WINDOW_SIZE
+        means = residual[: len(residual) // size * size].reshape(-1, size).mean(axis=1)
+        most = NOISE_LEVEL * self.noise * np.sqrt([len(means) / size, len(residual)])
+        return bool(np.any([np.linalg.norm(means), np.linalg.norm(residual)] > most))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -219,12 +232,7 @@ class Calibration(Result):
     @property
     def unexplained_channels(self) -> list[str]:
         """Channels whose residuals over the training data are more than noise."""
-        noisy = [
-            x.name
-            for x in self.channels
-            if x.train_mask.any() and x.rms(x.simulated_after, True) > NOISE_LEVEL * x.noise
-        ]
-        return list(dict.fromkeys(noisy))
+        return list(dict.fromkeys(x.name for x in self.channels if x.exceeds_noise))
 
     @property
     def quality_warnings(self) -> list[str]:

@@ -34,7 +34,7 @@ from crane.identification.calibration.levenberg_marquardt import (
     LevenbergMarquardt,
     bounded_step,
 )
-from crane.identification.calibration.multi_start import smoothed_minimum
+from crane.identification.calibration.multi_start import lowest_minimum, simulated_score
 
 MAX_CORRELATION = 0.98  # of parameters that are both kept
 MAX_PRIOR_SHARE = 0.7  # of the deviation of a prior, up to which recordings determine a parameter
@@ -143,13 +143,6 @@ class LinearizedSelection:
         penalty = float(z @ self._prior @ z)
         return float(self._counts @ np.log(squares)) + penalty + 2.0 * len(parameters)
 
-    def simulated_criterion(self, search: LevenbergMarquardt, z: Array) -> float:
-        """Score of simulated unknowns of a search, without blocks left out."""
-        errors = np.array(list(search.training_errors(z).values()))
-        return 2.0 * float(self._counts @ np.log(errors) + len(search.problem.unknowns)) + float(
-            np.sum((search.prior * z) ** 2)
-        )
-
     def with_starts(self, parameters: Sequence[int]) -> list[int]:
         """Parameters and all starts of recordings."""
         return [*parameters, *range(self._count, len(self._z))]
@@ -239,7 +232,7 @@ def select_parameters(search: LevenbergMarquardt, kept_names: Sequence[str]) -> 
         The selected model.
     """
     names = [x.name for x in search.problem.unknowns]
-    z = search.sharpen_friction(smoothed_minimum(search))
+    z = lowest_minimum(search)
     for _ in range(_WEIGHT_ROUNDS):  # before its end a search leaves what looks like model errors
         search.update_scales(z)
         search.has_equal_channels = False
@@ -277,7 +270,7 @@ def _fewer_parameters(
     )
     chosen, steps = selection.path()
     others = sorted(set(range(len(parameters))) - set(chosen), key=lambda i: -abs(z[i]))
-    criterion = selection.simulated_criterion(search, z)
+    score = simulated_score(search, z) + 2.0 * len(parameters)
     while others:
         unknowns = selection.with_starts(sorted(chosen))
         problem = subset_problem(search.problem, sorted(chosen))
@@ -285,7 +278,7 @@ def _fewer_parameters(
         start = min((z[unknowns], selection.fit(unknowns)[unknowns]), key=fewer.cost)
         minimum = fewer.minimize(start, COMPARED_COST_TOLERANCE).z
         search.problem.simulation_count = problem.simulation_count
-        if selection.simulated_criterion(fewer, minimum) <= criterion:
+        if simulated_score(fewer, minimum) + 2.0 * len(problem.unknowns) <= score:
             return fewer, minimum, steps
         half = (len(others) + 1) // 2
         chosen, others = [*chosen, *others[:half]], others[half:]

@@ -3,7 +3,12 @@
 Over a whole motion, one oscillation more or less is a local minimum, and so is a crane that never
 lifts. Therefore the search starts from the machine, and from the best of many points of a Sobol
 sequence, which are simulated only. In three rounds the better half of the searches goes on. A
-search from the machine that leaves nothing but noise needs no others.
+search from the machine that leaves nothing but noise needs no others. Two of the minima with
+smoothed friction are followed to the friction model, where the lower score,
+
+    sum_c n_c ln(mean square of channel c) + sum (z / prior)^2,
+
+with the number n_c of independent samples decides: smoothed friction hides what rings.
 """
 
 from contextlib import suppress
@@ -25,15 +30,45 @@ _ROUNDS = ((7, 3), (3, 4), (2, 40))  # searches and iterations of each round
 _SAMPLE_DEVIATIONS = 2.0  # of a prior, within which points lie
 _SAMPLE_FACTOR = 3.0  # of a start without a prior, likewise
 _PRIOR_SHARE = 0.98  # of the normal distribution
+_SAME_MINIMUM = 0.1  # distance of scaled unknowns, up to which minima are the same
 
 
 def minimize_from_starts(search: LevenbergMarquardt) -> Array:
     """Minimum (p,) of a search, which goes on from its initial guess if it has one."""
-    z = smoothed_minimum(search) if search.initial_guess is None else search.initial_guess
-    return search.nearest_minimum(search.sharpen_friction(z))
+    z = search.initial_guess
+    sharp = lowest_minimum(search) if z is None else search.sharpen_friction(z)
+    return search.nearest_minimum(sharp)
 
 
-def smoothed_minimum(search: LevenbergMarquardt) -> Array:
+def lowest_minimum(search: LevenbergMarquardt) -> Array:
+    """Minimum (p,) of the lowest score with the friction model, from several starts."""
+    z = _smoothed_minimum(search)
+    starts = [z, *(x.z for x in search.minima[1:2] if np.abs(x.z - z).max() > _SAME_MINIMUM)]
+    scales = search.channel_scales, search.redundancies
+    found: list[tuple[Array, dict[str, float], dict[str, float]]] = []
+    for start in starts:
+        search.channel_scales, search.redundancies = scales
+        with suppress(*[SimulationError] * bool(found)):
+            z = search.sharpen_friction(start)
+            found.append((z, search.channel_scales, search.redundancies))
+    search.redundancies = found[0][-1]
+    best = min(found, key=lambda x: simulated_score(search, x[0]))
+    z, search.channel_scales, search.redundancies = best
+    return z
+
+
+def simulated_score(search: LevenbergMarquardt, z: Array) -> float:
+    """Score of simulated unknowns, see the module."""
+    counts = dict.fromkeys(search.channel_scales, 0.0)
+    for case in search.training_cases:
+        for name in case.sensors:
+            counts[name] += float(case.train_mask.sum()) / search.redundancies[name]
+    errors = search.training_errors(z).items()
+    likelihood = sum(2.0 * counts[name] * float(np.log(x)) for name, x in errors)
+    return likelihood + float(np.sum((search.prior * z) ** 2))
+
+
+def _smoothed_minimum(search: LevenbergMarquardt) -> Array:
     """Lowest minimum (p,) found with smoothed friction."""
     search.start_with_smoothed_friction()
     start = np.zeros(search.problem.unknown_count)
