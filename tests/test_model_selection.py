@@ -201,6 +201,7 @@ def test_the_friction_model_decides_between_two_minima(monkeypatch, minima, erro
     search = RaceSearch(minima, errors)
     assert multi_start.lowest_minimum(search) == best**2
     assert search.sharpened == tried and search.channel_scales == {"x": 2.0 + best}
+    assert search.minima[0].z == best and len(search.minima) == len(minima)
     search.redundancies = {"x": 2.0}
     expected = 4 / 2.0 * np.log(errors[best] ** 2) + (0.5 * best**2) ** 2
     assert multi_start.simulated_score(search, np.array([best**2])) == pytest.approx(expected)

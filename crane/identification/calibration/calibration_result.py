@@ -170,7 +170,8 @@ class Calibration(Result):
         selection: Steps of the selection of parameters.
         block_errors: By channel, RMS error in blocks of the training data that were left out of
             the fit: of all blocks, and of the worst.
-        minima: Costs of the minima of searches from several starts, relative to the lowest.
+        minima: Costs of the minima of searches from several starts with smoothed friction,
+            relative to the first, from which the search went on.
         findings: Texts about what is not plausible.
     """
 
@@ -312,8 +313,8 @@ class Calibration(Result):
         lines += ["", f"RMS of simulated less measured; {self.simulation_count} simulations."]
         if len(self.minima) > 1:
             minima = ", ".join(f"{x:.3g}" for x in self.minima)
-            lines += ["", f"Searches from several starts ended at {minima} times the "
-                      "lowest sum of squares."]  # fmt: skip
+            lines += ["", f"Searches from several starts ended at {minima} times the sum of "
+                      "squares of the first, from which this fit went on."]  # fmt: skip
         if self.changes:
             lines += ["", f"    {self.command_line_options}"]
         return "\n".join(lines)

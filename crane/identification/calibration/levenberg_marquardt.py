@@ -126,7 +126,7 @@ class LevenbergMarquardt:
         has_equal_channels: Whether all channels count by the largest redundancy, not by their own.
         prior: (p,) weights of the priors.
         initial_guess: (p,) unknowns from which it goes on, None for a search of its own.
-        minima: Minima of the searches from several starts, the lowest first.
+        minima: Minima of the searches from several starts, first the one that goes on.
     """
 
     def __init__(

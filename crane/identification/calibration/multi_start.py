@@ -42,8 +42,9 @@ def minimize_from_starts(search: LevenbergMarquardt) -> Array:
 
 def lowest_minimum(search: LevenbergMarquardt) -> Array:
     """Minimum (p,) of the lowest score with the friction model, from several starts."""
-    z = _smoothed_minimum(search)
-    starts = [z, *(x.z for x in search.minima[1:2] if np.abs(x.z - z).max() > _SAME_MINIMUM)]
+    smoothed = _smoothed_minimum(search)
+    starts = [smoothed]
+    starts += [x.z for x in search.minima[1:2] if np.abs(x.z - smoothed).max() > _SAME_MINIMUM]
     scales = search.channel_scales, search.redundancies
     found: list[tuple[Array, dict[str, float], dict[str, float]]] = []
     for start in starts:
@@ -52,8 +53,10 @@ def lowest_minimum(search: LevenbergMarquardt) -> Array:
             z = search.sharpen_friction(start)
             found.append((z, search.channel_scales, search.redundancies))
     search.redundancies = found[0][-1]
-    best = min(found, key=lambda x: simulated_score(search, x[0]))
-    z, search.channel_scales, search.redundancies = best
+    scores = [simulated_score(search, z) for z, *_ in found]
+    best = int(np.argmin(scores))
+    search.minima.insert(0, search.minima.pop(best))
+    z, search.channel_scales, search.redundancies = found[best]
     return z
 
 

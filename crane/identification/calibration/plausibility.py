@@ -27,7 +27,7 @@ from crane.recordings.timeseries import table_column
 
 PAYLOAD_MASS = "payload.mass"
 _MAX_DEVIATIONS = 3.0  # standard deviations of what is believable
-_NEAR_MINIMUM = 1.1  # cost of another minimum that is reported, relative to the lowest
+_NEAR_MINIMUM = 0.1  # relative excess of the cost of another minimum that is reported
 _TEST_MASS = 100.0  # [kg]
 _SAMPLE_COUNT = 300  # samples of a recording
 _SMOOTHING_SHARE = 30  # samples of a recording per window of a speed
@@ -155,14 +155,14 @@ def near_minima(problem: CalibrationProblem, minima: Sequence[SearchState]) -> I
 
     Args:
         problem: Problem of the search from several starts.
-        minima: Its minima, the lowest first.
+        minima: Its minima with smoothed friction, first the one from which it went on.
     """
     for other in minima[1:]:
         values = problem.values(other.z)
         far = np.abs(other.z - minima[0].z) > 1.0
         names = [x.name for x, is_far in zip(problem.unknowns, far, strict=False) if is_far]
-        if other.cost < _NEAR_MINIMUM * minima[0].cost and names:
-            yield (
-                f"Another minimum has {100 * (other.cost / minima[0].cost - 1):.1f} % more "
-                f"squares: {', '.join(f'{name} = {values[name]:.4g}' for name in names)}"
-            )
+        excess = other.cost / minima[0].cost - 1.0
+        if excess < _NEAR_MINIMUM and names:
+            text = f"{100 * abs(excess):.1f} % {'more' if excess >= 0.0 else 'less'} squares"
+            numbers = ", ".join(f"{name} = {values[name]:.4g}" for name in names)
+            yield f"Another minimum has {text}: {numbers}"
