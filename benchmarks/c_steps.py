@@ -71,9 +71,7 @@ class CMachine:
 
     def __init__(self, program: InstanceProgram, step: str, folder: Path, build: tuple[str, ...]):
         sources = CSources(program, "m")
-        members = sources.members()
-        first = members[program.layout.start_index("inputs")]
-        driver = _DRIVER.replace("@", first).replace("STEP", step)
+        driver = _DRIVER.replace("@", sources.first_input()).replace("STEP", step)
         files = {"m.h": sources.header(), "m.c": sources.source(), "driver.c": driver}
         for name, text in files.items():
             (folder / name).write_text(text)

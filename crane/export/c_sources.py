@@ -142,7 +142,7 @@ class CSources:
             "NAME": self.name, "UPPER": self.name.upper(), "MACHINE": machine.name,
             "VERSION": crane.__version__, "NQ": str(machine.model.nv),
             "N": str(len(machine.active)), "INPUT_COUNT": str(len(inputs)),
-            "FIRST_INPUT": self._first_input(),
+            "FIRST_INPUT": self.first_input(),
             "OUTPUTS": str(self._program.output_count), **further,
         }  # fmt: skip
         return re.sub(r"@([A-Z_]+)@", lambda match: values[match[1]], text)
@@ -169,7 +169,7 @@ class CSources:
             found[name] = indices
         return found
 
-    def _first_input(self) -> str:
+    def first_input(self) -> str:
         """Member of the first input; the time where there is none."""
         inputs = self._program.layout.indices("inputs")
         return next((name for name, (i, *_) in self._members.items() if i in inputs), "time")
@@ -249,7 +249,7 @@ class CSources:
             arguments = f'"{key}", found, {key}[i], {sizes[key]}, {scale}, bound_of_{key}[i][0]'
             checks += [f"{name}_{key}(&m, q, v, x, found);", f"compare({arguments});"]
         set_inputs = f"for (j = 0; j < {inputs.shape[1]}; ++j)\n            " + (
-            f"(&m.{self._first_input()})[j] = ({name}_real)inputs[i][j];" if inputs.size else ";"
+            f"(&m.{self.first_input()})[j] = ({name}_real)inputs[i][j];" if inputs.size else ";"
         )
         tables = vectors.states | vectors.values | bounds | {"inputs": inputs, "motion": motion}
         values = {
