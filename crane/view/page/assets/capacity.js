@@ -53,10 +53,12 @@ function ticks(low, high, room) {
 }
 
 function draw() {
+  chart.style.height = "";  // as large as the page lets it be, and no higher than is drawn
   const box = chart.getBoundingClientRect(), [low, high] = [data.low, data.high];
   const room = [box.width - EDGE.left - EDGE.right, box.height - EDGE.top - EDGE.bottom];
   scale = Math.min(room[0] / (high[0] - low[0]), room[1] / (high[1] - low[1]));
   const size = [scale * (high[0] - low[0]), scale * (high[1] - low[1])];
+  chart.style.height = `${EDGE.top + size[1] + EDGE.bottom}px`;
   const left = EDGE.left + (room[0] - size[0]) / 2, base = EDGE.top + size[1];
   origin = [left - scale * low[0], base + scale * low[1]];
   chart.replaceChildren(cells(), axes(left, base, size), lines(), make("g", { id: "cursor" }));
