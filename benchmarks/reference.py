@@ -144,9 +144,9 @@ class CurveMotion:
         return quad(slowness, start[0], end[0], epsabs=1e-13, epsrel=1e-13, limit=500)[0]
 
 
-def crane_positions(problem: Problem) -> Array:
+def crane_positions(problem: Problem, tolerance: float = TOLERANCE) -> Array:
     """Centres of mass (k, n, 3) by crane's DOP853."""
-    simulator = CraneSimulator(problem, "DOP853", TOLERANCE)
+    simulator = CraneSimulator(problem, "DOP853", tolerance)
     return np.array([state.position for state in simulator.states(simulator.run())])
 
 
