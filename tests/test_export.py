@@ -24,7 +24,7 @@ from crane.description.force_elements import Friction
 from crane.export import InstanceProgram, write_c
 from crane.export.c_sources import CSources
 from crane.export.instance_program import DYNAMICS_ROUTINES
-from crane.export.instance_routines import BEYOND_CHART, TOO_MANY_CALLS
+from crane.export.instance_routines import BEYOND_CHART, HALTED, TOO_MANY_CALLS
 from crane.machine.payload import Payload
 
 COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
@@ -419,6 +419,11 @@ def test_a_dead_centre_ends_the_motion_with_a_status(tmp_path):
     motion = CubicHermiteSpline(expected.time, expected.q[:, 0], expected.v[:, 0])
     assert last == pytest.approx(motion(end), abs=1e-9)
     assert 0.88 < last < expected.q.max() < 0.9 + 1e-9  # of rods of 0.3 m and 0.6 m
+    library.at.q[:], library.at.v_a[:] = machine.home, 0.0
+    assert library("initialize") == 1 and library("advance") == 1
+    for step in (0.0, -STEP, np.inf, np.nan):
+        library.at.step[:], time = step, library.at.time.copy()
+        assert library("advance") == HALTED and library.at.time == time
 
 
 @needs_compiler

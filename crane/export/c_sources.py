@@ -34,7 +34,7 @@ _TEMPLATES = (
 )  # fmt: skip
 _TEXTS = {
     "initialize": "Close the loops from the active coordinates in q, the others as first guess,\n"
-    "and start at rest; pressures hold the machine, joints with stiction stick or slip.",
+    "and start at rest at `time`; pressures hold the machine, joints with stiction stick or slip.",
     "update_modes": "After an event, or a change of parameters during a motion: find which joints "
     "stick.",
     "advance": "Integrate over `step` with controlled errors. The inputs go linearly from those\n"

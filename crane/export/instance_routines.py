@@ -54,6 +54,7 @@ STATUS_TEXTS = MappingProxyType(
 )
 _FIRST_STEP_SHARE, _LONGEST_FIRST_STEP = 0.01, 5e-4  # as `ErrorControlledStepper.run`
 _STEP_REDUCTION_AFTER_EVENT = 0.2
+_LONGEST_STEP = 1e300  # [s]
 _TIME_TOLERANCE = 1e-9  # of a step
 _LEAST_MASS = 1e-30  # by which moments are divided [kg]
 
@@ -182,7 +183,7 @@ class InstanceRoutines(KinematicsRoutines):
         state, lengths = self._part("q"), self._part("lengths")
         bounds, tolerances = (self._part(x) for x in ("bounds", "tolerances"))
         step = r.new_variable(self._element("step"))
-        with r.if_then(~(step > 0.0)):
+        with r.if_then(~((step > 0.0) & (step < _LONGEST_STEP))):
             r.return_value(HALTED)
         if self._dead_times is not None:
             self._call_or_return(r, TOO_MANY_CALLS, "append_call", r.instance)

@@ -83,7 +83,7 @@ def _stack_size(linked: LinkedFunction) -> int:
     return sum(_NUMBER_SIZE * size + _ALIGNMENT for size in sizes)
 
 
-class _ModuleReader:
+class _WasmModuleReader:
     """Reads numbers and texts of a module."""
 
     def __init__(self, data: bytes):
@@ -118,12 +118,12 @@ def _link(code: bytes, pages: int) -> bytes:
     """A module from an object file: with a memory, a stack and exports of all global functions."""
     found: dict[int, bytes] = {}
     symbols = b""
-    reader = _ModuleReader(code[len(_HEADER) :])
+    reader = _WasmModuleReader(code[len(_HEADER) :])
     while reader:
         number, content = reader.number(), reader.content()
         if number != _CUSTOM:
             found[number] = content
-        elif (custom := _ModuleReader(content)).content() == b"linking":
+        elif (custom := _WasmModuleReader(content)).content() == b"linking":
             symbols = custom.rest()
     assert _DATA not in found, "formulas have no data"
     functions = [_sized(b"math") + _sized(name) + b"\x00" + _number(kind)
@@ -143,7 +143,7 @@ def _link(code: bytes, pages: int) -> bytes:
 
 def _imported_functions(section: bytes) -> Iterator[tuple[bytes, int]]:
     """Names and types of functions; not the memory and the stack, of two numbers each."""
-    reader = _ModuleReader(section)
+    reader = _WasmModuleReader(section)
     for _ in range(reader.number()):
         reader.content()  # its module
         name, kind, number = reader.content(), reader.number(), reader.number()
@@ -155,10 +155,10 @@ def _imported_functions(section: bytes) -> Iterator[tuple[bytes, int]]:
 
 def _global_functions(linking: bytes) -> Iterator[tuple[bytes, int]]:
     """Names and indices of defined functions that other object files may call."""
-    reader = _ModuleReader(linking)
+    reader = _WasmModuleReader(linking)
     reader.number()  # version
     while reader:
-        part, content = reader.number(), _ModuleReader(reader.content())
+        part, content = reader.number(), _WasmModuleReader(reader.content())
         for _ in range(content.number() if part == _SYMBOL_TABLE else 0):
             kind, flags, index = content.number(), content.number(), content.number()
             has_name = not flags & _UNDEFINED or flags & _EXPLICIT_NAME
