@@ -42,6 +42,7 @@ BLOCK_DURATION = 3.0  # [s] of a block that is left out
 _BLOCK_RANGE = 3, 8  # number of blocks of a recording
 _MAX_COST = 4.0  # of the score, of a parameter that the recordings do not determine: chi-square
 _WEIGHT_ROUNDS = 3  # of weights by redundancies of all candidates
+_SELECTION_ITERATIONS = 12  # of the fit of a selected set
 _BLOCK_ITERATIONS = 3  # of the fits without a block
 
 
@@ -255,9 +256,9 @@ def _fewer_parameters(
 ) -> tuple[LevenbergMarquardt, Array, list[SelectionStep]]:
     """Search and minimum of fewer parameters, or of these, and the steps that lead there.
 
-    A linearization does not hold as far as the machine's values. So the selected set is fitted by
-    simulation; if that is worse than with all parameters, the half of the others joins that the
-    recordings moved farthest, in deviations of their priors.
+    A linearization does not hold as far as the machine's values. So the half of the others that the
+    recordings moved least, in deviations of their priors, is removed first, and the rest fitted by
+    simulation; if that is worse than with all parameters, the half of this half, and so on.
 
     Args:
         search: Search, linearized at its minimum.
@@ -272,16 +273,19 @@ def _fewer_parameters(
     others = sorted(set(range(len(parameters))) - set(chosen), key=lambda i: -abs(z[i]))
     score = simulated_score(search, z) + 2.0 * len(parameters)
     while others:
-        unknowns = selection.with_starts(sorted(chosen))
-        problem = subset_problem(search.problem, sorted(chosen))
+        others = others[len(others) // 2 :]
+        remaining = [i for i in range(len(parameters)) if i not in others]
+        unknowns = selection.with_starts(remaining)
+        problem = subset_problem(search.problem, remaining)
         fewer = search.restricted_search(problem, z[unknowns])
         start = min((z[unknowns], selection.fit(unknowns)[unknowns]), key=fewer.cost)
-        minimum = fewer.minimize(start, COMPARED_COST_TOLERANCE).z
+        minimum = fewer.minimize(
+            start, COMPARED_COST_TOLERANCE, max_iterations=_SELECTION_ITERATIONS
+        ).z
         search.problem.simulation_count = problem.simulation_count
         if simulated_score(fewer, minimum) + 2.0 * len(problem.unknowns) <= score:
             return fewer, minimum, steps
-        half = (len(others) + 1) // 2
-        chosen, others = [*chosen, *others[:half]], others[half:]
+        others = others[1:]
     return search, z, steps
 
 
@@ -291,6 +295,7 @@ def subset_problem(problem: CalibrationProblem, chosen: Sequence[int]) -> Calibr
         problem.machine, [problem.unknowns[i] for i in chosen], problem.cases
     )
     smaller.smooth, smaller.slopes = problem.smooth, problem.slopes
+    smaller.derivative_tolerance = problem.derivative_tolerance
     smaller.simulation_count = problem.simulation_count
     return smaller
 

@@ -3,6 +3,15 @@
 // interval of frames above which fewer pixels are drawn [ms]; displays may have 50 Hz
 const SMOOTH = 1000 / (isSoftware ? 57 : 40);
 
+// A round shape has fewer corners where a processor computes them.
+function drawnShape({ geometry }) {
+    const { type, parameters } = geometry;
+    if (!isSoftware) return geometry.clone();
+    if (type === "CylinderGeometry") return new THREE.CylinderGeometry(parameters.radiusTop, parameters.radiusBottom, parameters.height, 14);
+    if (type === "SphereGeometry") return new THREE.SphereGeometry(parameters.radius, 14, 9);
+    return geometry.clone();
+}
+
 // The shapes of a link as one mesh with a colour at each corner, which is drawn by one call.
 function merge(group) {
     group.updateMatrixWorld(true);
@@ -11,7 +20,7 @@ function merge(group) {
     group.traverse((item) => { if (item.isMesh && item.material.opacity === 1) meshes.push(item); });
     let first = 0;
     for (const mesh of meshes) {
-        const shape = mesh.geometry.clone().applyMatrix4(back.clone().multiply(mesh.matrixWorld));
+        const shape = drawnShape(mesh).applyMatrix4(back.clone().multiply(mesh.matrixWorld));
         if (!shape.attributes.normal) shape.computeVertexNormals();
         const { r, g, b } = mesh.material.color, count = shape.attributes.position.count;
         for (const name of ["position", "normal"]) arrays[name].push(shape.attributes[name].array);
@@ -42,7 +51,9 @@ class DriveSpace extends Space {
         this.load = this.ball(1, 0x8a6a3b, 1);
         this.marks.add(this.load);
         this.arrows = drive.loads.map(() => this.arrow());
-        this.ratio = this.most = Math.min(window.devicePixelRatio, isSoftware ? 1 : 2);
+        this.most = Math.min(window.devicePixelRatio, isSoftware ? 1 : 2);
+        this.ratio = isSoftware ? 0.7 * this.most : this.most;
+        viewer.renderer.setPixelRatio(this.ratio);
         [this.interval, this.last, this.checked, this.goal] = [16, 0, 0, null];
         for (const group of Object.values(this.groups)) merge(group);
         if (isSoftware) this.dim();
@@ -131,6 +142,7 @@ class DriveSpace extends Space {
     draw(now) {
         const passed = now - this.last;
         this.last = now;
+        if (!viewer.needs_render) return;
         if (passed < 500) this.interval += 0.1 * (passed - this.interval);
         if (now - this.checked > 700) {
             this.checked = now;
@@ -140,9 +152,8 @@ class DriveSpace extends Space {
             if (Math.abs(wished - this.ratio) > 0.02) {
                 this.ratio = wished;
                 viewer.renderer.setPixelRatio(wished); // which clears the canvas
-                viewer.set_dirty();
             }
         }
-        if (viewer.needs_render) viewer.render();
+        viewer.render();
     }
 }
