@@ -134,7 +134,7 @@ class SimulatedSearch:
     def cost(self, z):
         return float(z @ z)
 
-    def minimize(self, z, tolerance):
+    def minimize(self, z, tolerance, max_iterations):
         return SimpleNamespace(z=z)
 
     def training_errors(self, z):
@@ -157,7 +157,7 @@ def test_what_a_simulation_needs_stays(monkeypatch, is_simulated):
     if not is_simulated:
         monkeypatch.setattr(SimulatedSearch, "training_errors", lambda *_: {"x": 0.1, "y": 0.1})
     z = np.array([2.0, -1.0, 0.0, 0.5, 0.0])  # the twin was moved
-    fewer, _, steps = model_selection._fewer_parameters(search, z, [])
+    fewer, _, steps = model_selection._fewer_parameters(search, z, [], [])
     names = [x.name for x in fewer.problem.unknowns]
     assert names[:2] == ["gain", "offset"] and ("twin" in names) == is_simulated
     assert [x.name for x in steps[1:3]] == ["gain", "offset"]

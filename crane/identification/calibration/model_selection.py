@@ -42,7 +42,7 @@ BLOCK_DURATION = 3.0  # [s] of a block that is left out
 _BLOCK_RANGE = 3, 8  # number of blocks of a recording
 _MAX_COST = 4.0  # of the score, of a parameter that the recordings do not determine: chi-square
 _WEIGHT_ROUNDS = 3  # of weights by redundancies of all candidates
-_SELECTION_ITERATIONS = 12  # of the fit of a selected set
+_MAX_ITERATIONS = 12  # of the fit of a selected set
 _BLOCK_ITERATIONS = 3  # of the fits without a block
 
 
@@ -240,11 +240,12 @@ def select_parameters(search: LevenbergMarquardt, kept_names: Sequence[str]) -> 
         search.problem.smooth, search.problem.slopes = FINAL_SMOOTHING
         z = search.minimize(z, COMPARED_COST_TOLERANCE).z
     steps, count = list[SelectionStep](), len(names) + 1
+    rejected = list[set[str]]()
     while len(search.problem.unknowns) < count:
         count = len(search.problem.unknowns)
         search.update_scales(z)
         search.linearize_for_covariance(z)
-        search, z, last = _fewer_parameters(search, z, kept_names)
+        search, z, last = _fewer_parameters(search, z, kept_names, rejected)
         steps = steps or last
     z = search.nearest_minimum(z)
     selected = {x.name for x in search.problem.unknowns}
@@ -252,18 +253,23 @@ def select_parameters(search: LevenbergMarquardt, kept_names: Sequence[str]) -> 
 
 
 def _fewer_parameters(
-    search: LevenbergMarquardt, z: Array, kept_names: Sequence[str]
+    search: LevenbergMarquardt,
+    z: Array,
+    kept_names: Sequence[str],
+    rejected: list[set[str]],
 ) -> tuple[LevenbergMarquardt, Array, list[SelectionStep]]:
     """Search and minimum of fewer parameters, or of these, and the steps that lead there.
 
-    A linearization does not hold as far as the machine's values. So the half of the others that the
-    recordings moved least, in deviations of their priors, is removed first, and the rest fitted by
-    simulation; if that is worse than with all parameters, the half of this half, and so on.
+    A linearization does not hold as far as the machine's values. So the selected set is fitted by
+    simulation; if that is worse than with all parameters, the half of the others joins that the
+    recordings moved farthest, in deviations of their priors. Sets within a rejected one are not
+    fitted.
 
     Args:
         search: Search, linearized at its minimum.
         z: (p,) minimum.
         kept_names: Parameters that are kept in any case.
+        rejected: Names of sets that were fitted and worse, to which those found here are added.
     """
     parameters = search.problem.unknowns
     selection = LinearizedSelection(
@@ -273,19 +279,21 @@ def _fewer_parameters(
     others = sorted(set(range(len(parameters))) - set(chosen), key=lambda i: -abs(z[i]))
     score = simulated_score(search, z) + 2.0 * len(parameters)
     while others:
-        others = others[len(others) // 2 :]
         remaining = [i for i in range(len(parameters)) if i not in others]
-        unknowns = selection.with_starts(remaining)
-        problem = subset_problem(search.problem, remaining)
-        fewer = search.restricted_search(problem, z[unknowns])
-        start = min((z[unknowns], selection.fit(unknowns)[unknowns]), key=fewer.cost)
-        minimum = fewer.minimize(
-            start, COMPARED_COST_TOLERANCE, max_iterations=_SELECTION_ITERATIONS
-        ).z
-        search.problem.simulation_count = problem.simulation_count
-        if simulated_score(fewer, minimum) + 2.0 * len(problem.unknowns) <= score:
-            return fewer, minimum, steps
-        others = others[1:]
+        names = {parameters[i].name for i in remaining}
+        if not any(names <= x for x in rejected):
+            unknowns = selection.with_starts(remaining)
+            problem = subset_problem(search.problem, remaining)
+            fewer = search.restricted_search(problem, z[unknowns])
+            start = min((z[unknowns], selection.fit(unknowns)[unknowns]), key=fewer.cost)
+            minimum = fewer.minimize(
+                start, COMPARED_COST_TOLERANCE, max_iterations=_MAX_ITERATIONS
+            )
+            search.problem.simulation_count = problem.simulation_count
+            if simulated_score(fewer, minimum.z) + 2.0 * len(names) <= score:
+                return fewer, minimum.z, steps
+            rejected.append(names)
+        others = others[(len(others) + 1) // 2 :]
     return search, z, steps
 
 
