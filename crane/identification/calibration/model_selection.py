@@ -15,8 +15,8 @@ their prior, or that correlate with another one, if they cost nothing.
 
 A linearization does not hold as far as the values of the machine. Therefore the set is fitted by
 simulation, and replaces the larger one only if its score, sum_c n_c ln(mean square) over the
-training data with the same penalties, is not higher; else the half of what it lacks joins that
-was moved farthest.
+training data with the same penalties, is not higher, but for the same small cost of parameters
+that are not determined; else the half of what it lacks joins that was moved farthest.
 It is selected again by the linearization at its minimum, until nothing is left out any more.
 """
 
@@ -278,6 +278,7 @@ def _fewer_parameters(
     chosen, steps = selection.path()
     others = sorted(set(range(len(parameters))) - set(chosen), key=lambda i: -abs(z[i]))
     score = simulated_score(search, z) + 2.0 * len(parameters)
+    undetermined = set(selection.undetermined(range(len(parameters))))
     while others:
         remaining = [i for i in range(len(parameters)) if i not in others]
         names = {parameters[i].name for i in remaining}
@@ -290,7 +291,8 @@ def _fewer_parameters(
                 start, COMPARED_COST_TOLERANCE, max_iterations=_MAX_ITERATIONS
             )
             search.problem.simulation_count = problem.simulation_count
-            if simulated_score(fewer, minimum.z) + 2.0 * len(names) <= score:
+            highest = score + _MAX_COST * len(undetermined & set(others))
+            if simulated_score(fewer, minimum.z) + 2.0 * len(names) <= highest:
                 return fewer, minimum.z, steps
             rejected.append(names)
         others = others[(len(others) + 1) // 2 :]

@@ -30,6 +30,8 @@ _SIGNED_PARAMETERS = (
 )  # fmt: skip
 _MIN_SPOOL_STROKE = 0.05  # of the stroke of a spool, from which a valve counts as open
 _MIN_BANDWIDTH, _MAX_BANDWIDTH = 2.0, 200.0  # bandwidths of spools [1/s]
+# damping of spools, relative to that of the file: deviation, as of the bandwidth, and factor
+_SPOOL_DAMPING_STD, _MAX_SPOOL_DAMPING_FACTOR = 0.5, 4.0
 _DELAY_STD, _MAX_DELAY = 0.1, 0.6  # standard deviation and largest value of delays [s]
 _STROKE_DELAY_STD = 0.02  # standard deviation of delays of length sensors [s]
 _ANGLE_ZERO_STD = 0.05  # standard deviation of zeros of angle sensors [rad]
@@ -291,6 +293,9 @@ def _spool_candidates(
     if spool.bandwidth:
         low, high = min(spool.bandwidth, _MIN_BANDWIDTH), max(spool.bandwidth, _MAX_BANDWIDTH)
         yield _candidate(f"{name}.bandwidth", spool.bandwidth, 0.5 * spool.bandwidth, low, high)
+        yield _positive_candidate(
+            f"{name}.damping", spool.damping, _SPOOL_DAMPING_STD, _MAX_SPOOL_DAMPING_FACTOR
+        )
     yield _candidate(f"{name}.delay", spool.delay, _DELAY_STD, 0.0, max(spool.delay, _MAX_DELAY))
 
 
