@@ -1,10 +1,10 @@
 """Calibrate seven numbers to a recording of lifting from random starts; count the best minimum.
 
-    python scripts/random_starts.py RECORDING [FIRST] [END]
+    python scripts/random_starts.py RECORDING [FIRST] [END] [FACTOR]
 
-The starts lie within a factor of 2 of the machine's values, even in the logarithm. A fit is in
-the best minimum if its sum of squares is within 2 % of the lowest; otherwise its report should
-warn of another minimum, which is counted.
+The starts lie within a factor, 2 by default, of the machine's values, even in the logarithm. A
+fit is in the best minimum if its sum of squares is within 2 % of the lowest; otherwise its report
+should warn of another minimum, which is counted.
 """
 
 import sys
@@ -34,8 +34,9 @@ def main():
     machine = crane.load("patu655", lock=LOCKED, changes=LOADED)
     values = MachineVariants(machine).values
     seeds, costs, told = range(*map(int, sys.argv[2:4] or [0, 100])), [], []
+    factor = float(sys.argv[4]) if len(sys.argv) > 4 else 2.0
     for seed in seeds:
-        factors = 2.0 ** np.random.default_rng(seed).uniform(-1, 1, len(NAMES))
+        factors = factor ** np.random.default_rng(seed).uniform(-1, 1, len(NAMES))
         fit = {x: values[x] * y for x, y in zip(NAMES, factors.tolist(), strict=True)}
         begun = time.process_time()
         found = crane.calibrate(machine, sys.argv[1], fit, columns=COLUMNS, sensors=SENSORS)
