@@ -2,9 +2,10 @@
 
     python scripts/random_starts.py RECORDING [FIRST] [END] [FACTOR]
 
-The starts lie within a factor, 2 by default, of the machine's values, even in the logarithm. A
-fit is in the best minimum if its sum of squares is within 2 % of the lowest; otherwise its report
-should warn of another minimum, which is counted.
+The starts lie within a factor, 2 by default, of the machine's values, even in the logarithm; those
+of the pin within 2, since the machine does not close farther away. A fit is in the best minimum
+if its sum of squares is within 2 % of the lowest; otherwise its report should warn of another
+minimum, which is counted.
 """
 
 import sys
@@ -25,6 +26,7 @@ NAMES = [
     "valve.X_lift.c1", "valve.X_lift.c2", "valve.X_lift.bandwidth", "lift_boom_rod.x",
     "cylinder.X_lift.stiffness", "cylinder.X_lift.damping", "friction.X_lift.coulomb",
 ]  # fmt: skip
+PINS = ["lift_boom_rod.x"]
 SIZES = {"m": 1e-3, "Pa": 5e4, "rad": 0.01}  # of what a channel may leave
 
 
@@ -36,7 +38,8 @@ def main():
     seeds, costs, told = range(*map(int, sys.argv[2:4] or [0, 100])), [], []
     factor = float(sys.argv[4]) if len(sys.argv) > 4 else 2.0
     for seed in seeds:
-        factors = factor ** np.random.default_rng(seed).uniform(-1, 1, len(NAMES))
+        widths = [min(factor, 2.0) if x in PINS else factor for x in NAMES]
+        factors = np.array(widths) ** np.random.default_rng(seed).uniform(-1, 1, len(NAMES))
         fit = {x: values[x] * y for x, y in zip(NAMES, factors.tolist(), strict=True)}
         begun = time.process_time()
         found = crane.calibrate(machine, sys.argv[1], fit, columns=COLUMNS, sensors=SENSORS)

@@ -20,7 +20,7 @@ that are not determined; else the half of what it lacks joins that was moved far
 It is selected again by the linearization at its minimum, until nothing is left out any more.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -278,25 +278,29 @@ def _fewer_parameters(
     chosen, steps = selection.path()
     others = sorted(set(range(len(parameters))) - set(chosen), key=lambda i: -abs(z[i]))
     score = simulated_score(search, z) + 2.0 * len(parameters)
-    undetermined = set(selection.undetermined(range(len(parameters))))
-    while others:
-        remaining = [i for i in range(len(parameters)) if i not in others]
+    for removed in _last_halves(others):
+        remaining = [i for i in range(len(parameters)) if i not in removed]
         names = {parameters[i].name for i in remaining}
-        if not any(names <= x for x in rejected):
-            unknowns = selection.with_starts(remaining)
-            problem = subset_problem(search.problem, remaining)
-            fewer = search.restricted_search(problem, z[unknowns])
-            start = min((z[unknowns], selection.fit(unknowns)[unknowns]), key=fewer.cost)
-            minimum = fewer.minimize(
-                start, COMPARED_COST_TOLERANCE, max_iterations=_MAX_ITERATIONS
-            )
-            search.problem.simulation_count = problem.simulation_count
-            highest = score + _MAX_COST * len(undetermined & set(others))
-            if simulated_score(fewer, minimum.z) + 2.0 * len(names) <= highest:
-                return fewer, minimum.z, steps
-            rejected.append(names)
-        others = others[(len(others) + 1) // 2 :]
+        if any(names <= x for x in rejected):
+            continue
+        unknowns = selection.with_starts(remaining)
+        problem = subset_problem(search.problem, remaining)
+        fewer = search.restricted_search(problem, z[unknowns])
+        start = min((z[unknowns], selection.fit(unknowns)[unknowns]), key=fewer.cost)
+        minimum = fewer.minimize(start, COMPARED_COST_TOLERANCE, max_iterations=_MAX_ITERATIONS).z
+        search.problem.simulation_count = problem.simulation_count
+        loose = set(removed).intersection(selection.undetermined(range(len(parameters))))
+        if simulated_score(fewer, minimum) + 2.0 * len(names) <= score + _MAX_COST * len(loose):
+            return fewer, minimum, steps
+        rejected.append(names)
     return search, z, steps
+
+
+def _last_halves(items: list[int]) -> Iterator[list[int]]:
+    """Items, their last half, the last half of this, and so on."""
+    while items:
+        yield items
+        items = items[(len(items) + 1) // 2 :]
 
 
 def subset_problem(problem: CalibrationProblem, chosen: Sequence[int]) -> CalibrationProblem:
