@@ -165,4 +165,4 @@ def near_minima(problem: CalibrationProblem, minima: Sequence[SearchState]) -> I
         if excess < _NEAR_MINIMUM and names:
             text = f"{100 * abs(excess):.1f} % {'more' if excess >= 0.0 else 'less'} squares"
             numbers = ", ".join(f"{name} = {values[name]:.4g}" for name in names)
-            yield f"Another minimum has {text}: {numbers}"
+            yield f"With smoothed friction another minimum has {text}: {numbers}"
