@@ -15,8 +15,8 @@ their prior, or that correlate with another one, if they cost nothing.
 
 A linearization does not hold as far as the values of the machine. Therefore the set is fitted by
 simulation, and replaces the larger one only if its score, sum_c n_c ln(mean square) over the
-training data with the same penalties, is not higher, but for the same small cost of parameters
-that are not determined; else the half of what it lacks joins that was moved farthest.
+training data with the same penalties, is not higher; else the half of what it lacks joins that
+was moved farthest.
 It is selected again by the linearization at its minimum, until nothing is left out any more.
 """
 
@@ -289,8 +289,7 @@ def _fewer_parameters(
         start = min((z[unknowns], selection.fit(unknowns)[unknowns]), key=fewer.cost)
         minimum = fewer.minimize(start, COMPARED_COST_TOLERANCE, max_iterations=_MAX_ITERATIONS).z
         search.problem.simulation_count = problem.simulation_count
-        loose = set(removed).intersection(selection.undetermined(range(len(parameters))))
-        if simulated_score(fewer, minimum) + 2.0 * len(names) <= score + _MAX_COST * len(loose):
+        if simulated_score(fewer, minimum) + 2.0 * len(names) <= score:
             return fewer, minimum, steps
         rejected.append(names)
     return search, z, steps

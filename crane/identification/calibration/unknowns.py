@@ -30,8 +30,8 @@ _SIGNED_PARAMETERS = (
 )  # fmt: skip
 _MIN_SPOOL_STROKE = 0.05  # of the stroke of a spool, from which a valve counts as open
 _MIN_BANDWIDTH, _MAX_BANDWIDTH = 2.0, 200.0  # bandwidths of spools [1/s]
-# damping of spools, relative to that of the file: deviation, as of the bandwidth, and factor
-_SPOOL_DAMPING_STD, _MAX_SPOOL_DAMPING_FACTOR = 0.5, 4.0
+# damping of spools, relative to that of the file: deviation and largest factor
+_SPOOL_DAMPING_STD, _MAX_SPOOL_DAMPING_FACTOR = 0.3, 4.0
 _DELAY_STD, _MAX_DELAY = 0.1, 0.6  # standard deviation and largest value of delays [s]
 _STROKE_DELAY_STD = 0.02  # standard deviation of delays of length sensors [s]
 _ANGLE_ZERO_STD = 0.05  # standard deviation of zeros of angle sensors [rad]
