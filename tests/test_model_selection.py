@@ -128,7 +128,7 @@ class SimulatedSearch:
             SimpleNamespace(train_mask=np.ones(1200, dtype=bool), sensors=["x", "y"])
         ]
 
-    def restricted_search(self, problem, z):
+    def restricted_search(self, problem):
         return SimulatedSearch([x.name for x in problem.unknowns], self)
 
     def cost(self, z):

@@ -1,7 +1,7 @@
 """Calibration of machines: parameters fitted to recordings through the simulation."""
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -44,7 +44,6 @@ from crane.identification.calibration.model_selection import (
     SelectedModel,
     block_errors,
     select_parameters,
-    subset_problem,
 )
 from crane.identification.calibration.multi_start import minimize_from_starts
 from crane.identification.calibration.plausibility import (
@@ -175,12 +174,12 @@ def calibrate(
     kept = [x.name for x in unknowns]
     kept += [x.name for x in extras if x.name == PAYLOAD_MASS and x.start != known_mass]
     with open_checkpoint(checkpoint, dependencies, LOG_COLUMNS, 1) as table:
-        first = LevenbergMarquardt(problem, progress, SearchLog(table))
+        search = LevenbergMarquardt(problem, progress, SearchLog(table))
         if automatic:
-            first, selected = _select(first, kept, {} if pins else _drawn_pins(machine))
+            selected = select_parameters(search, kept, _reserve(machine, {*pins, *kept}))
         else:
-            selected = SelectedModel(first, minimize_from_starts(first))
-        search, problem = selected.search, selected.search.problem
+            selected = SelectedModel(search, search, minimize_from_starts(search))
+        first, search, problem = selected.first, selected.search, selected.search.problem
         estimate = estimate_with_profiles(search, len(problem.unknowns), selected.minimum)
         errors = block_errors(search, estimate.z) if automatic else {}
     applicable = [x for x in extras if dict(x.members).get(x.name, x.start) == x.start]
@@ -204,35 +203,21 @@ def calibrate(
     )
 
 
-def _drawn_pins(machine: Machine) -> dict[str, str]:
-    """Joints of cylinders by the coordinates of pins on which they act."""
-    circuit = machine.hydraulics
-    return {
-        x: joint
-        for joint in (circuit.joints if circuit else ())
-        for x in cylinder_pins(machine, joint)
-    }
+def _reserve(machine: Machine, known: Collection[str]) -> dict[str, Collection[str]]:
+    """Channels by candidates that are needed only if the others leave more than noise in them.
 
+    Friction, load and pins of the drawing explain each other, as damping and delay of a spool do.
 
-def _select(
-    search: LevenbergMarquardt, kept: Sequence[str], pins: Mapping[str, str]
-) -> tuple[LevenbergMarquardt, SelectedModel]:
-    """Search of the candidates and selected model.
-
-    Pins of the drawing are candidates if the model without them leaves more than noise in the
-    stroke and the pressures of their cylinders: with friction and load they explain each other.
+    Args:
+        machine: The machine.
+        known: Names that are candidates in any case.
     """
-    unknowns = search.problem.unknowns
-    pins = {name: joint for name, joint in pins.items() if name not in kept}
-    others = [i for i, x in enumerate(unknowns) if x.name not in pins]
-    if len(others) < len(unknowns):
-        drawn = search.restricted_search(subset_problem(search.problem, others), None)
-        selected = select_parameters(drawn, kept)
-        moved = {pins[x.name] for x in unknowns if x.name in pins}
-        names = moved | {f"{PRESSURE_PREFIX}{x}_{side}" for x in moved for side in "ab"}
-        if selected.search.leaves_noise(selected.minimum, names):
-            return drawn, selected
-    return search, select_parameters(search, kept)
+    circuit, found = machine.hydraulics, dict[str, Collection[str]]()
+    for joint in circuit.joints if circuit else ():
+        channels = {joint, *(f"{PRESSURE_PREFIX}{joint}_{side}" for side in "ab")}
+        spools = (f"valve.{joint}.damping", f"valve.{joint}.spool_b.damping")
+        found |= dict.fromkeys((*cylinder_pins(machine, joint), *spools), channels)
+    return {name: channels for name, channels in found.items() if name not in known}
 
 
 def _sensor_units(cases: Sequence[RecordingCase]) -> dict[str, str]:

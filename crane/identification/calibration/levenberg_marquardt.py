@@ -26,7 +26,7 @@ _SCALE_TOLERANCE = 0.05  # relative change of channel scales that ends them
 # smoothing of friction and least smoothing for derivatives: initial rounds, and final
 _SMOOTHING_SCHEDULE, FINAL_SMOOTHING = (
     ((1.0, 1.0), (0.3, 0.3), (0.1, 0.1), (0.0, 0.3)),
-    (0.0, 0.03),
+    (0.0, 0.003),
 )
 _COVARIANCE_SMOOTHING = 0.1  # smoothing for derivatives of the covariance
 _MAX_ITERATIONS = 40  # iterations per round
@@ -125,7 +125,6 @@ class LevenbergMarquardt:
             independent observations.
         has_equal_channels: Whether all channels count by the largest redundancy, not by their own.
         prior: (p,) weights of the priors.
-        initial_guess: (p,) unknowns from which it goes on, None for a search of its own.
         minima: Minima of the searches from several starts, first the one that goes on.
     """
 
@@ -155,17 +154,14 @@ class LevenbergMarquardt:
         self.jacobian = self.residual = self.blocks = self.channels = np.zeros(0)
         self.minima: list[SearchState] = []
         self._iteration_count = iteration_count
-        self.initial_guess: Array | None = None
         self.has_equal_channels = True
         self._has_stiction = bool(find_stick_slip_columns(problem.machine))
 
-    def restricted_search(
-        self, problem: CalibrationProblem, z: Array | None
-    ) -> "LevenbergMarquardt":
-        """Method for fewer unknowns, with these channel scales and an initial guess."""
+    def restricted_search(self, problem: CalibrationProblem) -> "LevenbergMarquardt":
+        """Method for fewer unknowns, with these channel scales."""
         search = LevenbergMarquardt(problem, self._progress, self._log, self._iteration_count)
         search.channel_scales, search.redundancies = self.channel_scales, self.redundancies
-        search.initial_guess, search.has_equal_channels = z, self.has_equal_channels
+        search.has_equal_channels = self.has_equal_channels
         return search
 
     def start_with_smoothed_friction(self) -> None:
@@ -205,10 +201,11 @@ class LevenbergMarquardt:
 
     def linearize_for_covariance(self, z: Array) -> None:
         """Linearize with derivatives that hold over an interval."""
-        problem, tolerance = self.problem, self.problem.derivative_tolerance
+        problem = self.problem
+        before = problem.slopes, problem.derivative_tolerance
         problem.slopes, problem.derivative_tolerance = _COVARIANCE_SMOOTHING, DERIVATIVE_TOLERANCE
         self.linearize(z)
-        problem.derivative_tolerance = tolerance
+        problem.slopes, problem.derivative_tolerance = before
 
     def _training_residuals(self, z: Array) -> dict[str, Array]:
         """Residuals of each channel over the training data."""

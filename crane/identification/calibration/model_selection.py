@@ -1,7 +1,8 @@
 """Selection of the parameters of a calibration by the prediction of blocks that are left out.
 
-All candidates are fitted with their priors first. The linearization there, with residual r and
-Jacobian J by the scaled unknowns z, predicts the residuals of every other set S of parameters, the
+All candidates are fitted with their priors first, those in reserve only if the others leave more
+than noise. The linearization there, with residual r and Jacobian J by the scaled unknowns z,
+predicts the residuals of every other set S of parameters, the
 others at the values of the machine: r(z_S) = r - J z + J_S z_S. A fit of S without block b of
 contiguous instants is a Gauss-Newton step of normal equations, its error in block b follows from
 their matrices. The set grows by the parameter that reduces
@@ -20,7 +21,7 @@ was moved farthest.
 It is selected again by the linearization at its minimum, until nothing is left out any more.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -71,12 +72,14 @@ class SelectedModel:
     """Result of a selection.
 
     Attributes:
+        first: Search from several starts.
         search: Search of the selected parameters.
         minimum: (p,) its minimum, where it is linearized.
         steps: Steps of the selection.
         left_out: Names of the parameters that were left out.
     """
 
+    first: LevenbergMarquardt
     search: LevenbergMarquardt
     minimum: Array
     steps: tuple[SelectionStep, ...] = ()
@@ -222,23 +225,23 @@ def training_blocks(times: Array) -> Array:
     return numbers
 
 
-def select_parameters(search: LevenbergMarquardt, kept_names: Sequence[str]) -> SelectedModel:
+def select_parameters(
+    search: LevenbergMarquardt, kept_names: Sequence[str], reserve: Mapping[str, Collection[str]]
+) -> SelectedModel:
     """Select parameters, see the module.
 
     Args:
         search: Search of all candidates.
         kept_names: Parameters that are kept in any case.
+        reserve: Channels by parameters that are candidates only if the others leave more than
+            noise in one of these channels.
 
     Returns:
         The selected model.
     """
     names = [x.name for x in search.problem.unknowns]
-    z = lowest_minimum(search)
-    for _ in range(_WEIGHT_ROUNDS):  # before its end a search leaves what looks like model errors
-        search.update_scales(z)
-        search.has_equal_channels = False
-        search.problem.smooth, search.problem.slopes = FINAL_SMOOTHING
-        z = search.minimize(z, COMPARED_COST_TOLERANCE).z
+    first, z = _candidates_minimum(search, reserve)
+    search = first
     steps, count = list[SelectionStep](), len(names) + 1
     rejected = list[set[str]]()
     while len(search.problem.unknowns) < count:
@@ -249,7 +252,41 @@ def select_parameters(search: LevenbergMarquardt, kept_names: Sequence[str]) -> 
         steps = steps or last
     z = search.nearest_minimum(z)
     selected = {x.name for x in search.problem.unknowns}
-    return SelectedModel(search, z, tuple(steps), tuple(x for x in names if x not in selected))
+    left_out = tuple(x for x in names if x not in selected)
+    return SelectedModel(first, search, z, tuple(steps), left_out)
+
+
+def _candidates_minimum(
+    search: LevenbergMarquardt, reserve: Mapping[str, Collection[str]]
+) -> tuple[LevenbergMarquardt, Array]:
+    """Search of the candidates that are needed, and its minimum (p,).
+
+    Args:
+        search: Search of all candidates.
+        reserve: See `select_parameters`.
+    """
+    unknowns = search.problem.unknowns
+    others = [i for i, x in enumerate(unknowns) if x.name not in reserve]
+    if len(others) < len(unknowns):
+        first = search.restricted_search(subset_problem(search.problem, others))
+        z = _weighted_minimum(first, lowest_minimum(first))
+        channels = {name for x in unknowns for name in reserve.get(x.name, ())}
+        if first.leaves_noise(z, channels):
+            return first, z
+    return search, _weighted_minimum(search, lowest_minimum(search))
+
+
+def _weighted_minimum(search: LevenbergMarquardt, z: Array) -> Array:
+    """Minimum (p,) from a start, with weights by the residuals of the channels.
+
+    Before its end a search leaves what looks like errors of the model.
+    """
+    for _ in range(_WEIGHT_ROUNDS):
+        search.update_scales(z)
+        search.has_equal_channels = False
+        search.problem.smooth, search.problem.slopes = FINAL_SMOOTHING
+        z = search.minimize(z, COMPARED_COST_TOLERANCE).z
+    return z
 
 
 def _fewer_parameters(
@@ -285,7 +322,7 @@ def _fewer_parameters(
             continue
         unknowns = selection.with_starts(remaining)
         problem = subset_problem(search.problem, remaining)
-        fewer = search.restricted_search(problem, z[unknowns])
+        fewer = search.restricted_search(problem)
         start = min((z[unknowns], selection.fit(unknowns)[unknowns]), key=fewer.cost)
         minimum = fewer.minimize(start, COMPARED_COST_TOLERANCE, max_iterations=_MAX_ITERATIONS).z
         search.problem.simulation_count = problem.simulation_count
@@ -333,7 +370,7 @@ def block_errors(search: LevenbergMarquardt, z: Array) -> dict[str, tuple[float,
             part = CalibrationProblem(problem.machine, problem.unknowns, cases)
             part.smooth, part.slopes = problem.smooth, problem.slopes
             part.derivative_tolerance = problem.derivative_tolerance
-            found = search.restricted_search(part, z).minimize(
+            found = search.restricted_search(part).minimize(
                 z, INITIAL_COST_TOLERANCE, max_iterations=_BLOCK_ITERATIONS
             )
             problem.simulation_count += part.simulation_count

@@ -1,10 +1,11 @@
 """Multi-start search: a calibration from several starts, of which the better ones go on.
 
 Over a whole motion, one oscillation more or less is a local minimum, and so is a crane that never
-lifts. Therefore the search starts from the machine, and from the best of many points of a Sobol
-sequence, which are simulated only. In three rounds the better half of the searches goes on. A
-search from the machine that leaves nothing but noise needs no others. Two of the minima with
-smoothed friction are followed to the friction model, where the lower score,
+lifts. Therefore the search starts from the given values, and from the best of many points, those
+of a Sobol sequence and of the machine's values, which are simulated only. In three rounds the
+better half of the searches goes on. A search from the given values that leaves nothing but noise
+needs no others. Two of the minima with smoothed friction are followed to the friction model, where
+the lower score,
 
     sum_c n_c ln(mean square of channel c) + sum (z / prior)^2,
 
@@ -34,10 +35,8 @@ _SAME_MINIMUM = 0.1  # distance of scaled unknowns, up to which minima are the s
 
 
 def minimize_from_starts(search: LevenbergMarquardt) -> Array:
-    """Minimum (p,) of a search, which goes on from its initial guess if it has one."""
-    z = search.initial_guess
-    sharp = lowest_minimum(search) if z is None else search.sharpen_friction(z)
-    return search.nearest_minimum(sharp)
+    """Minimum (p,) of a search from several starts, linearized there."""
+    return search.nearest_minimum(lowest_minimum(search))
 
 
 def lowest_minimum(search: LevenbergMarquardt) -> Array:
@@ -88,7 +87,7 @@ def _race(search: LevenbergMarquardt, first: SearchState) -> list[SearchState]:
 
     Args:
         search: The search.
-        first: State of the search from the machine after the first round.
+        first: State of the search from the given values after the first round.
     """
     starts = _sampled_points(search)
     points = [SearchState(z, search.cost(z), _CAUTIOUS_DAMPING) for z in starts]
@@ -105,14 +104,22 @@ def _race(search: LevenbergMarquardt, first: SearchState) -> list[SearchState]:
 
 
 def _sampled_points(search: LevenbergMarquardt) -> list[Array]:
-    """Points of a Sobol sequence of the machine parameters; sensors are linear and start at 0."""
+    """Machine parameters as the machine has them and by a Sobol sequence.
+
+    Sensors are linear and start at 0.
+    """
     from scipy.stats import qmc
 
     unknowns = search.problem.unknowns
     varied = [i for i, x in enumerate(unknowns) if not x.sensor]
     if not varied:
         return []
-    points = []
+    points, z = [], np.zeros(search.problem.unknown_count)
+    z[varied] = [
+        (unknowns[i].machine_value - unknowns[i].start) / unknowns[i].scale for i in varied
+    ]
+    if np.any(z):
+        points.append(np.clip(z, search.low, search.high))
     for shares in qmc.Sobol(len(varied), seed=0).random(_POINT_COUNT):
         z = np.zeros(search.problem.unknown_count)
         z[varied] = [sample(unknowns[i], x) for i, x in zip(varied, shares, strict=True)]

@@ -31,7 +31,7 @@ _SIGNED_PARAMETERS = (
 _MIN_SPOOL_STROKE = 0.05  # of the stroke of a spool, from which a valve counts as open
 _MIN_BANDWIDTH, _MAX_BANDWIDTH = 2.0, 200.0  # bandwidths of spools [1/s]
 # damping of spools, relative to that of the file: deviation and largest factor
-_SPOOL_DAMPING_STD, _MAX_SPOOL_DAMPING_FACTOR = 0.3, 4.0
+_SPOOL_DAMPING_STD, _MAX_SPOOL_DAMPING_FACTOR = 0.5, 4.0
 _DELAY_STD, _MAX_DELAY = 0.1, 0.6  # standard deviation and largest value of delays [s]
 _STROKE_DELAY_STD = 0.02  # standard deviation of delays of length sensors [s]
 _ANGLE_ZERO_STD = 0.05  # standard deviation of zeros of angle sensors [rad]
@@ -80,6 +80,11 @@ class Unknown:
         if "*" in self.name:
             return {name: value * start for name, start in self.members}
         return {name: value for name, _ in self.members}
+
+    @property
+    def machine_value(self) -> float:
+        """Its value in the machine before the calibration."""
+        return 1.0 if "*" in self.name else self.members[0][1]
 
     @property
     def sensor_parameter(self) -> str:
@@ -166,6 +171,8 @@ def _scale_and_bounds(
             low = _MIN_SHARE * initial if low is None else low
         else:
             high = _MIN_SHARE * initial if high is None else high
+    if name.endswith(".bandwidth") and high is None:
+        high = max(initial, _MAX_BANDWIDTH)
     if not scale:
         if low is None or high is None:
             raise InputError(f"'{name}' is 0 initially, give its range: '{name}=0,LOW~HIGH'")
@@ -212,7 +219,9 @@ def candidate_parameters(
             if directions[name]:
                 found += _spool_candidates(spool, parameters, directions[name])
                 found += _orifice_candidates(spool, valve, parameters, directions[name])
-        if any(directions.values()):
+        is_moved = any(directions.values())
+        found += _friction_candidates(joint, hydraulics, parameters, is_moved)
+        if is_moved:
             found += _cylinder_candidates(joint, machine, hydraulics, parameters, cases)
             moved_pins += cylinder_pins(machine, joint)
     found += _pin_candidates(list(pins) or moved_pins, parameters)
@@ -321,6 +330,22 @@ def _orifice_candidates(
                 )
 
 
+def _friction_candidates(
+    joint: str, hydraulics: Hydraulics, parameters: Mapping[str, float], is_moved: bool
+) -> Iterator[Unknown]:
+    """Candidates of the friction of a cylinder, which holds one that is not moved."""
+    pressure, area = hydraulics.supply.pressure, hydraulics.cylinders[joint].area_a
+    force = _FRICTION_FORCE_SHARE * pressure * area
+    max_speed = hydraulics.valves[joint].c1 * np.sqrt(pressure) / area
+    sizes = {"coulomb": force} | ({"viscous": force / max_speed} if is_moved else {})
+    for what, size in sizes.items():
+        name = f"friction.{joint}.{what}"
+        if name in parameters:
+            start = parameters[name]
+            std = max(3.0 * start, size)
+            yield _candidate(name, start, std, 0.0, start + 5.0 * std)
+
+
 def _cylinder_candidates(
     joint: str,
     machine: Machine,
@@ -332,14 +357,6 @@ def _cylinder_candidates(
     pressure = hydraulics.supply.pressure
     index = machine.active.index(joint)
     stroke = 0.0 if cylinder.motor else float(machine.upper[index] - machine.lower[index])
-    friction_force = _FRICTION_FORCE_SHARE * pressure * cylinder.area_a
-    max_speed = valve.c1 * np.sqrt(pressure) / cylinder.area_a
-    for what, size in (("coulomb", friction_force), ("viscous", friction_force / max_speed)):
-        name = f"friction.{joint}.{what}"
-        if name in parameters:
-            start = parameters[name]
-            std = max(3.0 * start, size)
-            yield _candidate(name, start, std, 0.0, start + 5.0 * std)
     volumes = (
         cylinder.area_a * stroke + cylinder.hose_a,
         cylinder.area_b * stroke + cylinder.hose_b,
