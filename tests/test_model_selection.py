@@ -195,16 +195,59 @@ class RaceSearch:
         ([1.0, 2.0], {1.0: 1.0, 2.0: None}, 1.0, [1.0, 2.0]),
     ],
 )
-def test_the_friction_model_decides_between_two_minima(monkeypatch, minima, errors, best, tried):
+def test_the_friction_model_decides_between_two_minima(minima, errors, best, tried):
     """By the squares of independent samples and the prior, each minimum with its own scales."""
-    monkeypatch.setattr(multi_start, "_smoothed_minimum", lambda search: search.minima[0].z)
     search = RaceSearch(minima, errors)
-    assert multi_start.lowest_minimum(search) == best**2
+    assert multi_start.lowest_minimum(search, search.minima[0].z) == best**2
     assert search.sharpened == tried and search.channel_scales == {"x": 2.0 + best}
     assert search.minima[0].z == best and len(search.minima) == len(minima)
     search.redundancies = {"x": 2.0}
     expected = 4 / 2.0 * np.log(errors[best] ** 2) + (0.5 * best**2) ** 2
     assert multi_start.simulated_score(search, np.array([best**2])) == pytest.approx(expected)
+
+
+class ReserveSearch:
+    """A search whose residuals are noise with what was left in reserve, and maybe without it."""
+
+    def __init__(self, problem, levels):
+        self.problem, self.levels = problem, levels
+
+    def restricted_search(self, problem):
+        return ReserveSearch(problem, self.levels)
+
+    def leaves_noise(self, z, names, level=1.5):
+        assert names == {"X", "pressure_X_a"}
+        return self.levels[z] < level
+
+
+@pytest.mark.parametrize(
+    "levels, expected",
+    [
+        ({"smoothed": 2.0, "weighted": 1.1}, ["a", "b"]),
+        ({"smoothed": 2.0, "weighted": 1.6}, ["a", "b", "c"]),
+        ({"smoothed": 20.0}, ["a", "b", "c"]),  # not followed to the friction model
+    ],
+)
+def test_a_reserve_joins_where_more_than_noise_is_left(monkeypatch, levels, expected):
+    monkeypatch.setattr(
+        model_selection, "subset_problem",
+        lambda problem, chosen: SimpleNamespace(unknowns=[problem.unknowns[i] for i in chosen]),
+    )  # fmt: skip
+    tried = []
+
+    def lowest(search, z):
+        tried.append([x.name for x in search.problem.unknowns])
+        return z
+
+    monkeypatch.setattr(model_selection, "smoothed_minimum", lambda search: "smoothed")
+    monkeypatch.setattr(model_selection, "lowest_minimum", lowest)
+    monkeypatch.setattr(model_selection, "_weighted_minimum", lambda search, z: "weighted")
+    unknowns = [Unknown(x, 1.0, 0.0, 2.0, 1.0) for x in "abc"]
+    search = ReserveSearch(SimpleNamespace(unknowns=unknowns), levels)
+    reserve = {"c": {"X", "pressure_X_a"}, "d": {"Y"}}
+    found, z = model_selection._candidates_minimum(search, reserve)
+    assert [x.name for x in found.problem.unknowns] == expected and z == "weighted"
+    assert tried[-1] == expected and len(tried) == 1 + (levels.get("weighted", 0) > 1.5)
 
 
 def test_pins_of_a_cylinder():

@@ -24,15 +24,14 @@ def bundled_machines() -> dict[str, Path]:
 
 def machine_templates() -> dict[str, dict[str, Path]]:
     """Return the machine files that `crane new` copies: by machine, and by size from small on."""
+    found = [
+        (*path.stem.rpartition("_")[::2], path)
+        for path in (_model_folder() / "templates").glob("*.yaml")
+    ]
     templates: dict[str, dict[str, Path]] = {}
-    for path in sorted((_model_folder() / "templates").glob("*.yaml"), key=_size_of_template):
-        name, _, size = path.stem.rpartition("_")
+    for name, size, path in sorted(found, key=lambda x: float(x[1].rstrip(ascii_letters))):
         templates.setdefault(name, {})[size] = path
     return dict(sorted(templates.items()))
-
-
-def _size_of_template(path: Path) -> float:
-    return float(path.stem.rpartition("_")[2].rstrip(ascii_letters))
 
 
 def _model_folder() -> Path:

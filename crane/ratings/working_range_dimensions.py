@@ -241,13 +241,10 @@ class DimensionFinder:
         return Dimension(
             name,
             value,
-            self._rounded_position(place or self._lip, q),
+            np.round((place or self._lip).coordinates(q[None])[0], _ROUNDING_DIGITS) + 0.0,
             np.round(q[self._machine.closure.active], _ROUNDING_DIGITS) + 0.0,
             definition,
         )
-
-    def _rounded_position(self, coordinates: FrameSectionCoordinates, q: Array) -> Array:
-        return np.asarray(np.round(coordinates.coordinates(q[None])[0], _ROUNDING_DIGITS) + 0.0)
 
     def _lowest_height(self, radius: float) -> Optimum:
         """Return the lowest height of the lip at a radius, negated, and its configuration."""

@@ -67,7 +67,10 @@ def sustained_oscillation(
     """
     least = max(least, _MIN_RELATIVE_AMPLITUDE * float(np.abs(values).max(initial=0.0)))
     found: LimitCycle | None = None
-    changes = np.concatenate([[0, len(values)], *map(_command_changes, commands)])
+    # samples where a command starts, stops or reverses
+    changes = np.concatenate([
+        [0, len(values)], *(np.flatnonzero(np.diff(_directions(x))) + 1 for x in commands)
+    ])  # fmt: skip
     width = _MIN_PERIOD_SAMPLES
     while width * _MIN_PERIODS <= _MAX_WIDTH * len(values):
         deviation = values - _moving_mean(values, width)
@@ -228,11 +231,6 @@ def _peak_to_peak(values: Array, first: int, last: int, period: float) -> Array:
 def _reversal_count(command: Array) -> int:
     directions = _directions(command)
     return int(np.count_nonzero(np.diff(directions[directions != 0])))
-
-
-def _command_changes(command: Array) -> np.ndarray:
-    """Indices of samples where a command starts, stops or reverses."""
-    return np.flatnonzero(np.diff(_directions(command))) + 1
 
 
 def _directions(command: Array) -> Array:

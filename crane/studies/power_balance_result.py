@@ -136,10 +136,6 @@ class PowerBalance(Result):
         """Volume of the fuel as diesel of 840 kg/m3 [m3]."""
         return None if self.fuel_mass is None else self.fuel_mass / DIESEL_DENSITY
 
-    def owner_powers(self, owner: str) -> dict[str, Array]:
-        """Return the powers (N,) of one owner by kind [W]."""
-        return {part_kind(x): power for x, power in self.powers.items() if part_owner(x) == owner}
-
     def integrate_energy(self, power: Array) -> float:
         """Return the energy of a power (N,) over the recording [J]."""
         return float(np.trapezoid(power, self.time))

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping
 from math import inf, isfinite, isinf
-from pathlib import Path
 from typing import NamedTuple
 
 from crane.common.units import format_quantity
@@ -55,12 +54,15 @@ def _chain_fact(machine: Machine) -> MachineFact:
         "chains",
         ", ".join(x.name for x in chains),
         ("", "", "on"),
-        tuple((x.name, _relative_path(x.urdf, folder), x.parent or "") for x in chains),
+        tuple(
+            (
+                x.name,
+                str(x.urdf.relative_to(folder) if x.urdf.is_relative_to(folder) else x.urdf),
+                x.parent or "",
+            )
+            for x in chains
+        ),
     )
-
-
-def _relative_path(file: Path, folder: Path) -> str:
-    return str(file.relative_to(folder) if file.is_relative_to(folder) else file)
 
 
 def _joint_fact(machine: Machine) -> MachineFact:

@@ -51,7 +51,9 @@ def place_bodies(section: YamlSection, points: dict[str, Array]) -> dict[str, pi
         placement = placements[name] = _fitted_placement(own, points, sorted(shared[name]))
         extent = float(np.linalg.norm(np.ptp(list(own.values()), axis=0)))
         for pair in combinations(sorted(shared[name]), 2):
-            mine, drawn = (_distance(table, pair) for table in (own, points))
+            mine, drawn = (
+                float(np.linalg.norm(table[pair[1]] - table[pair[0]])) for table in (own, points)
+            )
             if abs(mine - drawn) > _TOLERANCE * extent:
                 raise item.error_at(
                     "points",
@@ -93,7 +95,3 @@ def _fitted_placement(
     angle = np.arctan2(cross, p[:, 0] @ q[:, 0] + p[:, 2] @ q[:, 2])
     rotation = np.asarray(pin.exp3(np.array([0.0, -angle, 0.0])))
     return pin.SE3(rotation, second.mean(axis=0) - rotation @ first.mean(axis=0))
-
-
-def _distance(points: Mapping[str, Array], pair: tuple[str, str]) -> float:
-    return float(np.linalg.norm(points[pair[1]] - points[pair[0]]))

@@ -301,7 +301,10 @@ class _DrawingTranslation:
         inertias = cylinder.barrel_inertia, cylinder.rod_inertia
         links = [
             add_link(self._robot, Link(name, "", inertial_from_inertia(
-                sum_inertias(*(_shifted(inertia, y) for y in slide.offsets)))))
+                sum_inertias(*(
+                    rigid_inertia(inertia.mass, inertia.lever + [0.0, y, 0.0], inertia.inertia)
+                    for y in slide.offsets
+                )))))
             for name, inertia in zip(names, inertias, strict=True)
         ]  # fmt: skip
         add_cylinder_visuals(links[0], links[1], cylinder, slide.offsets)
@@ -346,10 +349,6 @@ def _spanning_edges(
     for edge in edges:
         (tree if bodies.merge(*edge.bodies) else loops).append(edge)
     return tree, loops
-
-
-def _shifted(inertia: pin.Inertia, y: float) -> pin.Inertia:
-    return rigid_inertia(inertia.mass, inertia.lever + [0.0, y, 0.0], inertia.inertia)
 
 
 def _add_bar(link: etree._Element, bar: BarShape, origin: Array) -> None:

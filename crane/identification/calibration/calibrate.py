@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -147,18 +148,18 @@ def calibrate(
     variants = MachineVariants(machine)
     parameters = variants.values | sensor_parameters(cases[0].known_sensors)
     units = _sensor_units(cases)
-
-    def unknowns_for(which: Mapping[str, object] | Sequence[str]) -> list[Unknown]:
-        return build_unknowns(which, variants.spec, parameters, units)
-
+    unknowns_for = partial(
+        build_unknowns, spec=variants.spec, parameters=parameters, sensor_units=units
+    )
     unknowns = [] if automatic and not requested else unknowns_for(requested)
     known_mass = parameters.get(PAYLOAD_MASS, 0.0)
     pins = {k: v for case in cases for k, v in displaced_pins(machine, case.table).items()}
     statics = static_payload(variants, pins, cases) if PAYLOAD_MASS in parameters else None
     candidates = candidate_parameters(machine, cases, parameters, pins)
     if statics is not None:
-        others = [x for x in candidates if x.name != PAYLOAD_MASS]
-        candidates = [*others, *statics.candidates(known_mass)]
+        candidates = [
+            *(x for x in candidates if x.name != PAYLOAD_MASS), *statics.candidates(known_mass)
+        ]  # fmt: skip
     complete = unknowns_for({x.name: (x.start, x.low, x.high) for x in candidates})
     extras = _other_unknowns(unknowns, complete, candidates)
     problem = CalibrationProblem(machine, unknowns, cases)

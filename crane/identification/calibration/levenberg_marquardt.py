@@ -261,10 +261,12 @@ class LevenbergMarquardt:
             bounds[name] = least, max(least, _MAX_SCALE_SHARE * ranges[units[name]])
         return bounds
 
-    def leaves_noise(self, z: Array, names: Collection[str] = ()) -> bool:
+    def leaves_noise(
+        self, z: Array, names: Collection[str] = (), level: float = NOISE_LEVEL
+    ) -> bool:
         """Whether the residuals of channels, all by default, are about their noise."""
         return all(
-            rms < NOISE_LEVEL * self._scale_bounds[name][0]
+            rms < level * self._scale_bounds[name][0]
             for name, rms in self.training_errors(z).items()
             if not names or name in names
         )

@@ -35,13 +35,18 @@ from crane.identification.calibration.levenberg_marquardt import (
     LevenbergMarquardt,
     bounded_step,
 )
-from crane.identification.calibration.multi_start import lowest_minimum, simulated_score
+from crane.identification.calibration.multi_start import (
+    lowest_minimum,
+    simulated_score,
+    smoothed_minimum,
+)
 
 MAX_CORRELATION = 0.98  # of parameters that are both kept
 MAX_PRIOR_SHARE = 0.7  # of the deviation of a prior, up to which recordings determine a parameter
 BLOCK_DURATION = 3.0  # [s] of a block that is left out
 _BLOCK_RANGE = 3, 8  # number of blocks of a recording
 _MAX_COST = 4.0  # of the score, of a parameter that the recordings do not determine: chi-square
+_SMOOTHED_NOISE_LEVEL = 10.0  # residuals per noise that are of more than smoothed friction
 _WEIGHT_ROUNDS = 3  # of weights by redundancies of all candidates
 _MAX_ITERATIONS = 12  # of the fit of a selected set
 _BLOCK_ITERATIONS = 3  # of the fits without a block
@@ -252,8 +257,9 @@ def select_parameters(
         steps = steps or last
     z = search.nearest_minimum(z)
     selected = {x.name for x in search.problem.unknowns}
-    left_out = tuple(x for x in names if x not in selected)
-    return SelectedModel(first, search, z, tuple(steps), left_out)
+    return SelectedModel(
+        first, search, z, tuple(steps), tuple(x for x in names if x not in selected)
+    )
 
 
 def _candidates_minimum(
@@ -267,13 +273,15 @@ def _candidates_minimum(
     """
     unknowns = search.problem.unknowns
     others = [i for i, x in enumerate(unknowns) if x.name not in reserve]
-    if len(others) < len(unknowns):
-        first = search.restricted_search(subset_problem(search.problem, others))
-        z = _weighted_minimum(first, lowest_minimum(first))
-        channels = {name for x in unknowns for name in reserve.get(x.name, ())}
-        if first.leaves_noise(z, channels):
+    channels = {name for x in unknowns for name in reserve.get(x.name, ())}
+    first = search.restricted_search(subset_problem(search.problem, others))
+    z = smoothed_minimum(first)
+    if not channels or first.leaves_noise(z, channels, _SMOOTHED_NOISE_LEVEL):
+        z = _weighted_minimum(first, lowest_minimum(first, z))
+        if not channels or first.leaves_noise(z, channels):
             return first, z
-    return search, _weighted_minimum(search, lowest_minimum(search))
+    z = smoothed_minimum(search)
+    return search, _weighted_minimum(search, lowest_minimum(search, z))
 
 
 def _weighted_minimum(search: LevenbergMarquardt, z: Array) -> Array:

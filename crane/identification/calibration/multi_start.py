@@ -36,12 +36,16 @@ _SAME_MINIMUM = 0.1  # distance of scaled unknowns, up to which minima are the s
 
 def minimize_from_starts(search: LevenbergMarquardt) -> Array:
     """Minimum (p,) of a search from several starts, linearized there."""
-    return search.nearest_minimum(lowest_minimum(search))
+    return search.nearest_minimum(lowest_minimum(search, smoothed_minimum(search)))
 
 
-def lowest_minimum(search: LevenbergMarquardt) -> Array:
-    """Minimum (p,) of the lowest score with the friction model, from several starts."""
-    smoothed = _smoothed_minimum(search)
+def lowest_minimum(search: LevenbergMarquardt, smoothed: Array) -> Array:
+    """Minimum (p,) of the lowest score with the friction model.
+
+    Args:
+        search: Search with its minima of smoothed friction.
+        smoothed: (p,) lowest of these.
+    """
     starts = [smoothed]
     starts += [x.z for x in search.minima[1:2] if np.abs(x.z - smoothed).max() > _SAME_MINIMUM]
     scales = search.channel_scales, search.redundancies
@@ -70,13 +74,12 @@ def simulated_score(search: LevenbergMarquardt, z: Array) -> float:
     return likelihood + float(np.sum((search.prior * z) ** 2))
 
 
-def _smoothed_minimum(search: LevenbergMarquardt) -> Array:
-    """Lowest minimum (p,) found with smoothed friction."""
+def smoothed_minimum(search: LevenbergMarquardt) -> Array:
+    """Lowest minimum (p,) with smoothed friction, from several starts."""
     search.start_with_smoothed_friction()
-    start = np.zeros(search.problem.unknown_count)
-    first = search.minimize(start, INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING, _ROUNDS[0][1])
-    is_good = search.leaves_noise(first.z)
-    search.minima = [first] if is_good else _race(search, first)
+    given = np.zeros(search.problem.unknown_count)
+    first = search.minimize(given, INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING, _ROUNDS[0][1])
+    search.minima = [first] if search.leaves_noise(first.z) else _race(search, first)
     z = search.minima[0].z
     search.update_scales(z)
     return search.minimize(z, INITIAL_COST_TOLERANCE).z

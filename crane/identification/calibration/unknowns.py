@@ -339,8 +339,7 @@ def _friction_candidates(
     max_speed = hydraulics.valves[joint].c1 * np.sqrt(pressure) / area
     sizes = {"coulomb": force} | ({"viscous": force / max_speed} if is_moved else {})
     for what, size in sizes.items():
-        name = f"friction.{joint}.{what}"
-        if name in parameters:
+        if (name := f"friction.{joint}.{what}") in parameters:
             start = parameters[name]
             std = max(3.0 * start, size)
             yield _candidate(name, start, std, 0.0, start + 5.0 * std)
