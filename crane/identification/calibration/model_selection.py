@@ -49,6 +49,7 @@ _MAX_COST = 4.0  # of the score, of a parameter that the recordings do not deter
 _SMOOTHED_NOISE_LEVEL = 10.0  # residuals per noise that are of more than smoothed friction
 _WEIGHT_ROUNDS = 3  # of weights by redundancies of all candidates
 _MAX_ITERATIONS = 12  # of the fit of a selected set
+_NEW_MINIMUM_REDUCTION = 30.0  # of the score, by which a minimum is another one
 _BLOCK_ITERATIONS = 3  # of the fits without a block
 
 
@@ -308,7 +309,7 @@ def _fewer_parameters(
     A linearization does not hold as far as the machine's values. So the selected set is fitted by
     simulation; if that is worse than with all parameters, the half of the others joins that the
     recordings moved farthest, in deviations of their priors. Sets within a rejected one are not
-    fitted.
+    fitted, until another minimum is found.
 
     Args:
         search: Search, linearized at its minimum.
@@ -331,10 +332,15 @@ def _fewer_parameters(
         unknowns = selection.with_starts(remaining)
         problem = subset_problem(search.problem, remaining)
         fewer = search.restricted_search(problem)
-        start = min((z[unknowns], selection.fit(unknowns)[unknowns]), key=fewer.cost)
-        minimum = fewer.minimize(start, COMPARED_COST_TOLERANCE, max_iterations=_MAX_ITERATIONS).z
+        minimum = fewer.minimize(
+            min((z[unknowns], selection.fit(unknowns)[unknowns]), key=fewer.cost),
+            COMPARED_COST_TOLERANCE,
+            max_iterations=_MAX_ITERATIONS,
+        ).z
         search.problem.simulation_count = problem.simulation_count
-        if simulated_score(fewer, minimum) + 2.0 * len(names) <= score:
+        reduction = score - simulated_score(fewer, minimum) - 2.0 * len(names)
+        if reduction >= 0.0:
+            rejected[:] = rejected if reduction < _NEW_MINIMUM_REDUCTION else []
             return fewer, minimum, steps
         rejected.append(names)
     return search, z, steps

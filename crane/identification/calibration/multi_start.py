@@ -46,8 +46,10 @@ def lowest_minimum(search: LevenbergMarquardt, smoothed: Array) -> Array:
         search: Search with its minima of smoothed friction.
         smoothed: (p,) lowest of these.
     """
-    starts = [smoothed]
-    starts += [x.z for x in search.minima[1:2] if np.abs(x.z - smoothed).max() > _SAME_MINIMUM]
+    starts = [
+        smoothed,
+        *(x.z for x in search.minima[1:2] if np.abs(x.z - smoothed).max() > _SAME_MINIMUM),
+    ]
     scales = search.channel_scales, search.redundancies
     found: list[tuple[Array, dict[str, float], dict[str, float]]] = []
     for start in starts:
@@ -80,9 +82,8 @@ def smoothed_minimum(search: LevenbergMarquardt) -> Array:
     given = np.zeros(search.problem.unknown_count)
     first = search.minimize(given, INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING, _ROUNDS[0][1])
     search.minima = [first] if search.leaves_noise(first.z) else _race(search, first)
-    z = search.minima[0].z
-    search.update_scales(z)
-    return search.minimize(z, INITIAL_COST_TOLERANCE).z
+    search.update_scales(search.minima[0].z)
+    return search.minimize(search.minima[0].z, INITIAL_COST_TOLERANCE).z
 
 
 def _race(search: LevenbergMarquardt, first: SearchState) -> list[SearchState]:
