@@ -221,7 +221,9 @@ def compute_chart(
         raise InputError(f"'{conditions.frame}' reaches none of these positions, give others")
 
     def select(evaluate: ValueFunction) -> ConfigurationSet:
-        return search.select_best(configurations, axes, partial(_smallest_values, evaluate))[0]
+        return search.select_best(
+            configurations, axes, lambda q, statics: np.asarray(evaluate(q, statics).min(axis=1))
+        )[0]
 
     rated = rate_postures(conditions, (len(axes[1]), len(axes[0])), select, slews)
     return chart_class(**rated, radii=axes[0], heights=axes[1], **attributes)
@@ -295,10 +297,6 @@ def _values_by_factor(
             q[:, column] = slew_coordinate
             statics = conditions.places.statics.evaluate(q)
     return limits.rated_values(statics, np.full(len(q), angle), q)
-
-
-def _smallest_values(evaluate: ValueFunction, q: Array, statics: StaticQuantities) -> Array:
-    return np.asarray(evaluate(q, statics).min(axis=1))
 
 
 def _simultaneous_factors(values_by_factor: Array, smallest: Array) -> NDArray[np.bool_]:

@@ -109,7 +109,16 @@ def limit_cycles(recording: Recording) -> list[LimitCycle]:
     ]
     prefixes = _COMMAND_PREFIXES[:1] if references else _COMMAND_PREFIXES
     references += [x for x in channels if x.startswith(prefixes)]
-    commands = [channels[x] for x in references] + _revolutions(recording) + _arrivals(recording)
+    commands = [
+        *(channels[x] for x in references),
+        *_revolutions(recording),
+        *(  # steps from 1 to 0 where a joint arrives at the end of its motion, as at an end stop
+            np.maximum.accumulate(np.abs(x - x[-1])[::-1] > _MIN_RELATIVE_AMPLITUDE * np.ptp(x))[
+                ::-1
+            ].astype(float)
+            for x in recording.q.T
+        ),
+    ]
     found = []
     for name in names:
         release_pages()
@@ -129,16 +138,6 @@ def _revolutions(recording: Recording) -> list[Array]:
         np.cos(np.maximum.accumulate(np.sign(angle[-1]) * angle))
         for angle in turned
         if abs(angle[-1]) > 2 * np.pi
-    ]
-
-
-def _arrivals(recording: Recording) -> list[Array]:
-    """Steps (N,) from 1 to 0 where a joint arrives at the end of its motion, as at an end stop."""
-    return [
-        np.maximum.accumulate(np.abs(x - x[-1])[::-1] > _MIN_RELATIVE_AMPLITUDE * np.ptp(x))[
-            ::-1
-        ].astype(float)
-        for x in recording.q.T
     ]
 
 

@@ -161,7 +161,7 @@ class LevenbergMarquardt:
         """Method for fewer unknowns, with these channel scales."""
         search = LevenbergMarquardt(problem, self._progress, self._log, self._iteration_count)
         search.channel_scales, search.redundancies = self.channel_scales, self.redundancies
-        search.has_equal_channels = self.has_equal_channels
+        search.has_equal_channels, search.blocks = self.has_equal_channels, self.blocks
         return search
 
     def start_with_smoothed_friction(self) -> None:

@@ -2,10 +2,10 @@
 
 All candidates are fitted with their priors first, those in reserve only if the others leave more
 than noise. The linearization there, with residual r and Jacobian J by the scaled unknowns z,
-predicts the residuals of every other set S of parameters, the
-others at the values of the machine: r(z_S) = r - J z + J_S z_S. A fit of S without block b of
-contiguous instants is a Gauss-Newton step of normal equations, its error in block b follows from
-their matrices. The set grows by the parameter that reduces
+predicts the residuals of every other set S of parameters, the others at the values of the machine:
+r(z_S) = r - J z + J_S z_S. A fit of S without block b of contiguous instants is a Gauss-Newton
+step of normal equations, its error in block b follows from their matrices. The set grows by the
+parameter that reduces
 
     score = sum_c n_c ln(mean square of channel c over all blocks left out) + sum_S (z / prior)^2
             + 2 k
@@ -17,8 +17,8 @@ their prior, or that correlate with another one, if they cost nothing.
 A linearization does not hold as far as the values of the machine. Therefore the set is fitted by
 simulation, and replaces the larger one only if its score, sum_c n_c ln(mean square) over the
 training data with the same penalties, is not higher; else the half of what it lacks joins that
-was moved farthest.
-It is selected again by the linearization at its minimum, until nothing is left out any more.
+was moved farthest. If it is higher by little, simulated fits without each block decide. The set is
+selected again by the linearization at its minimum, until nothing is left out any more.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -49,7 +49,7 @@ _MAX_COST = 4.0  # of the score, of a parameter that the recordings do not deter
 _SMOOTHED_NOISE_LEVEL = 10.0  # residuals per noise that are of more than smoothed friction
 _WEIGHT_ROUNDS = 3  # of weights by redundancies of all candidates
 _MAX_ITERATIONS = 12  # of the fit of a selected set
-_NEW_MINIMUM_REDUCTION = 30.0  # of the score, by which a minimum is another one
+_SCORE_TOLERANCE = 30.0  # difference of scores of one minimum; more is another one
 _BLOCK_ITERATIONS = 3  # of the fits without a block
 
 
@@ -323,7 +323,7 @@ def _fewer_parameters(
     )
     chosen, steps = selection.path()
     others = sorted(set(range(len(parameters))) - set(chosen), key=lambda i: -abs(z[i]))
-    score = simulated_score(search, z) + 2.0 * len(parameters)
+    score, large = simulated_score(search, z) + 2.0 * len(parameters), 0.0
     for removed in _last_halves(others):
         remaining = [i for i in range(len(parameters)) if i not in removed]
         names = {parameters[i].name for i in remaining}
@@ -339,11 +339,21 @@ def _fewer_parameters(
         ).z
         search.problem.simulation_count = problem.simulation_count
         reduction = score - simulated_score(fewer, minimum) - 2.0 * len(names)
+        if -_SCORE_TOLERANCE < reduction < 0.0:
+            large = large or _block_score(search, z)
+            reduction = large - _block_score(fewer, minimum)
         if reduction >= 0.0:
-            rejected[:] = rejected if reduction < _NEW_MINIMUM_REDUCTION else []
+            rejected[:] = rejected if reduction < _SCORE_TOLERANCE else []
             return fewer, minimum, steps
         rejected.append(names)
     return search, z, steps
+
+
+def _block_score(search: LevenbergMarquardt, z: Array) -> float:
+    """Score of simulated blocks that are left out."""
+    return 2.0 * len(search.problem.unknowns) + simulated_score(
+        search, z, {name: total for name, (total, _) in block_errors(search, z).items()}
+    )
 
 
 def _last_halves(items: list[int]) -> Iterator[list[int]]:

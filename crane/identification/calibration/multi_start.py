@@ -12,6 +12,7 @@ the lower score,
 with the number n_c of independent samples decides: smoothed friction hides what rings.
 """
 
+from collections.abc import Mapping
 from contextlib import suppress
 
 import numpy as np
@@ -65,14 +66,22 @@ def lowest_minimum(search: LevenbergMarquardt, smoothed: Array) -> Array:
     return z
 
 
-def simulated_score(search: LevenbergMarquardt, z: Array) -> float:
-    """Score of simulated unknowns, see the module."""
+def simulated_score(
+    search: LevenbergMarquardt, z: Array, errors: Mapping[str, float] | None = None
+) -> float:
+    """Score of simulated unknowns, see the module.
+
+    Args:
+        search: The search.
+        z: (p,) unknowns.
+        errors: RMS errors of its channels, by default those of the training data.
+    """
     counts = dict.fromkeys(search.channel_scales, 0.0)
     for case in search.training_cases:
         for name in case.sensors:
             counts[name] += float(case.train_mask.sum()) / search.redundancies[name]
-    errors = search.training_errors(z).items()
-    likelihood = sum(2.0 * counts[name] * float(np.log(x)) for name, x in errors)
+    errors = search.training_errors(z) if errors is None else errors
+    likelihood = sum(2.0 * counts[name] * float(np.log(x)) for name, x in errors.items())
     return likelihood + float(np.sum((search.prior * z) ** 2))
 
 

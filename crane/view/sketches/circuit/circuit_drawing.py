@@ -94,7 +94,12 @@ class _CircuitDrawing:
         nets_by_row = self._used_nets()
         risers = [net for net in self._rail_labels if sum(net in row for row in nets_by_row) > 1]
         left = self._label_width + 5.0 * len(risers)
-        heights = [self._row_height(k, len(row)) for k, row in enumerate(nets_by_row)]
+        heights = [
+            self._height_above_rail(k)
+            + _RAIL_SPACING * (len(row) - 1)
+            + (_ITEM_DISTANCE + max((x.height for x in self._items_below(k)), default=0.0) + 6)
+            for k, row in enumerate(nets_by_row)
+        ]
         width = _MARGIN + left + self._content_width + 2 * _MARGIN
         height = sum(heights) + _HEADING_HEIGHT + _MARGIN
         figure = Figure(figsize=(width / 72, height / 72))
@@ -153,13 +158,6 @@ class _CircuitDrawing:
     def _items_below(self, row: int) -> list[SupplyItem]:
         item_row = row - len(self._function_rows) + 1
         return self._item_rows[item_row] if item_row >= 0 else []
-
-    def _row_height(self, row: int, rail_count: int) -> float:
-        return (
-            self._height_above_rail(row)
-            + _RAIL_SPACING * (rail_count - 1)
-            + (_ITEM_DISTANCE + max((x.height for x in self._items_below(row)), default=0.0) + 6)
-        )
 
     def _draw_row(
         self,
