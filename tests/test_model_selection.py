@@ -94,6 +94,31 @@ def test_steps_stay_within_bounds():
         assert costs[0] <= 1.02 * costs[1]
 
 
+@pytest.mark.parametrize("blocks_decide", [False, True])
+def test_blocks_decide_between_sets_that_are_about_as_good(monkeypatch, blocks_decide):
+    monkeypatch.setattr(
+        model_selection, "subset_problem",
+        lambda problem, chosen: SimpleNamespace(
+            unknowns=[problem.unknowns[i] for i in chosen], simulation_count=1
+        ),
+    )  # fmt: skip
+    sign = 1.0 if blocks_decide else -1.0
+    monkeypatch.setattr(
+        model_selection, "_block_score", lambda search, z: sign * len(search.problem.unknowns)
+    )
+    monkeypatch.setattr(  # with fewer parameters worse by 24 in the score
+        SimulatedSearch, "training_errors",
+        lambda self, z: {"x": 0.1 + 1e-3 * (len(self.problem.unknowns) < 5), "y": 0.1},
+    )  # fmt: skip
+    linear = linear_search()
+    linear.residual -= linear.jacobian @ np.array([-2.0, 1.0, 0.0, 0.0, 0.0])
+    search, rejected = SimulatedSearch(NAMES, linear), []
+    z = np.array([2.0, -1.0, 0.0, 0.5, 0.0])
+    fewer, _, _ = model_selection._fewer_parameters(search, z, [], rejected)
+    assert (len(fewer.problem.unknowns) < len(NAMES)) == blocks_decide
+    assert bool(rejected) != blocks_decide
+
+
 def test_samples_of_starts():
     """A prior's quantiles; a factor of a positive value; the range between bounds."""
     known = Unknown("a", 2.0, 0.0, 9.0, 0.5, prior=1.0)
