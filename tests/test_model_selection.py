@@ -94,14 +94,20 @@ def test_steps_stay_within_bounds():
         assert costs[0] <= 1.02 * costs[1]
 
 
-@pytest.mark.parametrize("blocks_decide", [False, True])
-def test_blocks_decide_between_sets_that_are_about_as_good(monkeypatch, blocks_decide):
+@pytest.fixture
+def subsets(monkeypatch):
+    """Problems of some of the unknowns, without a machine."""
     monkeypatch.setattr(
         model_selection, "subset_problem",
         lambda problem, chosen: SimpleNamespace(
             unknowns=[problem.unknowns[i] for i in chosen], simulation_count=1
         ),
     )  # fmt: skip
+
+
+@pytest.mark.usefixtures("subsets")
+@pytest.mark.parametrize("blocks_decide", [False, True])
+def test_blocks_decide_between_sets_that_are_about_as_good(monkeypatch, blocks_decide):
     sign = 1.0 if blocks_decide else -1.0
     monkeypatch.setattr(
         model_selection, "_block_score", lambda search, z: sign * len(search.problem.unknowns)
@@ -167,15 +173,10 @@ class SimulatedSearch:
         return {"x": 0.1 if known else 0.2, "y": 0.1}
 
 
+@pytest.mark.usefixtures("subsets")
 @pytest.mark.parametrize("is_simulated", [False, True])
 def test_what_a_simulation_needs_stays(monkeypatch, is_simulated):
     """The twin costs nothing by linearization, which does not hold as far as its old value."""
-    monkeypatch.setattr(
-        model_selection, "subset_problem",
-        lambda problem, chosen: SimpleNamespace(
-            unknowns=[problem.unknowns[i] for i in chosen], simulation_count=1
-        ),
-    )  # fmt: skip
     linear = linear_search()
     linear.residual -= linear.jacobian @ np.array([-2.0, 1.0, 0.0, 0.0, 0.0])  # noise, at z
     search = SimulatedSearch(NAMES, linear)
@@ -245,6 +246,7 @@ class ReserveSearch:
         return self.levels[z] < level
 
 
+@pytest.mark.usefixtures("subsets")
 @pytest.mark.parametrize(
     "levels, expected",
     [
@@ -254,10 +256,6 @@ class ReserveSearch:
     ],
 )
 def test_a_reserve_joins_where_more_than_noise_is_left(monkeypatch, levels, expected):
-    monkeypatch.setattr(
-        model_selection, "subset_problem",
-        lambda problem, chosen: SimpleNamespace(unknowns=[problem.unknowns[i] for i in chosen]),
-    )  # fmt: skip
     tried = []
 
     def lowest(search, z):
