@@ -137,9 +137,6 @@ def test_what_is_fitted_can_be_loaded(fitted):
 
 @pytest.mark.long
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True, reason="the search of the selected set ends beside the minimum of the named fit"
-)
 def test_what_is_wrong_is_found_without_being_named(fitted, tmp_path):
     """Five numbers are off, one of them said otherwise by hand; what is right stays.
 

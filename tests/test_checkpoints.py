@@ -223,12 +223,13 @@ def test_a_calibration_goes_on_to_the_same_machine(tmp_path, fit):
     from test_calibration import recorded, simple
 
     machine = simple(tmp_path)
-    path = recorded(machine, tmp_path / "run.csv", 0)
+    path, other = (recorded(machine, tmp_path / f"run{i}.csv", i) for i in (0, 1))
 
     def compute(progress=None, file=None):
         return crane.calibrate(
-            machine, path, fit, train=(0.0, 2.0), checkpoint=file, progress=progress
-        )
+            machine, path, fit, train=(0.0, 2.0), validation=[other], checkpoint=file,
+            progress=progress,
+        )  # fmt: skip
 
     with quiet():
         whole = compute()
@@ -241,10 +242,14 @@ def test_a_calibration_goes_on_to_the_same_machine(tmp_path, fit):
     assert found.changes == whole.changes and found.simulation_count == whole.simulation_count
     rows = [line.split(",") for line in file.read_text().splitlines()[6:]]
     assert len(rows) > count and all(len(row) == 8 for row in rows)
+
+    def begin_anew(fit, train):
+        crane.calibrate(machine, path, fit, train=train, validation=[other], checkpoint=file)
+
     with pytest.raises(InputError, match="was begun with other settings"), quiet():
-        crane.calibrate(machine, path, ["load_x.mass"], train=(0.0, 2.0), checkpoint=file)
+        begin_anew(["load_x.mass"], (0.0, 2.0))
     with pytest.raises(InputError, match="was begun with other recordings"), quiet():
-        crane.calibrate(machine, path, fit, train=(0.0, 2.1), checkpoint=file)
+        begin_anew(fit, (0.0, 2.1))
 
 
 def study_command(out, *words):

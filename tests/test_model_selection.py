@@ -100,7 +100,7 @@ def subsets(monkeypatch):
     monkeypatch.setattr(
         model_selection, "subset_problem",
         lambda problem, chosen: SimpleNamespace(
-            unknowns=[problem.unknowns[i] for i in chosen], simulation_count=1
+            unknowns=[problem.unknowns[i] for i in chosen]
         ),
     )  # fmt: skip
 
@@ -123,6 +123,20 @@ def test_blocks_decide_between_sets_that_are_about_as_good(monkeypatch, blocks_d
     fewer, _, _ = model_selection._fewer_parameters(search, z, [], rejected)
     assert (len(fewer.problem.unknowns) < len(NAMES)) == blocks_decide
     assert bool(rejected) != blocks_decide
+
+
+@pytest.mark.parametrize(
+    ("has_stiction", "start", "found"), [(True, 3.0, 2.0), (False, 3.0, 3.0), (True, 0.0, 0.0)]
+)
+def test_a_kink_of_friction_is_left_for_a_lower_minimum(has_stiction, start, found):
+    """Smoothed friction moves the search by one; at the lowest minimum that is no gain."""
+    problem = SimpleNamespace(smooth=0.0, slopes=0.0)
+    search = SimpleNamespace(
+        problem=problem, has_stiction=has_stiction, cost=lambda z: float(z @ z),
+        minimize=lambda z, tolerance: SimpleNamespace(z=z - 0.5 * bool(problem.smooth)),
+    )  # fmt: skip
+    z = model_selection._released_minimum(search, np.array([start]))
+    assert z == [found] and not problem.smooth
 
 
 def test_samples_of_starts():
@@ -153,7 +167,7 @@ class SimulatedSearch:
     def __init__(self, names, linear):
         self.__dict__ |= vars(linear)
         unknowns = [x for x in linear.problem.unknowns if x.name in names]
-        self.problem = SimpleNamespace(unknowns=unknowns, simulation_count=0)
+        self.problem = SimpleNamespace(unknowns=unknowns)
         self.prior = np.ones(len(unknowns))
         self.training_cases = [
             SimpleNamespace(train_mask=np.ones(1200, dtype=bool), sensors=["x", "y"])

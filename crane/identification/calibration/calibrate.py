@@ -382,7 +382,7 @@ def _calibration_result(
         tuple(channels),
         problem.changes(z),
         tuple(sorted(correlated, key=lambda pair: -abs(pair[2]))),
-        problem.simulation_count,
+        search.log.simulations,
         correlation=correlation,
         states=simulated_states(problem, z),
         is_lowest_minimum=estimate.is_lowest_minimum,

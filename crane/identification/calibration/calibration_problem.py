@@ -69,7 +69,7 @@ class CalibrationProblem:
         for case in cases:
             self.cases.append(replace(case, first_start_index=count))
             count += len(case.start_std)
-        self.unknown_count, self.simulation_count = count, 0
+        self.unknown_count = count
         self.smooth = self.slopes = 0.0
         self.derivative_tolerance = DERIVATIVE_TOLERANCE
         self._machine_cache: dict[tuple[float, ...], Machine] = {}
@@ -120,7 +120,6 @@ class CalibrationProblem:
         Raises:
             CraneError: The machine is not valid, or its simulation fails.
         """
-        self.simulation_count += 1
         inputs = self._inputs_with_start(case, z)
         machine = self.simulated_machine(z, self.smooth)
         step, steps = _step_size_and_count(case, _MAX_STEP, training_only)
@@ -234,7 +233,6 @@ class CalibrationProblem:
         Raises:
             CraneError: See `simulate_readings`.
         """
-        self.simulation_count += 1
         friction_smoothing = max(self.smooth, self.slopes)
         machine = self.simulated_machine(z, friction_smoothing)
         inputs = self._inputs_with_start(case, z)

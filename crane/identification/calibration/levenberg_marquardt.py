@@ -58,8 +58,6 @@ class SearchState:
         damping: Damping of the next step.
         iteration: Number of iterations.
         has_ended: Whether this is the minimum.
-        total_iterations: Number of iterations of all searches so far.
-        simulations: Number of simulations so far.
     """
 
     z: Array
@@ -67,8 +65,6 @@ class SearchState:
     damping: float
     iteration: int = 0
     has_ended: bool = False
-    total_iterations: int = 0
-    simulations: int = 0
 
 
 class SearchLog:
@@ -79,21 +75,26 @@ class SearchLog:
 
     Args:
         checkpoint: Where states are kept; None if they are not.
+
+    Attributes:
+        iterations: Number of iterations so far.
+        simulations: Number of simulations so far.
     """
 
     def __init__(self, checkpoint: Checkpoint):
         self._checkpoint, self._number = checkpoint, 0
+        self.iterations = self.simulations = 0
 
     def begin(self) -> SearchState | None:
         """Begin the next search; returns its last state if one is kept."""
         self._number += 1
         with suppress(KeyError, ValueError):  # none, or damaged: it is searched again
             *numbers, unknowns = self._checkpoint.rows[(str(self._number),)]
-            iteration, cost, damping, has_ended, total, simulations = map(float, numbers)
-            return SearchState(
-                np.array([float(x) for x in unknowns.split()]), cost, damping, int(iteration),
-                bool(has_ended), int(total), int(simulations),
-            )  # fmt: skip
+            iteration, cost, damping, has_ended, *counts = map(float, numbers)
+            z = np.array([float(x) for x in unknowns.split()])
+            state = SearchState(z, cost, damping, int(iteration), bool(has_ended))
+            self.iterations, self.simulations = map(int, counts)
+            return state
         return None
 
     def add(self, state: SearchState) -> None:
@@ -104,7 +105,7 @@ class SearchLog:
         """
         cells = (
             state.iteration, repr(float(state.cost)), repr(float(state.damping)),
-            int(state.has_ended), state.total_iterations, state.simulations,
+            int(state.has_ended), self.iterations, self.simulations,
             " ".join(map(repr, state.z.tolist())),
         )  # fmt: skip
         self._checkpoint.append((str(self._number),), cells)
@@ -125,6 +126,7 @@ class LevenbergMarquardt:
             independent observations.
         has_equal_channels: Whether all channels count by the largest redundancy, not by their own.
         prior: (p,) weights of the priors.
+        has_stiction: Whether friction of the machine sticks.
         minima: Minima of the searches from several starts, first the one that goes on.
     """
 
@@ -133,9 +135,8 @@ class LevenbergMarquardt:
         problem: CalibrationProblem,
         progress: Progress,
         log: SearchLog,
-        iteration_count: int = 0,
     ):
-        self.problem, self._progress, self._log = problem, progress, log
+        self.problem, self._progress, self.log = problem, progress, log
         unknowns = problem.unknowns
         start_count = problem.unknown_count - len(unknowns)
         self.low = np.array(
@@ -153,13 +154,12 @@ class LevenbergMarquardt:
         self.channel_scales: dict[str, float] = {}
         self.jacobian = self.residual = self.blocks = self.channels = np.zeros(0)
         self.minima: list[SearchState] = []
-        self._iteration_count = iteration_count
         self.has_equal_channels = True
-        self._has_stiction = bool(find_stick_slip_columns(problem.machine))
+        self.has_stiction = bool(find_stick_slip_columns(problem.machine))
 
     def restricted_search(self, problem: CalibrationProblem) -> "LevenbergMarquardt":
         """Method for fewer unknowns, with these channel scales."""
-        search = LevenbergMarquardt(problem, self._progress, self._log, self._iteration_count)
+        search = LevenbergMarquardt(problem, self._progress, self.log)
         search.channel_scales, search.redundancies = self.channel_scales, self.redundancies
         search.has_equal_channels, search.blocks = self.has_equal_channels, self.blocks
         return search
@@ -168,7 +168,7 @@ class LevenbergMarquardt:
         """Prepare a search far from the minimum: largest channel scales, smoothed friction."""
         problem = self.problem
         self.channel_scales = {name: most for name, (_, most) in self._scale_bounds.items()}
-        problem.smooth = float(self._has_stiction)
+        problem.smooth = float(self.has_stiction)
         problem.derivative_tolerance = _COARSE_DERIVATIVE_TOLERANCE
 
     def sharpen_friction(self, z: Array) -> Array:
@@ -176,7 +176,7 @@ class LevenbergMarquardt:
         problem = self.problem
         problem.derivative_tolerance = _SEARCH_DERIVATIVE_TOLERANCE
         # residuals with smoothed friction do not give the final scales: they are updated
-        for problem.smooth, problem.slopes in _SMOOTHING_SCHEDULE if self._has_stiction else ():
+        for problem.smooth, problem.slopes in _SMOOTHING_SCHEDULE if self.has_stiction else ():
             is_last = not problem.smooth
             z = self.minimize(z, COMPARED_COST_TOLERANCE if is_last else INITIAL_COST_TOLERANCE).z
             self.update_scales(z)
@@ -211,6 +211,7 @@ class LevenbergMarquardt:
         """Residuals of each channel over the training data."""
         residuals: dict[str, list[Array]] = {}
         for case in self.training_cases:
+            self.log.simulations += 1
             residual = self.problem.residuals(case, z)[case.train_mask]
             for name, x in zip(case.sensors, residual.T, strict=True):
                 residuals.setdefault(name, []).append(x)
@@ -284,6 +285,7 @@ class LevenbergMarquardt:
         """
         parts = []
         for case in self.training_cases:
+            self.log.simulations += 1
             residuals = self.problem.residuals(case, z, training_only=True)
             parts.append((residuals * self.channel_weights(case))[case.train_mask].ravel())
         return np.concatenate(parts)
@@ -301,6 +303,7 @@ class LevenbergMarquardt:
         rows, weighted, blocks, channels = [], [], [], []
         order = {name: k for k, name in enumerate(self._scale_bounds)}
         for number, case in enumerate(self.training_cases):
+            self.log.simulations += 1
             try:
                 residual, derivatives = self.problem.linearize(case, z)
             except SimulationError as error:
@@ -334,18 +337,15 @@ class LevenbergMarquardt:
         Raises:
             CraneError: The simulation fails at the start.
         """
-        state = self._log.begin()
+        state = self.log.begin()
         if state is None:
             state = SearchState(z, self.cost(z), damping)
-        else:
-            self._iteration_count = state.total_iterations
-            self.problem.simulation_count = state.simulations
         if not np.isfinite(state.cost):  # raises the error
             for case in self.training_cases:
                 self.problem.residuals(case, z)
         while not state.has_ended and state.iteration < max_iterations:
             state = self._iterate(state, cost_tolerance)
-            self._log.add(state)
+            self.log.add(state)
         return state
 
     def _iterate(self, state: SearchState, cost_tolerance: float) -> SearchState:
@@ -358,8 +358,8 @@ class LevenbergMarquardt:
             trial = z + bounded_step(hessian, gradient, self.low - z, self.high - z, damping)
             trial = np.clip(trial, self.low, self.high)
             trial_cost = self.cost(trial)
-            self._iteration_count += 1
-            self._progress(1.0 - 0.97**self._iteration_count)
+            self.log.iterations += 1
+            self._progress(1.0 - 0.97**self.log.iterations)
             if trial_cost < cost:
                 z, cost, damping = trial, trial_cost, max(damping * _DAMPING_DECREASE, 1e-9)
                 break
@@ -368,10 +368,7 @@ class LevenbergMarquardt:
         has_ended = not reduction or reduction < cost_tolerance * min(
             state.cost, _MAX_COMPARED_COST
         )
-        return SearchState(
-            z, cost, damping, iteration, has_ended,
-            self._iteration_count, self.problem.simulation_count,
-        )  # fmt: skip
+        return SearchState(z, cost, damping, iteration, has_ended)
 
     def covariance(self, z: Array) -> tuple[Array, int]:
         """Covariance (p, p) of the scaled unknowns, and the number of blocks.

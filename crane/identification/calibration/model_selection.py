@@ -18,7 +18,8 @@ A linearization does not hold as far as the values of the machine. Therefore the
 simulation, and replaces the larger one only if its score, sum_c n_c ln(mean square) over the
 training data with the same penalties, is not higher; else the half of what it lacks joins that
 was moved farthest. If it is higher by little, simulated fits without each block decide. The set is
-selected again by the linearization at its minimum, until nothing is left out any more.
+selected again by the linearization at its minimum, until nothing is left out any more. At the end
+it is searched once more with smoothed friction, from which the lower minimum is kept.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -40,6 +41,7 @@ from crane.identification.calibration.multi_start import (
     simulated_score,
     smoothed_minimum,
 )
+from crane.identification.calibration.recording_case import RecordingCase
 
 MAX_CORRELATION = 0.98  # of parameters that are both kept
 MAX_PRIOR_SHARE = 0.7  # of the deviation of a prior, up to which recordings determine a parameter
@@ -51,6 +53,12 @@ _WEIGHT_ROUNDS = 3  # of weights by redundancies of all candidates
 _MAX_ITERATIONS = 12  # of the fit of a selected set
 _SCORE_TOLERANCE = 30.0  # difference of scores of one minimum; more is another one
 _BLOCK_ITERATIONS = 3  # of the fits without a block
+# smoothing and tolerances of the way out of a minimum that may be a kink of friction
+_RELEASE_SCHEDULE = (
+    ((0.1, 0.1), INITIAL_COST_TOLERANCE),
+    ((0.03, 0.03), INITIAL_COST_TOLERANCE),
+    (FINAL_SMOOTHING, COMPARED_COST_TOLERANCE),
+)
 
 
 @dataclass(frozen=True)
@@ -245,22 +253,21 @@ def select_parameters(
     Returns:
         The selected model.
     """
-    names = [x.name for x in search.problem.unknowns]
+    candidates = search.problem.unknowns
     first, z = _candidates_minimum(search, reserve)
     search = first
-    steps, count = list[SelectionStep](), len(names) + 1
-    rejected = list[set[str]]()
+    steps, rejected, count = list[SelectionStep](), list[set[str]](), len(candidates) + 1
     while len(search.problem.unknowns) < count:
         count = len(search.problem.unknowns)
         search.update_scales(z)
         search.linearize_for_covariance(z)
         search, z, last = _fewer_parameters(search, z, kept_names, rejected)
         steps = steps or last
-    z = search.nearest_minimum(z)
-    selected = {x.name for x in search.problem.unknowns}
+    z = search.nearest_minimum(_released_minimum(search, z))
     return SelectedModel(
-        first, search, z, tuple(steps), tuple(x for x in names if x not in selected)
-    )
+        first, search, z, tuple(steps),
+        tuple(x.name for x in candidates if x not in search.problem.unknowns),
+    )  # fmt: skip
 
 
 def _candidates_minimum(
@@ -298,6 +305,18 @@ def _weighted_minimum(search: LevenbergMarquardt, z: Array) -> Array:
     return z
 
 
+def _released_minimum(search: LevenbergMarquardt, z: Array) -> Array:
+    """Minimum z (p,), or the one that smoothed friction leads to from there, by the lower cost.
+
+    A search may end at a kink of its cost, where the simulation begins or ceases to stick.
+    """
+    problem, released = search.problem, z
+    for smoothing, tolerance in _RELEASE_SCHEDULE if search.has_stiction else ():
+        problem.smooth, problem.slopes = smoothing
+        released = search.minimize(released, tolerance).z
+    return min((z, released), key=search.cost)
+
+
 def _fewer_parameters(
     search: LevenbergMarquardt,
     z: Array,
@@ -330,14 +349,12 @@ def _fewer_parameters(
         if any(names <= x for x in rejected):
             continue
         unknowns = selection.with_starts(remaining)
-        problem = subset_problem(search.problem, remaining)
-        fewer = search.restricted_search(problem)
+        fewer = search.restricted_search(subset_problem(search.problem, remaining))
         minimum = fewer.minimize(
             min((z[unknowns], selection.fit(unknowns)[unknowns]), key=fewer.cost),
             COMPARED_COST_TOLERANCE,
             max_iterations=_MAX_ITERATIONS,
         ).z
-        search.problem.simulation_count = problem.simulation_count
         reduction = score - simulated_score(fewer, minimum) - 2.0 * len(names)
         if -_SCORE_TOLERANCE < reduction < 0.0:
             large = large or _block_score(search, z)
@@ -363,14 +380,18 @@ def _last_halves(items: list[int]) -> Iterator[list[int]]:
         items = items[(len(items) + 1) // 2 :]
 
 
-def subset_problem(problem: CalibrationProblem, chosen: Sequence[int]) -> CalibrationProblem:
-    """Problem of some of the parameters, with the same smoothing."""
+def subset_problem(
+    problem: CalibrationProblem,
+    chosen: Sequence[int],
+    cases: Sequence[RecordingCase] | None = None,
+) -> CalibrationProblem:
+    """Problem of some of the parameters, or with other recordings, with the same smoothing."""
     smaller = CalibrationProblem(
-        problem.machine, [problem.unknowns[i] for i in chosen], problem.cases
+        problem.machine, [problem.unknowns[i] for i in chosen], cases or problem.cases
     )
-    smaller.smooth, smaller.slopes = problem.smooth, problem.slopes
-    smaller.derivative_tolerance = problem.derivative_tolerance
-    smaller.simulation_count = problem.simulation_count
+    smaller.smooth, smaller.slopes, smaller.derivative_tolerance = (
+        problem.smooth, problem.slopes, problem.derivative_tolerance,
+    )  # fmt: skip
     return smaller
 
 
@@ -383,21 +404,18 @@ def block_errors(search: LevenbergMarquardt, z: Array) -> dict[str, tuple[float,
     """
     problem, squares = search.problem, dict[str, list[tuple[int, float]]]()
     numbers, row = training_blocks(search.blocks), 0
-    for k, case in enumerate(search.training_cases):
+    for k, case in enumerate(problem.cases):
         count = int(case.train_mask.sum()) * len(case.sensors)
         blocks = np.full(len(case.train_mask), -1)
         blocks[case.train_mask] = numbers[row : row + count : len(case.sensors)]
         row += count
         for b in np.unique(blocks[case.train_mask]):
-            cases = list(search.training_cases)
+            cases = list(problem.cases)
             cases[k] = replace(case, train_mask=case.train_mask & (blocks != b))
-            part = CalibrationProblem(problem.machine, problem.unknowns, cases)
-            part.smooth, part.slopes = problem.smooth, problem.slopes
-            part.derivative_tolerance = problem.derivative_tolerance
+            part = subset_problem(problem, range(len(problem.unknowns)), cases)
             found = search.restricted_search(part).minimize(
                 z, INITIAL_COST_TOLERANCE, max_iterations=_BLOCK_ITERATIONS
             )
-            problem.simulation_count += part.simulation_count
             residual = part.residuals(part.cases[k], found.z)[blocks == b]
             for name, x in zip(case.sensors, residual.T, strict=True):
                 squares.setdefault(name, []).append((len(x), float(x @ x)))
