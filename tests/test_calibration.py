@@ -553,3 +553,14 @@ def test_what_a_model_lacks_is_named_with_how_much_of_it(tmp_path):
     assert f"{air} at about" in found.to_text()
     path = recorded(machine, tmp_path / "none.csv", 0)
     assert not quiet(crane.calibrate, machine, path, fit, train=(0.0, 4.0)).score_tests
+
+
+def test_score_tests_find_the_friction_that_is_wrong(tmp_path):
+    """Fits of either friction take 32 and 42 % of the squares, of the spool 2 to 4 %."""
+    machine = simple(tmp_path)
+    path = recorded(machine, tmp_path / "run.csv", 0)
+    fit = ["load_x.mass", "valve.x.neutral", "oil.bulk_modulus"]
+    tests = quiet(crane.calibrate, machine, path, fit).score_tests
+    assert [x.name for x in tests[:2]] == ["friction.x.viscous", "friction.x.coulomb"]
+    assert 0.2 < tests[1].cost_reduction < tests[0].cost_reduction < 0.42
+    assert all(x.cost_reduction < 0.15 for x in tests[2:])

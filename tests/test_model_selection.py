@@ -27,6 +27,16 @@ from crane.recordings.timeseries import Table
 NAMES = ["gain", "offset", "nothing", "twin", "weak"]
 
 
+class Problem:
+    """Unknowns without a machine."""
+
+    def __init__(self, unknowns):
+        self.unknowns = unknowns
+
+    def variant(self, unknowns):
+        return Problem(unknowns)
+
+
 def linear_search(seed=0, noise=0.1, count=1200):
     """A linear model of two channels: two parameters, one without effect, a twin, noise alone."""
     random, time = np.random.default_rng(seed), np.linspace(0.0, 12.0, count)
@@ -41,7 +51,7 @@ def linear_search(seed=0, noise=0.1, count=1200):
         channels=np.tile([0, 1], count), channel_scales={"x": 0.5, "y": 2.0},
         weight_divisors={"x": 0.5, "y": 2.0},
         prior=np.ones(5), low=np.full(5, -9.0), high=np.full(5, 9.0),
-        problem=SimpleNamespace(unknowns=unknowns),
+        problem=Problem(unknowns),
     )  # fmt: skip
 
 
@@ -94,18 +104,6 @@ def test_steps_stay_within_bounds():
         assert costs[0] <= 1.02 * costs[1]
 
 
-@pytest.fixture
-def subsets(monkeypatch):
-    """Problems of some of the unknowns, without a machine."""
-    monkeypatch.setattr(
-        model_selection, "subset_problem",
-        lambda problem, chosen: SimpleNamespace(
-            unknowns=[problem.unknowns[i] for i in chosen]
-        ),
-    )  # fmt: skip
-
-
-@pytest.mark.usefixtures("subsets")
 @pytest.mark.parametrize("blocks_decide", [False, True])
 def test_blocks_decide_between_sets_that_are_about_as_good(monkeypatch, blocks_decide):
     sign = 1.0 if blocks_decide else -1.0
@@ -167,7 +165,7 @@ class SimulatedSearch:
     def __init__(self, names, linear):
         self.__dict__ |= vars(linear)
         unknowns = [x for x in linear.problem.unknowns if x.name in names]
-        self.problem = SimpleNamespace(unknowns=unknowns)
+        self.problem = Problem(unknowns)
         self.prior = np.ones(len(unknowns))
         self.training_cases = [
             SimpleNamespace(train_mask=np.ones(1200, dtype=bool), sensors=["x", "y"])
@@ -187,7 +185,6 @@ class SimulatedSearch:
         return {"x": 0.1 if known else 0.2, "y": 0.1}
 
 
-@pytest.mark.usefixtures("subsets")
 @pytest.mark.parametrize("is_simulated", [False, True])
 def test_what_a_simulation_needs_stays(monkeypatch, is_simulated):
     """The twin costs nothing by linearization, which does not hold as far as its old value."""
@@ -260,7 +257,6 @@ class ReserveSearch:
         return self.levels[z] < level
 
 
-@pytest.mark.usefixtures("subsets")
 @pytest.mark.parametrize(
     "levels, expected",
     [
@@ -280,7 +276,7 @@ def test_a_reserve_joins_where_more_than_noise_is_left(monkeypatch, levels, expe
     monkeypatch.setattr(model_selection, "lowest_minimum", lowest)
     monkeypatch.setattr(model_selection, "_weighted_minimum", lambda search, z: "weighted")
     unknowns = [Unknown(x, 1.0, 0.0, 2.0, 1.0) for x in "abc"]
-    search = ReserveSearch(SimpleNamespace(unknowns=unknowns), levels)
+    search = ReserveSearch(Problem(unknowns), levels)
     reserve = {"c": {"X", "pressure_X_a"}, "d": {"Y"}}
     found, z = model_selection._candidates_minimum(search, reserve)
     assert [x.name for x in found.problem.unknowns] == expected and z == "weighted"

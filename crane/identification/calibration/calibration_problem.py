@@ -1,7 +1,7 @@
 """Residuals between recordings and simulations of their inputs, and their derivatives."""
 
 import warnings
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -73,6 +73,16 @@ class CalibrationProblem:
         self.smooth = self.slopes = 0.0
         self.derivative_tolerance = DERIVATIVE_TOLERANCE
         self._machine_cache: dict[tuple[float, ...], Machine] = {}
+
+    def variant(
+        self, unknowns: Sequence[Unknown], cases: Sequence[RecordingCase] | None = None
+    ) -> "CalibrationProblem":
+        """The problem with other unknowns, and other recordings or these."""
+        problem = CalibrationProblem(self.machine, unknowns, cases or self.cases)
+        problem.smooth, problem.slopes, problem.derivative_tolerance = (
+            self.smooth, self.slopes, self.derivative_tolerance,
+        )  # fmt: skip
+        return problem
 
     def values(self, z: Array) -> dict[str, float]:
         """Values of the unknown parameters by name."""
@@ -218,9 +228,7 @@ class CalibrationProblem:
         curve = self.simulate_readings(case, z, training_only)
         return self._sensor_readings(case, curve, z)[0] - case.measured
 
-    def linearize(
-        self, case: RecordingCase, z: Array, fixed_unknowns: Set[int] = frozenset()
-    ) -> tuple[Array, Array]:
+    def linearize(self, case: RecordingCase, z: Array) -> tuple[Array, Array]:
         """Residuals (N, k) and their derivatives (N, k, p), see `crane.sensitivities`.
 
         They are valid up to the last training instant.
@@ -228,7 +236,6 @@ class CalibrationProblem:
         Args:
             case: The recording.
             z: Unknowns.
-            fixed_unknowns: Indices of unknowns whose derivatives are left 0.
 
         Raises:
             CraneError: See `simulate_readings`.
@@ -241,13 +248,12 @@ class CalibrationProblem:
         largest_step = _MAX_COARSE_STEP if is_coarse else _MAX_SENSITIVITY_STEP
         step, steps = _step_size_and_count(case, largest_step, True)
         start_unknowns = case.first_start_index + np.flatnonzero(case.start_std)
-        varied_unknowns = [i for i in range(len(self.unknowns)) if i not in fixed_unknowns]
         # compared sensors affect the simulation only if its start depends on them
         output_sensors = {
             x for x in case.sensors if x not in machine.active and not x.startswith("pressure_")
         }
         simulated_unknowns = [
-            i for i in varied_unknowns if self.unknowns[i].sensor not in output_sensors
+            i for i, x in enumerate(self.unknowns) if x.sensor not in output_sensors
         ]
         simulated_unknowns += start_unknowns.tolist()
         links = [link for link, _ in observed_frames(machine, case.sensors)]
@@ -279,8 +285,8 @@ class CalibrationProblem:
             jacobian[:, k, simulated_unknowns] = (
                 sensor.scale * sensitivity_curve(delayed_time)[:, k]
             )
-        for i in sensor_derivatives.keys() & set(varied_unknowns):
-            jacobian[:, :, i] += sensor_derivatives[i]
+        for i, derivative in sensor_derivatives.items():
+            jacobian[:, :, i] += derivative
         if friction_smoothing > self.smooth and find_stick_slip_columns(
             self.simulated_machine(z, self.smooth)
         ):

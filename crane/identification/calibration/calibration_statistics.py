@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from crane.common.errors import CraneError
 from crane.common.samples import Array
-from crane.identification.calibration.calibration_problem import CalibrationProblem
 from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt
 from crane.identification.calibration.unknowns import Unknown
 
@@ -243,24 +242,16 @@ def score_tests(
     problem = search.problem
     if not candidates:
         return []
-    extended_problem = CalibrationProblem(
-        problem.machine, [*problem.unknowns, *candidates], problem.cases
-    )
-    extended_problem.smooth, extended_problem.slopes = problem.smooth, problem.slopes
     count, candidate_count = len(problem.unknowns), len(candidates)
-    unknowns = np.concatenate([z[:count], np.zeros(candidate_count), z[count:]])
-    rows = []
-    for case, extended_case in zip(problem.cases, extended_problem.cases, strict=True):
-        if not case.train_mask.any():
-            continue
-        try:
-            _, derivatives = extended_problem.linearize(extended_case, unknowns, set(range(count)))
-        except CraneError:  # the tests are optional
-            return []
-        weighted = (derivatives * search.channel_weights(case)[:, :, None])[case.train_mask]
-        rows.append(weighted[:, :, count : count + candidate_count].reshape(-1, candidate_count))
-    jacobian, candidate_jacobian = search.jacobian, np.vstack(rows)
-    residual = search.residual
+    extended = search.restricted_search(problem.variant([*problem.unknowns, *candidates]))
+    try:
+        extended.linearize_for_covariance(
+            np.concatenate([z[:count], np.zeros(candidate_count), z[count:]])
+        )
+    except CraneError:  # the tests are optional
+        return []
+    jacobian, residual = search.jacobian, search.residual
+    candidate_jacobian = extended.jacobian[:, count : count + candidate_count]
     inverse = np.linalg.pinv(jacobian.T @ jacobian + np.diag(search.prior**2), hermitian=True)
     independent_columns = candidate_jacobian - jacobian @ (
         inverse @ (jacobian.T @ candidate_jacobian)

@@ -28,7 +28,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from crane.common.samples import Array
-from crane.identification.calibration.calibration_problem import CalibrationProblem
 from crane.identification.calibration.levenberg_marquardt import (
     COMPARED_COST_TOLERANCE,
     FINAL_SMOOTHING,
@@ -41,7 +40,6 @@ from crane.identification.calibration.multi_start import (
     simulated_score,
     smoothed_minimum,
 )
-from crane.identification.calibration.recording_case import RecordingCase
 
 MAX_CORRELATION = 0.98  # of parameters that are both kept
 MAX_PRIOR_SHARE = 0.7  # of the deviation of a prior, up to which recordings determine a parameter
@@ -280,9 +278,10 @@ def _candidates_minimum(
         reserve: See `select_parameters`.
     """
     unknowns = search.problem.unknowns
-    others = [i for i, x in enumerate(unknowns) if x.name not in reserve]
     channels = {name for x in unknowns for name in reserve.get(x.name, ())}
-    first = search.restricted_search(subset_problem(search.problem, others))
+    first = search.restricted_search(
+        search.problem.variant([x for x in unknowns if x.name not in reserve])
+    )
     z = smoothed_minimum(first)
     if not channels or first.leaves_noise(z, channels, _SMOOTHED_NOISE_LEVEL):
         z = _weighted_minimum(first, lowest_minimum(first, z))
@@ -345,11 +344,12 @@ def _fewer_parameters(
     score, large = simulated_score(search, z) + 2.0 * len(parameters), 0.0
     for removed in _last_halves(others):
         remaining = [i for i in range(len(parameters)) if i not in removed]
-        names = {parameters[i].name for i in remaining}
+        kept = [parameters[i] for i in remaining]
+        names = {x.name for x in kept}
         if any(names <= x for x in rejected):
             continue
         unknowns = selection.with_starts(remaining)
-        fewer = search.restricted_search(subset_problem(search.problem, remaining))
+        fewer = search.restricted_search(search.problem.variant(kept))
         minimum = fewer.minimize(
             min((z[unknowns], selection.fit(unknowns)[unknowns]), key=fewer.cost),
             COMPARED_COST_TOLERANCE,
@@ -380,21 +380,6 @@ def _last_halves(items: list[int]) -> Iterator[list[int]]:
         items = items[(len(items) + 1) // 2 :]
 
 
-def subset_problem(
-    problem: CalibrationProblem,
-    chosen: Sequence[int],
-    cases: Sequence[RecordingCase] | None = None,
-) -> CalibrationProblem:
-    """Problem of some of the parameters, or with other recordings, with the same smoothing."""
-    smaller = CalibrationProblem(
-        problem.machine, [problem.unknowns[i] for i in chosen], cases or problem.cases
-    )
-    smaller.smooth, smaller.slopes, smaller.derivative_tolerance = (
-        problem.smooth, problem.slopes, problem.derivative_tolerance,
-    )  # fmt: skip
-    return smaller
-
-
 def block_errors(search: LevenbergMarquardt, z: Array) -> dict[str, tuple[float, float]]:
     """RMS errors of each channel in blocks that are left out of the fit: of all, and of the worst.
 
@@ -412,7 +397,7 @@ def block_errors(search: LevenbergMarquardt, z: Array) -> dict[str, tuple[float,
         for b in np.unique(blocks[case.train_mask]):
             cases = list(problem.cases)
             cases[k] = replace(case, train_mask=case.train_mask & (blocks != b))
-            part = subset_problem(problem, range(len(problem.unknowns)), cases)
+            part = problem.variant(problem.unknowns, cases)
             found = search.restricted_search(part).minimize(
                 z, INITIAL_COST_TOLERANCE, max_iterations=_BLOCK_ITERATIONS
             )
