@@ -77,7 +77,7 @@ class CalibrationProblem:
     def variant(
         self, unknowns: Sequence[Unknown], cases: Sequence[RecordingCase] | None = None
     ) -> "CalibrationProblem":
-        """The problem with other unknowns, and other recordings or these."""
+        """The problem with other unknowns or recordings, smoothed like this one."""
         problem = CalibrationProblem(self.machine, unknowns, cases or self.cases)
         problem.smooth, problem.slopes, problem.derivative_tolerance = (
             self.smooth, self.slopes, self.derivative_tolerance,
