@@ -9,12 +9,12 @@ import crane
 from crane.common.errors import SimulationError
 from crane.formats.machine_loading import MachineVariants
 from crane.identification.calibration import model_selection, multi_start
-from crane.identification.calibration.levenberg_marquardt import bounded_step
 from crane.identification.calibration.model_selection import (
     LinearizedSelection,
     training_blocks,
 )
 from crane.identification.calibration.multi_start import sample
+from crane.identification.calibration.normal_equations import bounded_step, scaled_inverse
 from crane.identification.calibration.plausibility import (
     StaticPayload,
     implausible_values,
@@ -25,6 +25,16 @@ from crane.recordings.sensor_kinematics import cylinder_pins
 from crane.recordings.timeseries import Table
 
 NAMES = ["gain", "offset", "nothing", "twin", "weak"]
+
+
+def test_a_steep_unknown_hides_no_flat_one():
+    """An unknown 1e9 times as steep, one without effect, and twins that share theirs."""
+    J = np.random.default_rng(2).normal(size=(40, 4)) * [1e9, 1.0, 1e-3, 0.0]
+    J = np.column_stack([J, J[:, 2]])
+    variances = np.diag(scaled_inverse(J.T @ J))
+    exact = np.linalg.inv((J / [1e9, 1, 1e-3, 1, 1]).T[:3] @ (J / [1e9, 1, 1e-3, 1, 1])[:, :3])
+    np.testing.assert_allclose(variances[:2], np.diag(exact)[:2] / [1e18, 1.0], rtol=1e-6)
+    assert variances[3] == 0.0 and variances[2] == pytest.approx(exact[2, 2] * 1e6 / 4, rel=1e-6)
 
 
 class Problem:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from crane.common.errors import CraneError
 from crane.common.samples import Array
 from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt
+from crane.identification.calibration.normal_equations import scaled_inverse
 from crane.identification.calibration.unknowns import Unknown
 
 _LOWER_MINIMUM_SHARE = 5e-2  # relative difference of the cost of a lower minimum
@@ -124,7 +125,7 @@ def evaluate_profile_ends(
     """
     J = search.jacobian
     H = J.T @ J + np.diag(search.prior**2)
-    C = np.linalg.pinv(H, rcond=1e-13, hermitian=True)
+    C = scaled_inverse(H)
     minimum_cost, _ = _cost_and_gradient(search, z)
     lower_point, lowest_cost = None, minimum_cost * (1.0 - _LOWER_MINIMUM_SHARE)
     profile_ends = []
@@ -134,7 +135,7 @@ def evaluate_profile_ends(
             continue
         free = (z > search.low) & (z < search.high)
         free[i] = True
-        inverse = np.linalg.pinv(H[np.ix_(free, free)], rcond=1e-13, hermitian=True)
+        inverse = scaled_inverse(H[np.ix_(free, free)])
         k = int(free[:i].sum())
         path = np.zeros(len(z))
         path[free] = inverse[:, k] / inverse[k, k]
@@ -163,7 +164,7 @@ def _refine_point(
     """The better of a point and the point after a Gauss-Newton step, and its cost."""
     z = np.clip(z, search.low, search.high)
     cost, gradient = _cost_and_gradient(search, z)
-    inverse = np.linalg.pinv(H[np.ix_(free, free)], rcond=1e-13, hermitian=True)
+    inverse = scaled_inverse(H[np.ix_(free, free)])
     refined = z.copy()
     refined[free] -= inverse @ gradient[free]
     refined = np.clip(refined, search.low, search.high)
@@ -252,7 +253,7 @@ def score_tests(
         return []
     jacobian, residual = search.jacobian, search.residual
     candidate_jacobian = extended.jacobian[:, count : count + candidate_count]
-    inverse = np.linalg.pinv(jacobian.T @ jacobian + np.diag(search.prior**2), hermitian=True)
+    inverse = scaled_inverse(jacobian.T @ jacobian + np.diag(search.prior**2))
     independent_columns = candidate_jacobian - jacobian @ (
         inverse @ (jacobian.T @ candidate_jacobian)
     )

@@ -19,6 +19,7 @@ from crane.identification.calibration.calibration_problem import (
     DERIVATIVE_TOLERANCE,
     CalibrationProblem,
 )
+from crane.identification.calibration.normal_equations import bounded_step, scaled_inverse
 from crane.identification.calibration.recording_case import NOISE_LEVEL, RecordingCase, noise_std
 
 _MAX_WEIGHT_ROUNDS = 3  # rounds of channel scales
@@ -377,7 +378,7 @@ class LevenbergMarquardt:
         noise, without regard to bounds. The variance of an unknown without effect is infinite.
         """
         hessian = self.jacobian.T @ self.jacobian + np.diag(self.prior**2)
-        inverse = np.linalg.pinv(hessian, rcond=1e-13, hermitian=True)
+        inverse = scaled_inverse(hessian)
         numbers = np.unique(np.floor(self.blocks / self._block_duration()), return_inverse=True)[1]
         sums = np.zeros((numbers.max() + 1, len(z)))
         np.add.at(sums, numbers, self.jacobian * self.residual[:, None])
@@ -405,34 +406,6 @@ class LevenbergMarquardt:
                 correlation_time = max(correlation_time, step * _correlation_time(x))
         fewest, most = _BLOCK_COUNT_RANGE
         return max(min(max(4.0 * correlation_time, duration / most), duration / fewest), 1e-9)
-
-
-def bounded_step(
-    hessian: Array, gradient: Array, low: Array, high: Array, damping: float = 0.0
-) -> Array:
-    """Damped Gauss-Newton step (p,) between bounds, by an active set.
-
-    Args:
-        hessian: (p, p).
-        gradient: (p,).
-        low: (p,) least step.
-        high: (p,) largest step.
-        damping: Marquardt's, relative to the diagonal.
-    """
-    size = np.diag(hessian)
-    scaled = hessian + damping * np.diag(np.maximum(size, 1e-12 * size.max(initial=0.0)))
-    free = np.ones(len(gradient), dtype=bool)
-    step = np.zeros(len(gradient))
-    for _ in range(len(gradient)):
-        i = np.flatnonzero(free)
-        right_side = -gradient[i] - scaled[np.ix_(i, ~free)] @ step[~free]
-        step[i] = np.linalg.lstsq(scaled[np.ix_(i, i)], right_side, rcond=1e-12)[0]
-        outside = free & ((step < low) | (step > high))
-        if not outside.any():
-            break
-        step[outside] = np.clip(step, low, high)[outside]
-        free &= ~outside
-    return step
 
 
 def _correlation_time(x: Array) -> float:

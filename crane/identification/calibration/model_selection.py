@@ -33,13 +33,13 @@ from crane.identification.calibration.levenberg_marquardt import (
     FINAL_SMOOTHING,
     INITIAL_COST_TOLERANCE,
     LevenbergMarquardt,
-    bounded_step,
 )
 from crane.identification.calibration.multi_start import (
     lowest_minimum,
     simulated_score,
     smoothed_minimum,
 )
+from crane.identification.calibration.normal_equations import bounded_step, scaled_inverse
 
 MAX_CORRELATION = 0.98  # of parameters that are both kept
 MAX_PRIOR_SHARE = 0.7  # of the deviation of a prior, up to which recordings determine a parameter
@@ -177,7 +177,7 @@ class LinearizedSelection:
         """Parameters of a set that are known by their prior alone, or correlate with others."""
         unknowns = self.with_starts(parameters)
         hessian = (self._by_block.sum(axis=0)[:-1, :-1] + self._prior)[np.ix_(unknowns, unknowns)]
-        covariance = np.linalg.pinv(hessian, rcond=1e-13, hermitian=True)
+        covariance = scaled_inverse(hessian)
         covariance = covariance[: len(parameters), : len(parameters)]
         deviations = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
         prior = np.sqrt(np.diag(self._prior))[list(parameters)]

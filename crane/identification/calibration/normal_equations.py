@@ -1,0 +1,48 @@
+"""Normal equations of a least-squares problem: steps between bounds, inverse."""
+
+import numpy as np
+
+from crane.common.samples import Array
+
+
+def bounded_step(
+    hessian: Array, gradient: Array, low: Array, high: Array, damping: float = 0.0
+) -> Array:
+    """Damped Gauss-Newton step (p,) between bounds, by an active set.
+
+    Args:
+        hessian: (p, p).
+        gradient: (p,).
+        low: (p,) least step.
+        high: (p,) largest step.
+        damping: Marquardt's, relative to the diagonal.
+    """
+    size = np.diag(hessian)
+    scaled = hessian + damping * np.diag(np.maximum(size, 1e-12 * size.max(initial=0.0)))
+    free = np.ones(len(gradient), dtype=bool)
+    step = np.zeros(len(gradient))
+    for _ in range(len(gradient)):
+        i = np.flatnonzero(free)
+        right_side = -gradient[i] - scaled[np.ix_(i, ~free)] @ step[~free]
+        step[i] = np.linalg.lstsq(scaled[np.ix_(i, i)], right_side, rcond=1e-12)[0]
+        outside = free & ((step < low) | (step > high))
+        if not outside.any():
+            break
+        step[outside] = np.clip(step, low, high)[outside]
+        free &= ~outside
+    return step
+
+
+def scaled_inverse(hessian: Array) -> Array:
+    """Pseudo-inverse (p, p) of a Hessian whose unknowns may have any units.
+
+    Directions are cut off where the diagonal is scaled to 1: a steep unknown does not hide that a
+    flat one is determined.
+
+    Args:
+        hessian: (p, p), symmetric and positive semidefinite.
+    """
+    size = np.sqrt(np.diag(hessian))
+    size[size == 0.0] = 1.0
+    sizes = np.outer(size, size)
+    return np.asarray(np.linalg.pinv(hessian / sizes, rcond=1e-13, hermitian=True) / sizes)
