@@ -345,7 +345,7 @@ class Calibration(Result):
         for k, word in enumerate(("blocks left out", "the worst block")):
             errors = {name: self.block_errors[name][k] for name in names}
             lines.append(f"| simulated, {word} | | | {cells(errors)} |")
-        lines += ["", "Left out: " + ", ".join(self.unselected_parameters) + "."]
+        lines += ["", "Left out, exact to the intervals: " + ", ".join(self.unselected_parameters)]
         return lines
 
 
