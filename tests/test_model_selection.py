@@ -147,6 +147,18 @@ def test_a_kink_of_friction_is_left_for_a_lower_minimum(has_stiction, start, fou
     assert z == [found] and not problem.smooth
 
 
+def test_a_simulation_that_fails_with_smoothed_friction_keeps_the_minimum():
+    def fail(z, tolerance):
+        raise SimulationError("halts")
+
+    problem = SimpleNamespace(smooth=0.0, slopes=0.0)
+    search = SimpleNamespace(
+        problem=problem, has_stiction=True, cost=lambda z: float(z @ z), minimize=fail
+    )
+    assert model_selection._released_minimum(search, np.array([3.0])) == [3.0]
+    assert not problem.smooth
+
+
 def test_samples_of_starts():
     """A prior's quantiles; a factor of a positive value; the range between bounds."""
     known = Unknown("a", 2.0, 0.0, 9.0, 0.5, prior=1.0)

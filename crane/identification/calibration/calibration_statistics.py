@@ -123,12 +123,10 @@ def evaluate_profile_ends(
     Returns:
         Profile ends of each parameter, and a point with a lower cost than the minimum, or None.
     """
-    J = search.jacobian
-    H = J.T @ J + np.diag(search.prior**2)
-    C = scaled_inverse(H)
+    H = search.jacobian.T @ search.jacobian + np.diag(search.prior**2)
+    C, profile_ends = scaled_inverse(H), list[ProfileEnds]()
     minimum_cost, _ = _cost_and_gradient(search, z)
     lower_point, lowest_cost = None, minimum_cost * (1.0 - _LOWER_MINIMUM_SHARE)
-    profile_ends = []
     for i, width in enumerate(half_widths):
         if not np.isfinite(width):
             profile_ends.append(ProfileEnds())

@@ -383,8 +383,7 @@ class LevenbergMarquardt:
         sums = np.zeros((numbers.max() + 1, len(z)))
         np.add.at(sums, numbers, self.jacobian * self.residual[:, None])
         count = len(sums)
-        meat = sums.T @ sums * (count / max(count - 1, 1))
-        meat += np.diag(self.prior**2)
+        meat = sums.T @ sums * (count / max(count - 1, 1)) + np.diag(self.prior**2)
         robust = inverse @ meat @ inverse
         degrees_of_freedom = max(len(self.residual) - len(z), 1)
         white = inverse * float(self.residual @ self.residual) / degrees_of_freedom

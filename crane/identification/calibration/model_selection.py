@@ -23,10 +23,12 @@ it is searched once more with smoothed friction, from which the lower minimum is
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from crane.common.errors import SimulationError
 from crane.common.samples import Array
 from crane.identification.calibration.levenberg_marquardt import (
     COMPARED_COST_TOLERANCE,
@@ -177,8 +179,7 @@ class LinearizedSelection:
         """Parameters of a set that are known by their prior alone, or correlate with others."""
         unknowns = self.with_starts(parameters)
         hessian = (self._by_block.sum(axis=0)[:-1, :-1] + self._prior)[np.ix_(unknowns, unknowns)]
-        covariance = scaled_inverse(hessian)
-        covariance = covariance[: len(parameters), : len(parameters)]
+        covariance = scaled_inverse(hessian)[: len(parameters), : len(parameters)]
         deviations = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
         prior = np.sqrt(np.diag(self._prior))[list(parameters)]
         loose = deviations * prior > MAX_PRIOR_SHARE
@@ -310,9 +311,11 @@ def _released_minimum(search: LevenbergMarquardt, z: Array) -> Array:
     A search may end at a kink of its cost, where the simulation begins or ceases to stick.
     """
     problem, released = search.problem, z
-    for smoothing, tolerance in _RELEASE_SCHEDULE if search.has_stiction else ():
-        problem.smooth, problem.slopes = smoothing
-        released = search.minimize(released, tolerance).z
+    with suppress(SimulationError):  # with smoothed friction: the minimum remains
+        for smoothing, tolerance in _RELEASE_SCHEDULE if search.has_stiction else ():
+            problem.smooth, problem.slopes = smoothing
+            released = search.minimize(released, tolerance).z
+    problem.smooth, problem.slopes = FINAL_SMOOTHING
     return min((z, released), key=search.cost)
 
 
