@@ -1,16 +1,16 @@
 """Long computations go on after interruptions and deaths of processes, to the same result."""
 
 import hashlib
+import json
 import multiprocessing
 import os
 import random
 import signal
-import socket
 import subprocess
 import sys
 import time
 import warnings
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
 import numpy as np
@@ -376,15 +376,15 @@ def test_a_script_without_a_guard_is_told_so(tmp_path):
 @pytest.mark.slow
 def test_a_scheduler_that_ends_leaves_what_is_finished(tmp_path):
     pytest.importorskip("distributed")
-    address = f"tcp://127.0.0.1:{free_port()}"
+    contact = tmp_path / "scheduler.json"  # written by the scheduler once it answers
     command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--no-dashboard"]
-    command += ["--host", "127.0.0.1", "--port", address.rpartition(":")[2]]
+    command += ["--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(contact)]
     with subprocess.Popen(command, stderr=subprocess.DEVNULL, cwd=tmp_path) as scheduler:
+        address = scheduler_address(contact)
         worker = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1"]
         worker += ["--no-dashboard", "--no-nanny", "--death-timeout", "60"]
         with subprocess.Popen(worker, stderr=subprocess.DEVNULL, cwd=tmp_path) as process:
             file = tmp_path / "unfinished.csv"
-            wait_for(address)
 
             def end(share):
                 if share > 0.2 and scheduler.poll() is None:
@@ -424,19 +424,13 @@ def test_a_scheduler_that_ends_while_it_hands_over_a_result_is_told(monkeypatch)
             list(results)
 
 
-def wait_for(address):
-    host, port = address.removeprefix("tcp://").split(":")
+def scheduler_address(file):
+    """Address in the file of a scheduler, which chose a free port."""
     for _ in range(600):
-        with socket.socket() as one:
-            if one.connect_ex((host, int(port))) == 0:
-                return
+        with suppress(OSError, ValueError):  # no file yet, or half of one
+            return json.loads(file.read_text())["address"]
         time.sleep(0.1)
-
-
-def free_port():
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return one.getsockname()[1]
+    raise TimeoutError(f"no scheduler has written {file}")
 
 
 def cluster_workers():
