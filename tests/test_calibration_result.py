@@ -1,5 +1,6 @@
 """Results of a calibration: ends of intervals, correlated directions, remaining errors."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from hydraulic_rig import AREA_A, AREA_B, COMPENSATED, HOSE, STROKE, rig
 
 import crane
+from crane.common.errors import InputError
 from crane.description.parameter_changes import parameters
 from crane.formats.machine_loading import MachineVariants
 from crane.identification.calibration.calibration_result import (
@@ -95,6 +97,7 @@ class Fake:
         self.weighted_residuals, self._minima = left, minima
         self.low, self.high = (np.broadcast_to(x, 2).astype(float) for x in (low, high))
         self.prior, self.starts = np.array(prior), []
+        self.problem = SimpleNamespace(unknowns=["one", "two"])
 
     def run(self):
         return self.nearest_minimum(None)
@@ -164,11 +167,56 @@ def test_the_search_goes_on_where_the_cost_is_lower():
         return (0.0 if start is None else start[0], -4.0)
 
     search = Fake(left, minima)
-    found = estimate_with_profiles(search, 2, search.run())
+    found = estimate_with_profiles(search, search.run())
     assert isinstance(found, CalibrationEstimate) and len(search.starts) > 1
     cost = [0.5 * np.sum(left(z) ** 2) for z in (np.array([0.0, -4.0]), found.z)]
     assert cost[1] < 0.5 * cost[0]
     assert np.sum(left(np.array([search.starts[1][0], -4.0])) ** 2) < 2.0 * cost[0]
+
+
+class Linear(Fake):
+    """A search of some columns, with those of others at hand."""
+
+    def __init__(self, columns, names=("one", "two")):
+        super().__init__(lambda z: self.jacobian @ z, lambda _: np.zeros(2))
+        self.columns, self.prior = columns, np.ones(len(names))
+        self.problem = SimpleNamespace(unknowns=list(names), variant=tuple)
+        self.jacobian = np.column_stack([columns[x] for x in names])
+
+    def nearest_minimum(self, start):
+        return np.zeros(2)
+
+    def restricted_search(self, problem):
+        return Linear(self.columns, problem)
+
+    def linearize_for_covariance(self, z):
+        assert len(z) == self.jacobian.shape[1] and not z.any()
+        if "cracked" in self.columns and len(z) > 2:
+            raise InputError("its mass is negative")
+
+
+def test_intervals_with_what_was_left_out():
+    """A parameter beside one that acts alike is known by its prior alone, the other as before."""
+    one, two = 100.0 * np.eye(50)[:2]
+    columns = {"one": one, "two": two, "alike": one, "other": np.eye(50)[2]}
+    search = Linear(columns)
+    found = estimate_with_profiles(search, np.zeros(2), ["alike", "other"])
+    widths = found.interval_half_widths
+    np.testing.assert_allclose(widths, 1.9623 / np.sqrt(1e4 + 1), rtol=1e-4)
+    H = np.array([[1e4 + 1, 1e4], [1e4, 1e4 + 1]])
+    alike = 1.9623 * np.sqrt(np.linalg.inv(H)[0, 0])
+    assert found.candidate_half_widths == pytest.approx([alike, widths[1]], rel=1e-4)
+    assert estimate_with_profiles(search, np.zeros(2)).candidate_half_widths == pytest.approx(
+        widths
+    )
+    failing = Linear(columns | {"cracked": one})  # the simulation of a candidate
+    found = estimate_with_profiles(failing, np.zeros(2), ["alike"])
+    assert found.candidate_half_widths == pytest.approx(widths)
+    fitted = FittedParameter("a", 1.0, 1.5, 0.1, False, False, members=(("a", 1.0),))
+    assert replace(fitted, candidate_half_width=0.14).remark == ""
+    wider = replace(fitted, candidate_half_width=0.45)
+    assert wider.remark == "±0.45 with all candidates"
+    assert wider.notes == {"a": "fitted ±0.1, 95 %, ±0.45 with all candidates (was 1)"}
 
 
 def test_numbers_that_go_together():

@@ -15,7 +15,7 @@ from crane.description import bundled_machines
 from crane.description.key_types import SectionKey, SectionSchema
 from crane.description.machine_schema import MACHINE
 from crane.formats.machine_file.json_schema import SCHEMA_PATH, schema_text
-from crane.formats.machine_file.machine_reader import read_plain_data
+from crane.formats.machine_file.yaml_section import parse_with_base
 from crane.formats.machine_file.yaml_text import parse_yaml_file
 
 ROOT = Path(__file__).parents[1]
@@ -67,7 +67,7 @@ def test_the_tables_of_the_page_are_current():
 @pytest.mark.parametrize("file", [*bundled_machines().values(), *DATA.glob("*.yaml")], ids=str)
 def test_machine_files_validate(file):
     assert not errors(parse_yaml_file(file))
-    assert not errors(read_plain_data(file))
+    assert not errors(parse_with_base(file, MACHINE, ()))
 
 
 @pytest.mark.parametrize("text", examples())

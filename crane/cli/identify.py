@@ -240,7 +240,10 @@ def identify(
     min_speeds = parse_values("--min-speed", min_speed, joint_units(loaded, "/s"))
     if priors is None:
         loaded = loaded.replace(estimation=replace(loaded.estimation, prior={}))
-    inside, outside = _split(_read(recording, loaded, reading), window)
+    recordings = _read(recording, loaded, reading)
+    inside = [x.between(*window) for x in recordings]
+    parts = ((x, part) for x in recordings for part in (x.time < window[0], x.time > window[1]))
+    outside = [x.at(part) for x, part in parts if part.sum() >= _MIN_HELD_OUT_SAMPLES]
     judges: list[crane.Recording | Motion] = [*_usable_motions(loaded, outside, trust)]
     if train is not None and not outside:
         warnings.warn(
@@ -294,18 +297,6 @@ def _read(
         with status(f"reading {path.name}"):
             recordings.append(reading.read(path, machine, needs))
     return recordings
-
-
-def _split(
-    recordings: "list[crane.Recording]", window: tuple[float, float]
-) -> "tuple[list[crane.Recording], list[crane.Recording]]":
-    """The parts of recordings inside a window [s], and those outside with enough samples."""
-    return [recording.between(*window) for recording in recordings], [
-        recording.at(part)
-        for recording in recordings
-        for part in (recording.time < window[0], recording.time > window[1])
-        if part.sum() >= _MIN_HELD_OUT_SAMPLES
-    ]
 
 
 def _usable_motions(

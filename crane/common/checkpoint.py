@@ -58,7 +58,10 @@ class Checkpoint:
         self._path, self._key_size, self._has_rows = Path(path), key_size, False
         self.rows: dict[tuple[str, ...], list[str]] = {}
         self._missing_folders = [x for x in self._path.absolute().parents if not x.exists()]
-        notes = {name: _digest(value) for name, value in dependencies.items()}
+        notes = {
+            name: hashlib.sha256(json.dumps(_plain(value)).encode()).hexdigest()
+            for name, value in dependencies.items()
+        }
         notes["version of crane"] = crane.__version__
         lines = [f"# {name}: {text}\n" for name, text in notes.items()]
         try:
@@ -154,10 +157,6 @@ def _csv_line(cells: Iterable[object]) -> str:
     line = io.StringIO()
     csv.writer(line, lineterminator="\n").writerow(cells)
     return line.getvalue()
-
-
-def _digest(value: Any) -> str:
-    return hashlib.sha256(json.dumps(_plain(value)).encode()).hexdigest()
 
 
 def _plain(value: Any) -> Any:

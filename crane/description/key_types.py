@@ -219,7 +219,7 @@ def section_schema(
     """
     fields = {} if content is None else {x.name: x for x in dataclasses.fields(content)}
     if content is not None and content.__module__.startswith("crane.hydraulics"):
-        component = component or component_name(content)
+        component = component or content.__name__.removeprefix("Circuit").lower()
     return SectionSchema(
         title,
         {
@@ -230,11 +230,6 @@ def section_schema(
         component,
         **more,
     )
-
-
-def component_name(content: type) -> str:
-    """The name by which `plausible_range` knows a class of components."""
-    return content.__name__.removeprefix("Circuit").lower()
 
 
 def _completed(key: Key, name: str, entry: Any, component: str) -> Key:

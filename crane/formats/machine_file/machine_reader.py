@@ -67,7 +67,7 @@ from crane.formats.machine_file.structure_sections import (
     warn_about_open_loops,
 )
 from crane.formats.machine_file.task_section import read_tasks
-from crane.formats.machine_file.yaml_section import YamlSection, parse_with_base
+from crane.formats.machine_file.yaml_section import YamlSection
 from crane.formats.machine_file.yaml_values import as_boolean, as_float
 from crane.formats.parallel_robots import is_parallel_robot, read_parallel_robot
 from crane.formats.robot_files import is_robot_file
@@ -109,15 +109,6 @@ def _read_robot(path: Path) -> MachineSpec:
         locations = {**spec.source_locations, "active": spec.loops[0].source_location}
         spec = dataclasses.replace(spec, active=(), source_locations=locations)
     return dataclasses.replace(spec, tip=tree.single_leaf_link()) if spec.tip is None else spec
-
-
-def read_plain_data(path: Path) -> dict[str, Any]:
-    """What a machine file says, with what it extends.
-
-    Raises:
-        DescriptionError: As `read_machine_spec`.
-    """
-    return parse_with_base(path, MACHINE, ())
 
 
 def _read_machine(path: Path) -> MachineSpec:

@@ -171,9 +171,9 @@ def calibrate(
         "recordings": [x.contents for x in cases],
         "settings": (unknowns, extras, automatic),
     }
-    problem = CalibrationProblem(machine, [*unknowns, *(extras if automatic else [])], cases)
-    kept = [x.name for x in unknowns]
-    kept += [x.name for x in extras if x.name == PAYLOAD_MASS and x.start != known_mass]
+    problem = problem.variant([*unknowns, *(extras if automatic else [])])
+    unknown_payload = [x for x in extras if x.name == PAYLOAD_MASS and x.start != known_mass]
+    kept = [x.name for x in (*unknowns, *unknown_payload)]
     with open_checkpoint(checkpoint, dependencies, LOG_COLUMNS, 1) as table:
         search = LevenbergMarquardt(problem, progress, SearchLog(table))
         if automatic:
@@ -181,7 +181,7 @@ def calibrate(
         else:
             selected = SelectedModel(search, search, minimize_from_starts(search))
         first, search, problem = selected.first, selected.search, selected.search.problem
-        estimate = estimate_with_profiles(search, len(problem.unknowns), selected.minimum)
+        estimate = estimate_with_profiles(search, selected.minimum, selected.left_out)
         errors = block_errors(search, estimate.z) if automatic else {}
     applicable = [x for x in extras if dict(x.members).get(x.name, x.start) == x.start]
     with warnings.catch_warnings(action="ignore"):
@@ -193,7 +193,7 @@ def calibrate(
         machine=_machine_with_sensors(fitted, known, columns, found.changes),
         score_tests=() if automatic else tuple(score_tests(search, applicable, estimate.z)),
         selection=selected.steps,
-        unselected_parameters=selected.left_out,
+        unselected_parameters=tuple(x.name for x in selected.left_out),
         block_errors=errors,
         minima=tuple(x.cost / first.minima[0].cost for x in first.minima),
         findings=(
@@ -216,8 +216,10 @@ def _reserve(machine: Machine, known: Collection[str]) -> dict[str, Collection[s
     circuit, found = machine.hydraulics, dict[str, Collection[str]]()
     for joint in circuit.joints if circuit else ():
         channels = {joint, *(f"{PRESSURE_PREFIX}{joint}_{side}" for side in "ab")}
-        spools = (f"valve.{joint}.damping", f"valve.{joint}.spool_b.damping")
-        found |= dict.fromkeys((*cylinder_pins(machine, joint), *spools), channels)
+        found |= dict.fromkeys((
+            *cylinder_pins(machine, joint),
+            f"valve.{joint}.damping", f"valve.{joint}.spool_b.damping",
+        ), channels)  # fmt: skip
     return {name: channels for name, channels in found.items() if name not in known}
 
 
@@ -301,10 +303,11 @@ def _machine_with_sensors(
         name, unit = parse_heading(line.heading)
         if quantity_unit(machine.tree, name) is not None:
             sensors[name] = replace(sensors.get(name, Sensor()), column=line.expression, unit=unit)
-    sensor_changes = {
-        name: value for name, value in changes.items() if name.startswith(SENSOR_PREFIX)
-    }
-    return machine.replace(sensors=with_sensor_parameters(sensors, sensor_changes))
+    return machine.replace(
+        sensors=with_sensor_parameters(
+            sensors, {name: x for name, x in changes.items() if name.startswith(SENSOR_PREFIX)}
+        )
+    )
 
 
 def _read_case(
@@ -340,8 +343,10 @@ def _calibration_result(
     divisors = np.where(deviations > 0, deviations, np.inf)[: len(unknowns)]
     finite = np.nan_to_num(covariance[: len(unknowns), : len(unknowns)], posinf=0.0)
     correlation = finite / np.outer(divisors, divisors)
-    pairs = np.argwhere(np.abs(np.tril(correlation, -1)) > _MAX_CORRELATION).tolist()
-    correlated = [(unknowns[j].name, unknowns[i].name, float(correlation[i, j])) for i, j in pairs]
+    correlated = [
+        (unknowns[j].name, unknowns[i].name, float(correlation[i, j]))
+        for i, j in np.argwhere(np.abs(np.tril(correlation, -1)) > _MAX_CORRELATION).tolist()
+    ]
     final_residuals = [problem.residuals(case, z) for case in problem.cases]
     channels = [
         CalibrationChannel(
@@ -374,6 +379,7 @@ def _calibration_result(
                 unknown.members,
                 estimate.profile_ends[i],
                 any(x.exceeds_noise for x in channels),
+                float(estimate.candidate_half_widths[i]) * scale,
             )
         )
     return Calibration(

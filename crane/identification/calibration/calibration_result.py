@@ -27,6 +27,7 @@ LOWER_MINIMUM_WARNING = (
     "parameters."
 )
 _MAX_GROUPS = 8  # groups of about equal size
+_WIDER_FACTOR = 1.5  # of half widths that are told apart
 _REST_SPEED_SHARE = 0.02  # of the largest speed, below which a drive is at rest
 
 
@@ -46,6 +47,8 @@ class FittedParameter:
         profile_ends: Profile likelihood at the ends of the interval.
         has_model_error: Whether residuals are more than noise: its interval is that of noise, and
             excludes the error of the model.
+        candidate_half_width: Half width with the candidates that a selection left out free within
+            their priors.
     """
 
     name: str
@@ -58,6 +61,7 @@ class FittedParameter:
     members: tuple[tuple[str, float], ...] = ()
     profile_ends: ProfileEnds = ProfileEnds()
     has_model_error: bool = False
+    candidate_half_width: float = 0.0
 
     @property
     def is_common_factor(self) -> bool:
@@ -85,8 +89,10 @@ class FittedParameter:
             if self.at_bound
             else "not determined by the recordings" * self.is_unidentifiable
         )
+        is_wider = self.candidate_half_width > _WIDER_FACTOR * self.interval_half_width
+        wider = f"±{self.candidate_half_width:.2g} with all candidates" * is_wider
         excluded = "excludes model error" * self.has_model_error
-        return ", ".join(filter(None, (status, self.profile_ends.remark, excluded)))
+        return ", ".join(filter(None, (status, wider, self.profile_ends.remark, excluded)))
 
     @property
     def notes(self) -> dict[str, str]:
@@ -195,10 +201,10 @@ class Calibration(Result):
         """Machine, channels, and identifiable parameters."""
         identifiable = [x for x in self.parameters if not (x.at_bound or x.is_unidentifiable)]
         values = ", ".join(f"{x.name} = {x.value:.5g}" for x in identifiable)
-        parameters, channels = format_count(len(self.parameters), "parameter"), len(self.channels)
         return (
-            f"Calibration of '{self.machine.name}': {len(identifiable)} of {parameters} "
-            f"determined by {format_count(channels, 'channel')}{': ' * bool(identifiable)}{values}"
+            f"Calibration of '{self.machine.name}': {len(identifiable)} of "
+            f"{format_count(len(self.parameters), 'parameter')} determined by "
+            f"{format_count(len(self.channels), 'channel')}{': ' * bool(identifiable)}{values}"
         )
 
     @property
@@ -209,9 +215,10 @@ class Calibration(Result):
     @property
     def correlated_directions(self) -> list[dict[str, float]]:
         """Directions that the recordings do not determine, see `correlated_directions`."""
-        half_widths = [one.interval_half_width for one in self.parameters]
         return correlated_directions(
-            [one.name for one in self.parameters], self.correlation, np.array(half_widths)
+            [one.name for one in self.parameters],
+            self.correlation,
+            np.array([one.interval_half_width for one in self.parameters]),
         )
 
     @property
@@ -345,7 +352,8 @@ class Calibration(Result):
         for k, word in enumerate(("blocks left out", "the worst block")):
             errors = {name: self.block_errors[name][k] for name in names}
             lines.append(f"| simulated, {word} | | | {cells(errors)} |")
-        lines += ["", "Left out, exact to the intervals: " + ", ".join(self.unselected_parameters)]
+        lines += ["", "Left out, exact to the intervals but for those with all candidates: "
+                  + ", ".join(self.unselected_parameters)]  # fmt: skip
         return lines
 
 
@@ -431,20 +439,12 @@ def _residual_dependence(
         )
 
     residual = np.concatenate([(x.simulated_after - x.measured)[x.train_mask] for x in channels])
-    speed, pressure = (
-        joined(drive + VELOCITY_SUFFIX),
-        joined(f"{PRESSURE_PREFIX}{drive}_{chamber}"),
-    )
+    speed = joined(drive + VELOCITY_SUFFIX)
+    pressure = joined(f"{PRESSURE_PREFIX}{drive}_{chamber}")
     is_moving = np.abs(speed) > _REST_SPEED_SHARE * np.abs(speed).max()
     motion = {"speed": speed, "pressure": pressure, "direction": np.sign(speed) * is_moving}
     correlation_ratios = {what: correlation_ratio(residual, x) for what, x in motion.items()}
+    speed_unit = VELOCITY_UNITS[calibration.machine.unit(drive)]
     return ResidualDependence(
-        name,
-        unit,
-        residual,
-        drive,
-        VELOCITY_UNITS[calibration.machine.unit(drive)],
-        chamber,
-        motion,
-        correlation_ratios,
+        name, unit, residual, drive, speed_unit, chamber, motion, correlation_ratios
     )

@@ -12,6 +12,7 @@ simulated, too: if F decreases there, the minimum was a local one.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -75,6 +76,8 @@ class CalibrationEstimate:
         covariance: (p, p) covariance of the unknowns.
         interval_half_widths: (n,) half widths of the 95 % intervals of the parameters, in their
             scales.
+        candidate_half_widths: (n,) the same with the candidates that a selection left out free
+            within their priors.
         profile_ends: Profile likelihood at the ends of these intervals.
         is_lowest_minimum: Whether no lower minimum was found.
     """
@@ -82,32 +85,64 @@ class CalibrationEstimate:
     z: Array
     covariance: Array
     interval_half_widths: Array
+    candidate_half_widths: Array
     profile_ends: list[ProfileEnds]
     is_lowest_minimum: bool
 
 
 def estimate_with_profiles(
-    search: LevenbergMarquardt, parameter_count: int, minimum: Array
+    search: LevenbergMarquardt, minimum: Array, left_out: Sequence[Unknown] = ()
 ) -> CalibrationEstimate:
     """Evaluate the ends of the intervals at a minimum, and continue from lower minima.
 
     Args:
         search: The minimization.
-        parameter_count: Number of parameters, which are the first unknowns.
         minimum: (p,) minimum at which the search is linearized.
+        left_out: Candidates that a selection left out.
     """
-    from scipy.stats import t as student
-
     z = minimum
     for last in [False] * _MAX_RESTARTS + [True]:
-        covariance, blocks = search.covariance(z)
-        factor = float(student.ppf(0.975, max(blocks - 1, 1)))
-        half_widths = factor * np.sqrt(np.maximum(np.diag(covariance)[:parameter_count], 0.0))
+        covariance, half_widths = _covariance_and_half_widths(search, z)
         ends, lower_point = evaluate_profile_ends(search, z, half_widths)
         if lower_point is None or last:
             break
         z = search.nearest_minimum(lower_point)
-    return CalibrationEstimate(z, covariance, half_widths, ends, lower_point is None)
+    wider = half_widths
+    if left_out:
+        with suppress(CraneError):  # they are not known then
+            wider = _covariance_and_half_widths(*extended_search(search, left_out, z))[1]
+    return CalibrationEstimate(
+        z, covariance, half_widths, wider[: len(half_widths)], ends, lower_point is None
+    )
+
+
+def _covariance_and_half_widths(search: LevenbergMarquardt, z: Array) -> tuple[Array, Array]:
+    """Covariance (p, p) of the unknowns, and half widths (n,) of the intervals of parameters."""
+    from scipy.stats import t as student
+
+    covariance, blocks = search.covariance(z)
+    variances = np.maximum(np.diag(covariance)[: len(search.problem.unknowns)], 0.0)
+    return covariance, float(student.ppf(0.975, max(blocks - 1, 1))) * np.sqrt(variances)
+
+
+def extended_search(
+    search: LevenbergMarquardt, others: Sequence[Unknown], z: Array
+) -> tuple[LevenbergMarquardt, Array]:
+    """Search of further parameters, linearized at their values before, and its unknowns.
+
+    Args:
+        search: A search at its minimum.
+        others: The parameters.
+        z: (p,) the minimum.
+
+    Raises:
+        CraneError: The simulation fails.
+    """
+    unknowns = search.problem.unknowns
+    extended = search.restricted_search(search.problem.variant([*unknowns, *others]))
+    z = np.insert(z, [len(unknowns)] * len(others), 0.0)
+    extended.linearize_for_covariance(z)
+    return extended, z
 
 
 def evaluate_profile_ends(
@@ -238,15 +273,9 @@ def score_tests(
         candidates: The parameters, with their standard deviations as scales.
         z: (p,) the minimum.
     """
-    problem = search.problem
-    if not candidates:
-        return []
-    count, candidate_count = len(problem.unknowns), len(candidates)
-    extended = search.restricted_search(problem.variant([*problem.unknowns, *candidates]))
+    count, candidate_count = len(search.problem.unknowns), len(candidates)
     try:
-        extended.linearize_for_covariance(
-            np.concatenate([z[:count], np.zeros(candidate_count), z[count:]])
-        )
+        extended, _ = extended_search(search, candidates, z)
     except CraneError:  # the tests are optional
         return []
     jacobian, residual = search.jacobian, search.residual
@@ -262,10 +291,10 @@ def score_tests(
     ):
         if not size > _MIN_INDEPENDENT_SHARE * squared_norm:
             continue
-        # within the bounds, and within some standard deviations
-        step = np.clip(-gradient / size, (candidate.low - candidate.start) / candidate.scale,
+        # within some standard deviations, and within the bounds
+        step = np.clip(np.clip(-gradient / size, -_MAX_STEP, _MAX_STEP),
+                       (candidate.low - candidate.start) / candidate.scale,
                        (candidate.high - candidate.start) / candidate.scale)  # fmt: skip
-        step = np.clip(step, -_MAX_STEP, _MAX_STEP)
         gain = -(2.0 * step * gradient + step**2 * size) / max(float(residual @ residual), 1e-300)
         value = candidate.start + candidate.scale * float(step)
         found.append(ScoreTestResult(candidate.name, value, float(gain)))

@@ -220,8 +220,10 @@ class LevenbergMarquardt:
 
     def training_errors(self, z: Array) -> dict[str, float]:
         """RMS residual of each channel over the training data."""
-        residuals = self._training_residuals(z).items()
-        return {name: max(root_mean_square(x), _MIN_SCALE) for name, x in residuals}
+        return {
+            name: max(root_mean_square(x), _MIN_SCALE)
+            for name, x in self._training_residuals(z).items()
+        }
 
     def update_scales(self, z: Array) -> None:
         """Set scale and redundancy of each channel by the residuals of the training data."""
@@ -385,8 +387,9 @@ class LevenbergMarquardt:
         count = len(sums)
         meat = sums.T @ sums * (count / max(count - 1, 1)) + np.diag(self.prior**2)
         robust = inverse @ meat @ inverse
-        degrees_of_freedom = max(len(self.residual) - len(z), 1)
-        white = inverse * float(self.residual @ self.residual) / degrees_of_freedom
+        white = inverse * (
+            float(self.residual @ self.residual) / max(len(self.residual) - len(z), 1)
+        )
         inflation = np.sqrt(np.maximum(np.diag(white) / np.maximum(np.diag(robust), 1e-300), 1.0))
         without_effect = np.diag(np.where(np.diag(hessian) == 0.0, np.inf, 0.0))
         return robust * np.outer(inflation, inflation) + without_effect, count

@@ -42,6 +42,7 @@ from crane.identification.calibration.multi_start import (
     smoothed_minimum,
 )
 from crane.identification.calibration.normal_equations import bounded_step, scaled_inverse
+from crane.identification.calibration.unknowns import Unknown
 
 MAX_CORRELATION = 0.98  # of parameters that are both kept
 MAX_PRIOR_SHARE = 0.7  # of the deviation of a prior, up to which recordings determine a parameter
@@ -90,14 +91,14 @@ class SelectedModel:
         search: Search of the selected parameters.
         minimum: (p,) its minimum, where it is linearized.
         steps: Steps of the selection.
-        left_out: Names of the parameters that were left out.
+        left_out: Parameters that were left out.
     """
 
     first: LevenbergMarquardt
     search: LevenbergMarquardt
     minimum: Array
     steps: tuple[SelectionStep, ...] = ()
-    left_out: tuple[str, ...] = ()
+    left_out: tuple[Unknown, ...] = ()
 
 
 class LinearizedSelection:
@@ -265,7 +266,7 @@ def select_parameters(
     z = search.nearest_minimum(_released_minimum(search, z))
     return SelectedModel(
         first, search, z, tuple(steps),
-        tuple(x.name for x in candidates if x not in search.problem.unknowns),
+        tuple(x for x in candidates if x not in search.problem.unknowns),
     )  # fmt: skip
 
 

@@ -11,26 +11,27 @@ def bounded_step(
     """Damped Gauss-Newton step (p,) between bounds, by an active set.
 
     Args:
-        hessian: (p, p).
+        hessian: (p, p), of unknowns of any units.
         gradient: (p,).
         low: (p,) least step.
         high: (p,) largest step.
         damping: Marquardt's, relative to the diagonal.
     """
-    size = np.diag(hessian)
-    scaled = hessian + damping * np.diag(np.maximum(size, 1e-12 * size.max(initial=0.0)))
+    scaled, size = _unit_diagonal(hessian)
+    scaled += damping * np.diag(np.diag(scaled))
+    gradient, lowest, highest = gradient / size, low * size, high * size
     free = np.ones(len(gradient), dtype=bool)
     step = np.zeros(len(gradient))
     for _ in range(len(gradient)):
         i = np.flatnonzero(free)
         right_side = -gradient[i] - scaled[np.ix_(i, ~free)] @ step[~free]
         step[i] = np.linalg.lstsq(scaled[np.ix_(i, i)], right_side, rcond=1e-12)[0]
-        outside = free & ((step < low) | (step > high))
+        outside = free & ((step < lowest) | (step > highest))
         if not outside.any():
             break
-        step[outside] = np.clip(step, low, high)[outside]
+        step[outside] = np.clip(step, lowest, highest)[outside]
         free &= ~outside
-    return step
+    return np.clip(step / size, low, high)
 
 
 def scaled_inverse(hessian: Array) -> Array:
@@ -42,7 +43,12 @@ def scaled_inverse(hessian: Array) -> Array:
     Args:
         hessian: (p, p), symmetric and positive semidefinite.
     """
+    scaled, size = _unit_diagonal(hessian)
+    return np.linalg.pinv(scaled, rcond=1e-13, hermitian=True) / np.outer(size, size)
+
+
+def _unit_diagonal(hessian: Array) -> tuple[Array, Array]:
+    """Hessian (p, p) of unknowns times their sizes, whose diagonal is 1 or 0, and these (p,)."""
     size = np.sqrt(np.diag(hessian))
     size[size == 0.0] = 1.0
-    sizes = np.outer(size, size)
-    return np.asarray(np.linalg.pinv(hessian / sizes, rcond=1e-13, hermitian=True) / sizes)
+    return hessian / np.outer(size, size), size

@@ -19,7 +19,7 @@ from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.force_comparison import ForceComparison, check_forces
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.identify import METHODS, build_equations, multi_pass_progress
-from crane.identification.mechanics.model_terms import ModelTerm, MotionSamples, friction_term
+from crane.identification.mechanics.model_terms import ModelTerm, friction_term
 from crane.identification.mechanics.payload_estimate import (
     MIN_FRICTION_SHARE,
     PayloadEstimate,
@@ -153,9 +153,6 @@ class _PayloadCase:
         """Model of a load, see `PayloadTerm`, and of corrections of Coulomb friction."""
         dynamics = Dynamics(self.machine)
 
-        def machine_forces(at: MotionSamples) -> Array:
-            return dynamics.evaluate_closed("inverse with friction", at.q, at.v_a, at.a_a)
-
         bare_machine = self.machine.replace(
             friction={}, forces=(), gas_springs=(), ropes=(), end_stops=()
         )
@@ -163,7 +160,10 @@ class _PayloadCase:
             PayloadTerm(self.machine, self.frame, has_inertia, com),
             *(friction_term(bare_machine, x, ("coulomb",), 0.0) for x in self.moving_drives),
         ]
-        return IdentificationModel(bare_machine, terms, machine_forces)
+        return IdentificationModel(
+            bare_machine, terms,
+            lambda at: dynamics.evaluate_closed("inverse with friction", at.q, at.v_a, at.a_a),
+        )  # fmt: skip
 
     def estimate_body(
         self, has_inertia: bool, trust: bool, progress: Progress

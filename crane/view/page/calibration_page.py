@@ -225,9 +225,8 @@ def _correlation_section(calibration: Calibration) -> str:
 
 
 def _option_text(calibration: Calibration) -> str:
-    options = " ".join(f"--set {name}={value:.8g}" for name, value in calibration.changes.items())
     return (
         "<p>For every command that takes a machine. The machine file has all digits.</p><pre>"
-        + escape(options).replace(" --", " \\\n--")
+        + escape(calibration.command_line_options).replace(" --", " \\\n--")
         + "</pre>"
     )

@@ -326,21 +326,17 @@ def reached_limit_sentences(machine: Machine, recording: Recording) -> list[str]
             (q >= upper - tolerance, "upper", upper),
         )
         for is_reached, limit_name, limit in [x for x in limit_checks if x[0].any()]:
-            first_time = recording.time[int(np.argmax(is_reached))]
+            first_time, share = recording.time[int(np.argmax(is_reached))], is_reached.mean()
             sentences.append(
                 f"{joint} reaches its {limit_name} limit of {_format_number(scale * limit)} "
-                f"{unit} at {first_time:.4g} s ({_format_percent(is_reached.mean())} of the "
-                "samples)"
+                f"{unit} at {first_time:.4g} s "
+                f"({100 * share:{'.0f' if share >= 0.1 else '.2g'}}\u00a0% of the samples)"
             )
     if len(sentences) > _MAX_LIMIT_SENTENCES:
         sentences[_MAX_LIMIT_SENTENCES:] = [
             f"and {len(sentences) - _MAX_LIMIT_SENTENCES} more limits are reached"
         ]
     return sentences
-
-
-def _format_percent(share: float) -> str:
-    return f"{100 * share:{'.0f' if share >= 0.1 else '.2g'}}\u00a0%"
 
 
 def _format_quantity(value: float, unit: str) -> str:

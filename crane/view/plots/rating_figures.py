@@ -228,11 +228,8 @@ def _draw_contours(axes: Axes, chart: Capacity, k: int) -> None:
     )
     unit, scale = display_unit("kg", max(level for level, _ in contour_lines))
 
-    def format_level(level: float) -> str:
-        return f"{scale * level:g} {unit}"
-
     axes.apply_aspect()
-    style: Any = {"fmt": format_level, "fontsize": _LABEL_SIZE}
+    style: Any = {"fmt": lambda level: f"{scale * level:g} {unit}", "fontsize": _LABEL_SIZE}
     positions: list[tuple[float, float]] = []
     boxes: list[Any] = []
     for draft in axes.clabel(lines, inline=False, **style):
