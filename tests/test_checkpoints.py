@@ -111,8 +111,8 @@ def test_functions_count_by_what_they_do():
     first, second, third = (
         eval(text) for text in ("lambda x: x + 1", "lambda y: y + 1", "lambda x: x + 2")
     )  # noqa: S307
-    digests = [checkpoint._digest({"f": f}) for f in (first, second, third)]
-    assert digests[0] == digests[1] != digests[2]
+    contents = [checkpoint._plain({"f": f}) for f in (first, second, third)]
+    assert contents[0] == contents[1] != contents[2]
 
 
 def as_text(study, folder):
