@@ -158,6 +158,9 @@ def test_what_is_wrong_is_found_without_being_named(fitted, tmp_path):
         set(found.unselected_parameters) - {viscous.name} & {*told, *truth}
     )
     assert found.unselected_parameters[0] in found.to_text() and not found.degraded_channels
+    mass = told["load_x.mass"]  # a zero of the pressure, left out, would act like it
+    assert mass.candidate_half_width > 10.0 * mass.interval_half_width
+    assert f"±{mass.candidate_half_width:.2g} with all candidates" in found.to_text()
     for sensor, noise in zip(found.channels, (2e-4, 2e4, 2e4), strict=True):
         assert sensor.rms(sensor.simulated_after, False) < 1.2 * noise, sensor.name
 

@@ -188,7 +188,7 @@ class SimulatedSearch:
         self.__dict__ |= vars(linear)
         unknowns = [x for x in linear.problem.unknowns if x.name in names]
         self.problem = Problem(unknowns)
-        self.prior = np.ones(len(unknowns))
+        self.prior, self.scale_bounds = np.ones(len(unknowns)), dict.fromkeys("xy", (1e-9, 1.0))
         self.training_cases = [
             SimpleNamespace(train_mask=np.ones(1200, dtype=bool), sensors=["x", "y"])
         ]
@@ -225,7 +225,7 @@ def test_what_a_simulation_needs_stays(monkeypatch, is_simulated):
 class RaceSearch:
     """A search of one unknown that found minima with smoothed friction; sharp ones lie at z^2."""
 
-    prior, start = np.array([0.5]), np.zeros(1)
+    prior, start, scale_bounds = np.array([0.5]), np.zeros(1), {"x": (1e-9, 5.0)}
     training_cases = (SimpleNamespace(train_mask=np.arange(5) > 0, sensors=["x"]),)
 
     def __init__(self, minima, errors):
@@ -252,6 +252,7 @@ class RaceSearch:
         ([1.0, 2.0], {1.0: 1.0, 2.0: 0.01}, 2.0, [1.0, 2.0]),  # 0.25 against 4 - 18.4
         ([1.0, 1.01, 2.0], {1.0: 1.0, 2.0: 0.01}, 1.0, [1.0]),  # the same one twice
         ([1.0, 2.0], {1.0: 1.0, 2.0: None}, 1.0, [1.0, 2.0]),
+        ([1.0, 2.0], {1.0: 50.0, 2.0: 5.0}, 2.0, [1.0, 2.0]),  # beyond the bound of the scale
     ],
 )
 def test_the_friction_model_decides_between_two_minima(minima, errors, best, tried):
@@ -261,7 +262,7 @@ def test_the_friction_model_decides_between_two_minima(minima, errors, best, tri
     assert search.sharpened == tried and search.channel_scales == {"x": 2.0 + best}
     assert search.minima[0].z == best and len(search.minima) == len(minima)
     search.redundancies = {"x": 2.0}
-    expected = 4 / 2.0 * np.log(errors[best] ** 2) + (0.5 * best**2) ** 2
+    expected = 4 / 2.0 * (np.log(errors[best] ** 2) + 1.0) + (0.5 * best**2) ** 2
     assert multi_start.simulated_score(search, np.array([best**2])) == pytest.approx(expected)
 
 

@@ -372,14 +372,14 @@ def _calibration_result(
                 unknown.name,
                 unknown.start,
                 value,
-                float(estimate.interval_half_widths[i]) * scale,
+                float(estimate.interval_half_widths[i] * scale),
                 bool(bound),
                 bool(not bound and deviations[i] * scale > _MAX_STD_SHARE * size),
                 parameter_unit(problem.machine.tree, unknown.name),
                 unknown.members,
                 estimate.profile_ends[i],
                 any(x.exceeds_noise for x in channels),
-                float(estimate.candidate_half_widths[i]) * scale,
+                float(estimate.candidate_half_widths[i] * scale),
             )
         )
     return Calibration(

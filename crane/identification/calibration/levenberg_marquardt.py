@@ -119,6 +119,7 @@ class LevenbergMarquardt:
         problem: The calibration problem.
         training_cases: Recordings with training data.
         channel_scales: Channel scales by sensor.
+        scale_bounds: Least and largest scale of each channel.
         jacobian: (M, p) weighted derivatives of the training data at the minimum.
         residual: (M,) weighted residuals, likewise.
         blocks: (M,) time of each row, unique over recordings.
@@ -150,8 +151,8 @@ class LevenbergMarquardt:
         self.prior = np.array([x.prior for x in unknowns] + [1.0] * start_count)
         count = sum(int(case.train_mask.sum()) for case in self.training_cases)
         self._max_redundancy = max(count / _BLOCK_COUNT_RANGE[1], 1.0)
-        self._scale_bounds = self._channel_scale_bounds()
-        self.redundancies = dict.fromkeys(self._scale_bounds, self._max_redundancy)
+        self.scale_bounds = self._channel_scale_bounds()
+        self.redundancies = dict.fromkeys(self.scale_bounds, self._max_redundancy)
         self.channel_scales: dict[str, float] = {}
         self.jacobian = self.residual = self.blocks = self.channels = np.zeros(0)
         self.minima: list[SearchState] = []
@@ -168,7 +169,7 @@ class LevenbergMarquardt:
     def start_with_smoothed_friction(self) -> None:
         """Prepare a search far from the minimum: largest channel scales, smoothed friction."""
         problem = self.problem
-        self.channel_scales = {name: most for name, (_, most) in self._scale_bounds.items()}
+        self.channel_scales = {name: most for name, (_, most) in self.scale_bounds.items()}
         problem.smooth = float(self.has_stiction)
         problem.derivative_tolerance = _COARSE_DERIVATIVE_TOLERANCE
 
@@ -228,7 +229,7 @@ class LevenbergMarquardt:
     def update_scales(self, z: Array) -> None:
         """Set scale and redundancy of each channel by the residuals of the training data."""
         for name, x in self._training_residuals(z).items():
-            scale = np.clip(root_mean_square(x), *self._scale_bounds[name])
+            scale = np.clip(root_mean_square(x), *self.scale_bounds[name])
             redundancy = np.clip(2.0 * _correlation_time(x) - 1.0, 1.0, self._max_redundancy)
             self.channel_scales = self.channel_scales | {name: float(scale)}
             self.redundancies = self.redundancies | {name: float(redundancy)}
@@ -270,7 +271,7 @@ class LevenbergMarquardt:
     ) -> bool:
         """Whether the residuals of channels, all by default, are about their noise."""
         return all(
-            rms < level * self._scale_bounds[name][0]
+            rms < level * self.scale_bounds[name][0]
             for name, rms in self.training_errors(z).items()
             if not names or name in names
         )
@@ -304,7 +305,7 @@ class LevenbergMarquardt:
     def linearize(self, z: Array) -> None:
         """Set jacobian, residual, blocks and channels at z."""
         rows, weighted, blocks, channels = [], [], [], []
-        order = {name: k for k, name in enumerate(self._scale_bounds)}
+        order = {name: k for k, name in enumerate(self.scale_bounds)}
         for number, case in enumerate(self.training_cases):
             self.log.simulations += 1
             try:

@@ -15,7 +15,7 @@ all candidates. The set of the lowest score is kept, without parameters whose de
 their prior, or that correlate with another one, if they cost nothing.
 
 A linearization does not hold as far as the values of the machine. Therefore the set is fitted by
-simulation, and replaces the larger one only if its score, sum_c n_c ln(mean square) over the
+simulation, and replaces the larger one only if its score (see `multi_start`) over the
 training data with the same penalties, is not higher; else the half of what it lacks joins that
 was moved farthest. If it is higher by little, simulated fits without each block decide. The set is
 selected again by the linearization at its minimum, until nothing is left out any more. At the end

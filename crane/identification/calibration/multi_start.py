@@ -7,9 +7,10 @@ better half of the searches goes on. A search from the given values that leaves 
 needs no others. Two of the minima with smoothed friction are followed to the friction model, where
 the lower score,
 
-    sum_c n_c ln(mean square of channel c) + sum (z / prior)^2,
+    sum_c n_c (ln s_c^2 + mean square of channel c / s_c^2) + sum (z / prior)^2,
 
-with the number n_c of independent samples decides: smoothed friction hides what rings.
+with the number n_c of independent samples and the scale s_c of a channel, its RMS residual within
+bounds, decides: smoothed friction hides what rings.
 """
 
 from collections.abc import Mapping
@@ -81,8 +82,12 @@ def simulated_score(
         for name in case.sensors:
             counts[name] += float(case.train_mask.sum()) / search.redundancies[name]
     errors = search.training_errors(z) if errors is None else errors
-    likelihood = sum(2.0 * counts[name] * float(np.log(x)) for name, x in errors.items())
-    return likelihood + float(np.sum((search.prior * z) ** 2))
+    scales = {name: np.clip(x, *search.scale_bounds[name]) for name, x in errors.items()}
+    likelihood = sum(
+        counts[name] * (2.0 * np.log(scale) + (errors[name] / scale) ** 2)
+        for name, scale in scales.items()
+    )
+    return float(likelihood + np.sum((search.prior * z) ** 2))
 
 
 def smoothed_minimum(search: LevenbergMarquardt) -> Array:
