@@ -313,11 +313,14 @@ def test_pins_of_a_cylinder():
 
 
 def test_a_payload_that_the_file_lacks_is_a_candidate():
-    weighed = StaticPayload(210.0, 6.0)
+    weighed = StaticPayload(210.0, 6.0, 190.0)
     (found,) = weighed.candidates(0.0)
     assert (found.start, found.scale, found.prior) == (210.0, 6.0, 1.0)
-    assert "carry 210 kg at the tip, the machine file has payload.mass 0" in weighed.finding(0.0)
-    assert weighed.finding(200.0) == "" and StaticPayload(5.0, 6.0).candidates(0.0) == []
+    assert weighed.finding(0.0) == (
+        "By statics the pressures carry 210 kg at the tip, 190 kg if no friction acts at rest; "
+        "the machine file has payload.mass 0."
+    )
+    assert weighed.finding(200.0) == "" and StaticPayload(5.0, 6.0, 5.0).candidates(0.0) == []
     (known,) = weighed.candidates(200.0)
     assert (known.start, known.scale) == (200.0, 10.0)
     assert weighed.candidates(150.0)[0].start == 210.0  # of statics, not of the file
@@ -346,5 +349,10 @@ def test_a_load_is_weighed_through_friction():
     case = SimpleNamespace(inputs=inputs, table=Table(units, np.column_stack(columns), {}))
     found = static_payload(MachineVariants(machine), {}, [case])
     assert found.mass == pytest.approx(180.0, abs=1.0)
+    empty = crane.load(machine.path, lock=machine.locked_joints, changes={"payload.mass": 0.0})
+    gravity = [crane.Dynamics(x).gravity(q[0]) for x in (loaded, empty)]
+    lift, tilt = (gravity[0] - gravity[1]) / 180.0  # [N/kg], of which the lift misses 3000 N
+    rest = 180.0 - 3000.0 * lift / (lift**2 + tilt**2)
+    assert found.rest_mass == pytest.approx(rest, abs=0.1) and rest < 165.0
     moving = SimpleNamespace(inputs=SimpleNamespace(initial=(q[0], np.ones(2))), table=case.table)
     assert static_payload(MachineVariants(machine), {}, [moving]) is None

@@ -237,8 +237,9 @@ class LevenbergMarquardt:
     @property
     def weight_divisors(self) -> dict[str, float]:
         """One over the weight of each channel in its unit."""
-        sizes = dict.fromkeys(self.channel_scales, self._max_redundancy)
-        sizes |= {} if self.has_equal_channels else self.redundancies
+        sizes = dict.fromkeys(self.channel_scales, self._max_redundancy) | (
+            {} if self.has_equal_channels else self.redundancies
+        )
         return {x: scale * float(np.sqrt(sizes[x])) for x, scale in self.channel_scales.items()}
 
     def _channel_scale_bounds(self) -> dict[str, tuple[float, float]]:

@@ -40,12 +40,14 @@ class StaticPayload(NamedTuple):
     """Mass of a payload by statics.
 
     Attributes:
-        mass: Mass [kg].
-        std: Its standard deviation.
+        mass: Mass of the least friction [kg].
+        std: Its standard deviation, of areas, pressures and levers.
+        rest_mass: Mass of the least friction at rest alone [kg].
     """
 
     mass: float
     std: float
+    rest_mass: float
 
     def candidates(self, known: float) -> list[Unknown]:
         """The payload as a candidate of a calibration, if there is one.
@@ -69,8 +71,8 @@ class StaticPayload(NamedTuple):
         if abs(self.mass - known) < _MAX_DEVIATIONS * self.std:
             return ""
         return (
-            f"By statics the pressures carry {self.mass:.3g} kg at the tip, the machine file has "
-            f"{PAYLOAD_MASS} {known:.4g}."
+            f"By statics the pressures carry {self.mass:.3g} kg at the tip, {self.rest_mass:.3g} "
+            f"kg if no friction acts at rest; the machine file has {PAYLOAD_MASS} {known:.4g}."
         )
 
 
@@ -91,12 +93,15 @@ def static_payload(
     if not terms:
         return None
 
-    def squares(mass: float) -> float:
-        return sum(float(np.max(a - mass * b)) ** 2 for a, b in terms)
+    def squares(mass: float, parts: slice) -> float:
+        return sum(float(np.max((a - mass * b)[parts])) ** 2 for a, b in terms)
 
     largest = max(float(np.max(np.abs(a) / np.abs(b))) for a, b in terms)
-    mass = float(minimize_scalar(squares, bounds=(0.0, largest), method="bounded").x)
-    return StaticPayload(mass, _GEOMETRY_STD * max(mass, _TEST_MASS))
+    mass, rest_mass = (
+        float(minimize_scalar(squares, None, (0.0, largest), (parts,), "bounded").x)
+        for parts in (slice(None), slice(2))  # all, rest
+    )
+    return StaticPayload(mass, _GEOMETRY_STD * max(mass, _TEST_MASS), rest_mass)
 
 
 def _friction_terms(
@@ -122,9 +127,10 @@ def _friction_terms(
         if not all(x in table.units for x in names):
             continue
         i, cylinder = empty.active.index(joint), circuit.cylinders[joint]
-        areas = np.array([cylinder.area_a, -cylinder.area_b])
         pressures = np.vstack([(a, b), np.column_stack([table_column(table, x) for x in names])])
-        force = pressures[:: max(1, len(table.values) // _SAMPLE_COUNT)] @ areas - weight[:, i]
+        force = pressures[:: max(1, len(table.values) // _SAMPLE_COUNT)] @ [
+            cylinder.area_a, -cylinder.area_b
+        ] - weight[:, i]  # fmt: skip
         per_mass = (with_load[:, i] - weight[:, i]) / _TEST_MASS
         speed = np.gradient(uniform_filter1d(q[:, i], max(len(q) // _SMOOTHING_SHARE, 1)))
         moves = np.abs(speed) > _MOVING_SHARE * np.abs(speed).max()
@@ -163,6 +169,8 @@ def near_minima(problem: CalibrationProblem, minima: Sequence[SearchState]) -> I
         names = [x.name for x, is_far in zip(problem.unknowns, far, strict=False) if is_far]
         excess = other.cost / minima[0].cost - 1.0
         if excess < _NEAR_MINIMUM and names:
-            text = f"{100 * abs(excess):.1f} % {'more' if excess >= 0.0 else 'less'} squares"
-            numbers = ", ".join(f"{name} = {values[name]:.4g}" for name in names)
-            yield f"With smoothed friction another minimum has {text}: {numbers}"
+            yield (
+                f"With smoothed friction another minimum has {100 * abs(excess):.1f} % "
+                f"{'more' if excess >= 0.0 else 'less'} squares: "
+                + ", ".join(f"{name} = {values[name]:.4g}" for name in names)
+            )
