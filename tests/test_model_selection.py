@@ -99,6 +99,17 @@ def test_errors_in_blocks_are_those_of_fits_without_them():
     assert selection.path()[0][0] == 4  # what is named by hand stays
 
 
+def test_a_steep_unknown_holds_no_flat_one():
+    """Steps of unknowns in any units; one without effect stays, whatever gradients round to."""
+    random, sizes = np.random.default_rng(4), np.array([1e9, 1.0, 1e-6, 0.0])
+    A, b = random.normal(size=(30, 4)) * sizes, random.normal(size=30)
+    far = np.full(4, np.inf)
+    step = bounded_step(A.T @ A, A.T @ b + [0.0, 0.0, 0.0, 1e-17], -far, far)
+    alike = np.linalg.lstsq(A[:, :3] / sizes[:3], -b)[0]
+    np.testing.assert_allclose(step * sizes, [*alike, 0.0], rtol=1e-9)
+    assert step[3] == 0.0
+
+
 def test_steps_stay_within_bounds():
     """The step to the corner of a quadratic is that of scipy's bounded least squares."""
     from scipy.optimize import lsq_linear

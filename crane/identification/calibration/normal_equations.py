@@ -8,7 +8,7 @@ from crane.common.samples import Array
 def bounded_step(
     hessian: Array, gradient: Array, low: Array, high: Array, damping: float = 0.0
 ) -> Array:
-    """Damped Gauss-Newton step (p,) between bounds, by an active set.
+    """Damped Gauss-Newton step (p,) between bounds, by an active set, 0 of what has no effect.
 
     Args:
         hessian: (p, p), of unknowns of any units.
@@ -20,7 +20,7 @@ def bounded_step(
     scaled, size = _unit_diagonal(hessian)
     scaled += damping * np.diag(np.diag(scaled))
     gradient, lowest, highest = gradient / size, low * size, high * size
-    free = np.ones(len(gradient), dtype=bool)
+    free = np.diag(hessian) > 0.0  # what has no effect does not move
     step = np.zeros(len(gradient))
     for _ in range(len(gradient)):
         i = np.flatnonzero(free)
