@@ -96,7 +96,7 @@ def _parameter_table(calibration: Calibration) -> str:
         "in the file": [
             f"{x.initial_value:.5g}" if x.initial_value != x.start else "" for x in parameters
         ],
-        "remark*": [escape(_parameter_remark(x)) for x in parameters],
+        "remark*": [f'<td class="words">{escape(_parameter_remark(x))}</td>' for x in parameters],
     }
     if not any(columns["in the file"]):
         del columns["in the file"]
@@ -108,7 +108,9 @@ def _parameter_table(calibration: Calibration) -> str:
         "residuals reduce the number of independent samples. Grey rows are parameters on a bound "
         "and parameters that the recordings do not determine: they are no result. Intervals hold "
         "for a correct model. A parameter that compensates an effect which is missing in the "
-        "machine file may be far off with a narrow interval.</p>"
+        "machine file may be far off with a narrow interval."
+        + " With all candidates: with those free, too, that the selection left out, within their "
+        "priors." * bool(calibration.selection) + "</p>"
     ) + html_table(
         list(columns),
         zip(*columns.values(), strict=True),
