@@ -242,8 +242,12 @@ def identify(
         loaded = loaded.replace(estimation=replace(loaded.estimation, prior={}))
     recordings = _read(recording, loaded, reading)
     inside = [x.between(*window) for x in recordings]
-    parts = ((x, part) for x in recordings for part in (x.time < window[0], x.time > window[1]))
-    outside = [x.at(part) for x, part in parts if part.sum() >= _MIN_HELD_OUT_SAMPLES]
+    outside = [
+        x.at(part)
+        for x in recordings
+        for part in (x.time < window[0], x.time > window[1])
+        if part.sum() >= _MIN_HELD_OUT_SAMPLES
+    ]
     judges: list[crane.Recording | Motion] = [*_usable_motions(loaded, outside, trust)]
     if train is not None and not outside:
         warnings.warn(

@@ -440,11 +440,10 @@ def _residual_dependence(
 
     residual = np.concatenate([(x.simulated_after - x.measured)[x.train_mask] for x in channels])
     speed = joined(drive + VELOCITY_SUFFIX)
-    pressure = joined(f"{PRESSURE_PREFIX}{drive}_{chamber}")
-    is_moving = np.abs(speed) > _REST_SPEED_SHARE * np.abs(speed).max()
-    motion = {"speed": speed, "pressure": pressure, "direction": np.sign(speed) * is_moving}
-    correlation_ratios = {what: correlation_ratio(residual, x) for what, x in motion.items()}
-    speed_unit = VELOCITY_UNITS[calibration.machine.unit(drive)]
+    direction = np.sign(speed) * (np.abs(speed) > _REST_SPEED_SHARE * np.abs(speed).max())
+    motion = {"speed": speed, "pressure": joined(f"{PRESSURE_PREFIX}{drive}_{chamber}"),
+              "direction": direction}  # fmt: skip
     return ResidualDependence(
-        name, unit, residual, drive, speed_unit, chamber, motion, correlation_ratios
-    )
+        name, unit, residual, drive, VELOCITY_UNITS[calibration.machine.unit(drive)], chamber,
+        motion, {what: correlation_ratio(residual, x) for what, x in motion.items()},
+    )  # fmt: skip

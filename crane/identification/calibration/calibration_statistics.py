@@ -296,8 +296,11 @@ def score_tests(
                        (candidate.low - candidate.start) / candidate.scale,
                        (candidate.high - candidate.start) / candidate.scale)  # fmt: skip
         gain = -(2.0 * step * gradient + step**2 * size) / max(float(residual @ residual), 1e-300)
-        value = candidate.start + candidate.scale * float(step)
-        found.append(ScoreTestResult(candidate.name, value, float(gain)))
+        found.append(
+            ScoreTestResult(
+                candidate.name, candidate.start + candidate.scale * float(step), float(gain)
+            )
+        )
     return [
         one
         for one in sorted(found, key=lambda one: -one.cost_reduction)

@@ -387,14 +387,16 @@ class LevenbergMarquardt:
         sums = np.zeros((numbers.max() + 1, len(z)))
         np.add.at(sums, numbers, self.jacobian * self.residual[:, None])
         count = len(sums)
-        meat = sums.T @ sums * (count / max(count - 1, 1)) + np.diag(self.prior**2)
-        robust = inverse @ meat @ inverse
+        robust = inverse @ (
+            sums.T @ sums * (count / max(count - 1, 1)) + np.diag(self.prior**2)
+        ) @ inverse  # fmt: skip
         white = inverse * (
             float(self.residual @ self.residual) / max(len(self.residual) - len(z), 1)
         )
         inflation = np.sqrt(np.maximum(np.diag(white) / np.maximum(np.diag(robust), 1e-300), 1.0))
-        without_effect = np.diag(np.where(np.diag(hessian) == 0.0, np.inf, 0.0))
-        return robust * np.outer(inflation, inflation) + without_effect, count
+        return robust * np.outer(inflation, inflation) + np.diag(
+            np.where(np.diag(hessian) == 0.0, np.inf, 0.0)
+        ), count
 
     def _block_duration(self) -> float:
         """Duration of a block [s], four correlation times of the residuals."""

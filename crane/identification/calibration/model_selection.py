@@ -183,9 +183,10 @@ class LinearizedSelection:
         covariance = scaled_inverse(hessian)[: len(parameters), : len(parameters)]
         deviations = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
         prior = np.sqrt(np.diag(self._prior))[list(parameters)]
-        loose = deviations * prior > MAX_PRIOR_SHARE
         correlation = covariance / np.outer(deviations, deviations) - np.eye(len(parameters))
-        loose |= (np.abs(correlation) > MAX_CORRELATION).any(axis=1)
+        loose = (deviations * prior > MAX_PRIOR_SHARE) | (
+            np.abs(correlation) > MAX_CORRELATION
+        ).any(axis=1)
         return [p for p, x in zip(parameters, loose, strict=True) if x]
 
     def path(self) -> tuple[list[int], list[SelectionStep]]:

@@ -58,13 +58,21 @@ class StaticPayload(NamedTuple):
             known: Mass in the machine file [kg], 0 if it has no payload.
         """
         if known and not self.finding(known):
-            low, high = known / _MAX_DEVIATIONS, known * _MAX_DEVIATIONS
             std = max(self.std, abs(self.mass - known))
-            return [Unknown(PAYLOAD_MASS, known, low, high, std, prior=1.0)]
+            return [
+                Unknown(
+                    PAYLOAD_MASS, known, known / _MAX_DEVIATIONS, known * _MAX_DEVIATIONS, std,
+                    prior=1.0,
+                )
+            ]  # fmt: skip
         if self.mass < _MAX_DEVIATIONS * self.std:
             return []
-        low, high = (self.mass + x * _MAX_DEVIATIONS * self.std for x in (-1.0, 1.0))
-        return [Unknown(PAYLOAD_MASS, self.mass, low, high, self.std, prior=1.0)]
+        return [
+            Unknown(
+                PAYLOAD_MASS, self.mass, self.mass - _MAX_DEVIATIONS * self.std,
+                self.mass + _MAX_DEVIATIONS * self.std, self.std, prior=1.0,
+            )
+        ]  # fmt: skip
 
     def finding(self, known: float) -> str:
         """Text about a payload that the machine file lacks or has otherwise, or ""."""
