@@ -39,6 +39,7 @@ _MAX_COMPARED_COST = 500.0
 _MIN_RELATIVE_SCALE, _MIN_SCALE = 1e-6, 1e-9
 # largest scale of a channel, the usual error of a model, per range of its unit in the recordings
 _MAX_SCALE_SHARE = 5e-3
+_MAX_SCALES = 1e3  # largest change of an unknown without bounds, in its scales
 _INITIAL_DAMPING = 1e-3
 _DAMPING_INCREASE, _DAMPING_DECREASE, _MAX_DAMPING = 10.0, 0.2, 1e8  # of the damping
 # relative error of derivatives far from the minimum, and of searches
@@ -141,11 +142,13 @@ class LevenbergMarquardt:
         self.problem, self._progress, self.log = problem, progress, log
         unknowns = problem.unknowns
         start_count = problem.unknown_count - len(unknowns)
-        self.low = np.array(
-            [(x.low - x.start) / x.scale for x in unknowns] + [-np.inf] * start_count
+        self.low = np.nan_to_num(
+            [(x.low - x.start) / x.scale for x in unknowns] + [-np.inf] * start_count,
+            neginf=-_MAX_SCALES,
         )
-        self.high = np.array(
-            [(x.high - x.start) / x.scale for x in unknowns] + [np.inf] * start_count
+        self.high = np.nan_to_num(
+            [(x.high - x.start) / x.scale for x in unknowns] + [np.inf] * start_count,
+            posinf=_MAX_SCALES,
         )
         self.training_cases = [case for case in problem.cases if case.train_mask.any()]
         self.prior = np.array([x.prior for x in unknowns] + [1.0] * start_count)
