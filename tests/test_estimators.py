@@ -9,6 +9,7 @@ from scipy.stats import f, t
 
 from crane.common.errors import InputError
 from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt
+from crane.identification.calibration.unknowns import Unknown
 from crane.identification.estimation.estimators import (
     huber,
     instrumental_variables,
@@ -248,6 +249,16 @@ def test_blocks_of_a_calibration_last_four_correlation_times(decay, count, expec
         residuals.append(np.column_stack(columns).ravel())
     fit = SimpleNamespace(training_cases=cases, residual=np.concatenate(residuals))
     assert LevenbergMarquardt._block_duration(fit) == pytest.approx(expected, rel=0.02)
+
+
+def test_unknowns_without_bounds_keep_to_a_thousand_of_their_scales(mini):
+    """A parameter that has no effect yet, where the crane never lifts, is not lost."""
+    unknowns = [
+        Unknown("positive", 2.0, 0.002, np.inf, 2.0), Unknown("bounded", 1.0, -np.inf, 5e3, 0.5)
+    ]  # fmt: skip
+    problem = SimpleNamespace(unknowns=unknowns, unknown_count=2, cases=[], machine=mini)
+    search = LevenbergMarquardt(problem, print, None)
+    assert search.low.tolist() == [-0.999, -1e3] and search.high.tolist() == [1e3, 9998.0]
 
 
 @pytest.mark.parametrize("inflation", [0.5, 1.5, 4.0])

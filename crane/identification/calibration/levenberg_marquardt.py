@@ -363,8 +363,11 @@ class LevenbergMarquardt:
         hessian = self.jacobian.T @ self.jacobian + np.diag(self.prior**2)
         gradient = self.jacobian.T @ self.residual + self.prior**2 * z
         while damping <= _MAX_DAMPING:
-            trial = z + bounded_step(hessian, gradient, self.low - z, self.high - z, damping)
-            trial = np.clip(trial, self.low, self.high)
+            trial = np.clip(
+                z + bounded_step(hessian, gradient, self.low - z, self.high - z, damping),
+                self.low,
+                self.high,
+            )
             trial_cost = self.cost(trial)
             self.log.iterations += 1
             self._progress(1.0 - 0.97**self.log.iterations)
