@@ -226,8 +226,10 @@ def test_a_piston_that_leaves_its_cylinder_ends_the_run(unstopped):
     part = caught.value.recording
     assert part.stopped == str(caught.value) and part["X_lift"][-1] - 0.535 < room
     assert part.time[-1] == pytest.approx(float(told[1]) - 1e-3)
-    # the last rows before the event are rounded in another order
-    np.testing.assert_allclose(part.q[: len(before.time)], before.q, rtol=1e-15, atol=1e-15)
+    # the last row is interpolated in one run and the end of the other, so rounded otherwise
+    last = len(before.time) - 1
+    np.testing.assert_array_equal(part.q[:last], before.q[:last])
+    np.testing.assert_allclose(part.q[last], before.q[last], rtol=0.0, atol=1e-14)
     assert room - 0.02 < before["X_lift"][-1] - 0.535 < room
 
 
