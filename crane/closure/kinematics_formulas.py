@@ -7,7 +7,7 @@ at zero, see `crane.description.rotation_vectors`.
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import pinocchio as pin
@@ -251,6 +251,7 @@ class TreeGeometry:
         return [joint for part in parts if len(part) < 3 for joint in part]
 
 
+@lru_cache(maxsize=8)
 def tree_geometry(equations: LoopEquations) -> TreeGeometry:
     """The geometry of an assembled model."""
     model, coordinates = equations.model, equations.coordinates

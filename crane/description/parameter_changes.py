@@ -96,8 +96,8 @@ def apply_parameter_changes(spec: MachineSpec, changes: Mapping[str, float]) -> 
     Raises:
         InputError: A name is unknown, or a value is not allowed.
     """
-    names, paths = parameters(spec), parameter_paths(spec)
-    values = {name: _check_change(spec, names, name, changes[name]) for name in changes}
+    paths = parameter_paths(spec)
+    values = {name: _check_change(spec, paths, name, changes[name]) for name in changes}
     values = _flows_at_engine_speed(spec, values) | values
     payload_mass = values.pop(PAYLOAD_MASS, 0.0)
     sensor_changes = {x: value for x, value in values.items() if x.startswith(SENSOR_PREFIX)}
@@ -141,16 +141,14 @@ def _flows_at_engine_speed(spec: MachineSpec, values: Mapping[str, float]) -> di
     return flows
 
 
-def _check_change(
-    spec: MachineSpec, names: Mapping[str, float], name: str, new_value: object
-) -> float:
+def _check_change(spec: MachineSpec, paths: Container[str], name: str, new_value: object) -> float:
     if name.startswith(SENSOR_PREFIX):
         quantity, _ = parse_sensor_parameter(name)
         if quantity_unit(spec.tree, quantity) is None and quantity not in spec.sensors:
             hint = suggest_names(quantity_units(spec.tree), quantity)
             raise InputError(f"'{name}' is of no quantity of '{spec.name}', {hint}")
-    elif name not in names:
-        raise InputError(unknown_parameter_text(spec, names, name))
+    elif name not in paths and (name != PAYLOAD_MASS or spec.tip is None):
+        raise InputError(unknown_parameter_text(spec, parameters(spec), name))
     if name.endswith((".mass", ".rotor_inertia")):
         return as_nonnegative_number(
             new_value, f"parameter '{name}'", "kg" if name.endswith(".mass") else ""

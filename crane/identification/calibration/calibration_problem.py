@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -41,7 +42,8 @@ _DIFFERENCE_STEP = 1e-5  # of the scale of an unknown, for differences of simula
 _FRICTION_SMOOTHING = {"rad": 5e-3, "m": 2e-3}
 # largest steps [s] of a simulation, of one with derivatives, and with coarse ones
 _MAX_STEP, _MAX_SENSITIVITY_STEP, _MAX_COARSE_STEP = 1e-2, 2e-3, 5e-3
-_MAX_CACHED_MACHINES = 100  # machines with changed parameters in the cache
+# machines with changed parameters, and residuals at the last unknowns, that are kept
+_MAX_CACHED_MACHINES, _MAX_CACHED_RESIDUALS = 100, 8
 
 
 class CalibrationProblem:
@@ -72,7 +74,8 @@ class CalibrationProblem:
         self.unknown_count = count
         self.smooth = self.slopes = 0.0
         self.derivative_tolerance = DERIVATIVE_TOLERANCE
-        self._machine_cache: dict[tuple[float, ...], Machine] = {}
+        self._changed_machine = lru_cache(_MAX_CACHED_MACHINES)(self._build_machine)
+        self._recent_residuals = lru_cache(_MAX_CACHED_RESIDUALS)(self._simulate_residuals)
 
     def variant(
         self, unknowns: Sequence[Unknown], cases: Sequence[RecordingCase] | None = None
@@ -100,23 +103,20 @@ class CalibrationProblem:
 
     def simulated_machine(self, z: Array, friction_smoothing: float) -> Machine:
         """The machine for simulation, with changed parameters and smoothed friction."""
-        changes = {
-            x: value for x, value in self.changes(z).items() if not x.startswith(SENSOR_PREFIX)
-        }
-        key = friction_smoothing, *changes.values()
-        if key in self._machine_cache:
-            return self._machine_cache[key]
-        if len(self._machine_cache) >= _MAX_CACHED_MACHINES:
-            self._machine_cache.clear()
+        changes = self.changes(z).items()
+        return self._changed_machine(
+            friction_smoothing, *(x for x in changes if not x[0].startswith(SENSOR_PREFIX))
+        )
+
+    def _build_machine(self, friction_smoothing: float, *changes: tuple[str, float]) -> Machine:
         with warnings.catch_warnings(action="ignore"):
-            machine = self._variants.machine(changes) if changes else self.machine
+            machine = self._variants.machine(dict(changes)) if changes else self.machine
         if friction_smoothing:
             friction = dict(machine.friction)
             for joint in (machine.joints[i] for i in find_stick_slip_columns(machine)):
                 width = friction_smoothing * _FRICTION_SMOOTHING[machine.unit(joint)]
                 friction[joint] = replace(friction.get(joint, Friction()), smoothing=width)
             machine = machine.replace(friction=friction)
-        self._machine_cache[key] = machine
         return machine
 
     def simulate_readings(self, case: RecordingCase, z: Array, training_only: bool) -> CubicSpline:
@@ -225,7 +225,14 @@ class CalibrationProblem:
         Raises:
             CraneError: See `simulate_readings`.
         """
-        curve = self.simulate_readings(case, z, training_only)
+        ends_early = training_only and not case.train_mask[-1]
+        return self._recent_residuals(case, tuple(z.tolist()), self.smooth, ends_early)
+
+    def _simulate_residuals(
+        self, case: RecordingCase, unknowns: tuple[float, ...], _: float, ends_early: bool
+    ) -> Array:
+        z = np.array(unknowns)
+        curve = self.simulate_readings(case, z, ends_early)
         return self._sensor_readings(case, curve, z)[0] - case.measured
 
     def linearize(self, case: RecordingCase, z: Array) -> tuple[Array, Array]:
@@ -263,7 +270,7 @@ class CalibrationProblem:
             motion = SimulatedMotion(dynamics, drive, initial, steps, step)
             q = machine.closure.solve(initial[0], initial_guess=machine.home)
             constants = simulation_constants_of(dynamics, drive, initial, links, motion.time, q)
-            setup = (friction_smoothing, constants, links, motion.time, machine, q)
+            setup = (friction_smoothing, constants, links, motion.time, dynamics, q)
             every = [self._setup_derivative(case, z, i, *setup) for i in simulated_unknowns]
             integrator = VariationalIntegrator(
                 motion,
@@ -302,29 +309,26 @@ class CalibrationProblem:
         base: SimulationConstants,
         links: Sequence[str],
         times: Array,
-        machine: Machine,
+        nominal: Dynamics,
         start: Array,
     ) -> SimulationConstants:
         """Derivative of the simulation constants by an unknown.
 
         It is a difference quotient of the constants, which are smooth, backwards at a bound.
         """
-        is_start = i >= len(self.unknowns)
-        sides = (1.0, -1.0)
-        if not is_start:
-            unknown = self.unknowns[i]
-            if unknown.start + unknown.scale * (z[i] + _DIFFERENCE_STEP) > unknown.high:
-                sides = (-1.0, 1.0)
+        reaches_bound = any(
+            unknown.start + unknown.scale * (z[i] + _DIFFERENCE_STEP) > unknown.high
+            for unknown in self.unknowns[i : i + 1]
+        )
+        sides = (-1.0, 1.0) if reaches_bound else (1.0, -1.0)
         for last, side in enumerate(sides):
             perturbed = z.copy()
             perturbed[i] += side * _DIFFERENCE_STEP
             try:
-                other = (
-                    machine if is_start else self.simulated_machine(perturbed, friction_smoothing)
-                )
+                other = self.simulated_machine(perturbed, friction_smoothing)
                 inputs = self._inputs_with_start(case, perturbed)
-                initial = initial_motion(other, inputs.initial)
-                dynamics, drive = Dynamics(other), inputs.valve_drive(other)
+                dynamics = nominal if other is nominal.machine else Dynamics(other)
+                drive, initial = inputs.valve_drive(other), initial_motion(other, inputs.initial)
                 found = simulation_constants_of(dynamics, drive, initial, links, times, start)
             except CraneError:
                 if last:

@@ -63,8 +63,10 @@ class TransposedMap(NamedTuple):
     stage_weights: Array
 
 
-def step_pair_maps(values: Array, lengths: Array, sizes: Array) -> tuple[Array, Array]:
+def step_pair_maps(values: Array, lengths: Array, sizes: Array) -> list[Array]:
     """Maps Phi and Psi (n, m, m + p) of S by n pairs of steps.
+
+    Psi = sum_j mu_j^T B_j follows from the transposed maps, by equations with m right sides.
 
     Args:
         values: A and B (4 n + 1, m, m + p) at the nodes.
@@ -74,22 +76,26 @@ def step_pair_maps(values: Array, lengths: Array, sizes: Array) -> tuple[Array, 
     Returns:
         Maps of the first step, and of both steps, extrapolated.
     """
-    count, (stage_values, all_lengths) = len(lengths), _stage_values(values, lengths)
-    by_state, by_number = np.split(stage_values, [values.shape[1]], axis=-1)
-    step_count, stages, m, _ = by_state.shape
-    right = np.empty_like(stage_values)
-    right[..., :m] = np.eye(m)
-    right[..., m:] = (
-        np.einsum("ij,n,njmp->nimp", STAGE_WEIGHTS, all_lengths, by_number) / sizes[:, None]
-    )
-    sides = right.reshape(step_count, stages * m, stage_values.shape[-1])
-    matrix = _stage_matrix(by_state, all_lengths, sizes)
-    maps = np.linalg.solve(matrix, sides)[:, -m:] * sizes[:, None]
-    maps[..., :m] /= sizes
-    first, second, coarse = maps[:count:2], maps[1:count:2], maps[count:]
-    refined = second[..., :m] @ first
-    refined[..., m:] += second[..., m:]
-    return first, refined + (refined - coarse) / 15.0
+    m, maps = values.shape[1], []
+    nodes = np.stack([values[i : len(values) - 4 + i : 4, :, m:] for i in range(5)], axis=1)
+    for propagation, stage_weights in transposed_pair_maps(values[..., :m], lengths, sizes):
+        count, node_count = stage_weights.shape[:2]
+        weights = stage_weights.reshape(count, node_count * m, m)
+        by_number = nodes[:, :node_count].reshape(count, node_count * m, nodes.shape[-1])
+        maps.append(
+            np.concatenate(
+                [np.swapaxes(propagation, 1, 2), np.swapaxes(weights, 1, 2) @ by_number], axis=2
+            )
+        )
+    return maps
+
+
+def apply_maps(maps: Array, sensitivities: Array) -> Array:
+    """Phi S + Psi by maps (., m, m + p) of S (., m, P); further columns of Psi are 0."""
+    m = sensitivities.shape[-2]
+    found: Array = maps[..., :m] @ sensitivities
+    found[..., : maps.shape[-1] - m] += maps[..., m:]
+    return found
 
 
 def transposed_pair_maps(
@@ -136,13 +142,12 @@ def _values_by_step(values: Array) -> Array:
 
 def _stage_matrix(by_state: Array, lengths: Array, sizes: Array) -> Array:
     """1 - h a (x) A (N, 3 m, 3 m), scaled by the sizes of the states."""
-    by_state = by_state / sizes[:, None] * sizes
     count, stages, m, _ = by_state.shape
-    whole = np.zeros((count, stages, m, stages, m))
-    for i in range(stages):
-        for j in range(stages):
-            whole[:, i, :, j] = -STAGE_WEIGHTS[i, j] * lengths[:, None, None] * by_state[:, j]
-    return whole.reshape(count, stages * m, stages * m) + np.eye(stages * m)
+    scaled = by_state * (-lengths[:, None, None, None] * (sizes / sizes[:, None]))
+    rows = np.swapaxes(scaled, 1, 2).reshape(count, 1, m, stages * m)
+    matrix = np.repeat(STAGE_WEIGHTS, m, axis=1)[:, None] * rows
+    matrix.reshape(count, (stages * m) ** 2)[:, :: stages * m + 1] += 1.0
+    return matrix.reshape(count, stages * m, stages * m)
 
 
 STEP_ACCURACY = 1e-8  # relative error of a step
@@ -177,7 +182,7 @@ class VariationalIntegrator:
         accuracy: float = STEP_ACCURACY,
     ):
         self._motion, self._accuracy = motion, accuracy
-        self._nominal_constants, self._directions = nominal_constants, directions
+        self._nominal_constants = nominal_constants
         is_variable = (np.any(part != 0, axis=tuple(range(part.ndim - 1))) for part in directions)
         self._forward_derivatives = ForwardDerivatives(
             motion.chart,
@@ -185,17 +190,24 @@ class VariationalIntegrator:
             outputs,
             SimulationConstants(*(part.astype(np.float64) for part in is_variable)),
         )
-        scale = MIN_RELATIVE_CHANGE * np.outer(motion.largest_states, 1.0 / typical_changes)
-        self._min_scale = np.maximum(np.abs(directions.initial_state.T), scale)
+        # those that change the initial state alone come last: their B is 0
+        has_no_input = [
+            not any(np.any(part[i]) for part in directions[:5])
+            for i in range(len(typical_changes))
+        ]
+        self._order = np.argsort(has_no_input, kind="stable")
+        inputs = self._order[: has_no_input.count(False)]
+        self._directions = SimulationConstants(*(part[inputs] for part in directions))
+        self._initial_sensitivity = directions.initial_state.T[:, self._order]
+        scale = MIN_RELATIVE_CHANGE * np.outer(
+            motion.largest_states, 1.0 / typical_changes[self._order]
+        )
+        self._min_scale = np.maximum(np.abs(self._initial_sensitivity), scale)
 
     def integrate(self) -> Array:
         """Derivatives (N + 1, k, p) of the outputs."""
-        track, m, k = (
-            self._motion,
-            self._forward_derivatives.state_size,
-            len(self._forward_derivatives.outputs),
-        )
-        sensitivity = self._directions.initial_state.T.copy()
+        track, k = self._motion, len(self._forward_derivatives.outputs)
+        sensitivity = self._initial_sensitivity
         output_derivatives = np.empty((len(track.time) // 2 + 1, k, sensitivity.shape[1]))
         for segment in track.segments():
             track.adopt_mode(segment.mode)
@@ -210,12 +222,11 @@ class VariationalIntegrator:
                 every, node_outputs = self._integrate_segment(
                     track.recorded_nodes(segment), sensitivity, MAX_REFINEMENTS
                 )
-                at = node_outputs[::2, :k]
-                output_derivatives[segment.first_instant : segment.last_instant + 1] = (
-                    at[..., :m] @ every + at[..., m:]
+                output_derivatives[segment.first_instant : segment.last_instant + 1] = apply_maps(
+                    node_outputs[::2, :k], every
                 )
                 sensitivity = every[-1]
-        return output_derivatives
+        return output_derivatives[..., np.argsort(self._order)]
 
     def _directional_derivatives(self, nodes: MotionNodes) -> tuple[Array, Array]:
         """A and B, derivatives of outputs and margin; see `ForwardDerivatives`."""
@@ -231,10 +242,7 @@ class VariationalIntegrator:
         self, nodes: MotionNodes, sensitivity: Array, depth: int
     ) -> tuple[Array, Array]:
         """S (n + 1, m, p) at the ends of the steps, and derivatives of outputs at the nodes."""
-        m, (state_jacobian, output_jacobian) = (
-            self._forward_derivatives.state_size,
-            self._directional_derivatives(nodes),
-        )
+        state_jacobian, output_jacobian = self._directional_derivatives(nodes)
         count, paired = len(nodes.step_sizes), len(nodes.step_sizes) // 2 * 2
         first_maps, pair_maps = step_pair_maps(
             state_jacobian[: 2 * paired + 1],
@@ -244,11 +252,10 @@ class VariationalIntegrator:
         ends = np.empty((paired // 2 + 1, *sensitivity.shape))
         ends[0] = sensitivity
         for i, pair in enumerate(pair_maps):
-            ends[i + 1] = pair[:, :m] @ ends[i] + pair[:, m:]
+            ends[i + 1] = apply_maps(pair, ends[i])
         self._min_scale = np.maximum(self._min_scale, np.abs(ends).max(axis=0))
-        interpolation_error = interpolation_errors(state_jacobian[: 2 * paired + 1])
-        error = np.abs(interpolation_error[..., :m] @ ends[:-1] + interpolation_error[..., m:])
-        error *= nodes.step_sizes[:paired:2, None, None]
+        error = apply_maps(interpolation_errors(state_jacobian[: 2 * paired + 1]), ends[:-1])
+        error = np.abs(error) * nodes.step_sizes[:paired:2, None, None]
         needs_refinement = np.any(error > self._accuracy * self._min_scale, axis=(1, 2))
         step_sensitivities = [sensitivity]
         for first, pair, finer in zip(first_maps, pair_maps, needs_refinement, strict=True):
@@ -257,7 +264,7 @@ class VariationalIntegrator:
                 self._refine_step(nodes, step_sensitivities, depth)
             else:
                 step_sensitivities += [
-                    one[:, :m] @ step_sensitivities[-1] + one[:, m:] for one in (first, pair)
+                    apply_maps(one, step_sensitivities[-1]) for one in (first, pair)
                 ]
         if paired < count:
             self._refine_step(nodes, step_sensitivities, depth)
@@ -274,13 +281,9 @@ class VariationalIntegrator:
 
     def _apply_jump(self, jump: TransitionJump, sensitivity: Array) -> Array:
         """S behind an instant at which joints start or stop; see `sensitivity_jump`."""
-        track, m, nodes = (
-            self._motion,
-            self._forward_derivatives.state_size,
-            self._motion.nodes_at_transition(jump.transition),
-        )
-        by_number = self._directional_derivatives(nodes)[1][1, -1, m:]
-        by_state, leap = track.sensitivity_jump(
+        nodes = self._motion.nodes_at_transition(jump.transition)
+        margin = self._directional_derivatives(nodes)[1][1, -1:]
+        _, leap = self._motion.sensitivity_jump(
             self._forward_derivatives, self._nominal_constants, jump
         )
-        return sensitivity - np.outer(leap, by_state @ sensitivity + by_number)
+        return sensitivity - np.outer(leap, apply_maps(margin, sensitivity))
