@@ -40,7 +40,8 @@ _MIN_RELATIVE_SCALE, _MIN_SCALE = 1e-6, 1e-9
 # largest scale of a channel, the usual error of a model, per range of its unit in the recordings
 _MAX_SCALE_SHARE = 5e-3
 _MAX_SCALES = 1e3  # largest change of an unknown without bounds, in its scales
-_INITIAL_DAMPING = 1e-3
+# damping at first, and the largest reduction of an iteration that is expected, per the last one
+_INITIAL_DAMPING, _EXPECTED_REDUCTION = 1e-3, 2.0
 _DAMPING_INCREASE, _DAMPING_DECREASE, _MAX_DAMPING = 10.0, 0.2, 1e8  # of the damping
 # relative error of derivatives far from the minimum, and of searches
 _COARSE_DERIVATIVE_TOLERANCE, _SEARCH_DERIVATIVE_TOLERANCE = 1e-2, 1e-3
@@ -59,7 +60,7 @@ class SearchState:
         cost: Cost there.
         damping: Damping of the next step.
         iteration: Number of iterations.
-        has_ended: Whether this is the minimum.
+        has_ended: Whether this is the minimum, or one that is too high.
     """
 
     z: Array
@@ -333,6 +334,7 @@ class LevenbergMarquardt:
         cost_tolerance: float = _COST_TOLERANCE,
         damping: float = _INITIAL_DAMPING,
         max_iterations: int = _MAX_ITERATIONS,
+        highest_cost: float = np.inf,
     ) -> SearchState:
         """Last state of a search for the nearest minimum, for the present channel scales.
 
@@ -341,6 +343,8 @@ class LevenbergMarquardt:
             cost_tolerance: Relative reduction of the cost by an iteration that ends the search.
             damping: Initial damping.
             max_iterations: Number of iterations that ends the search.
+            highest_cost: The search ends where even twice the last reduction in each iteration
+                that is left would not lead below it.
 
         Raises:
             CraneError: The simulation fails at the start.
@@ -352,12 +356,17 @@ class LevenbergMarquardt:
             for case in self.training_cases:
                 self.problem.residuals(case, z)
         while not state.has_ended and state.iteration < max_iterations:
-            state = self._iterate(state, cost_tolerance)
+            state = self._iterate(state, cost_tolerance, max_iterations, highest_cost)
             self.log.add(state)
         return state
 
-    def _iterate(self, state: SearchState, cost_tolerance: float) -> SearchState:
-        """State after an iteration: a step that reduces the cost, if there is one."""
+    def _iterate(
+        self, state: SearchState, cost_tolerance: float, max_iterations: int, highest_cost: float
+    ) -> SearchState:
+        """State after an iteration: a step that reduces the cost, if there is one.
+
+        For arguments see `minimize`.
+        """
         z, cost, damping = state.z, state.cost, state.damping
         self.linearize(z)
         hessian = self.jacobian.T @ self.jacobian + np.diag(self.prior**2)
@@ -376,8 +385,10 @@ class LevenbergMarquardt:
                 break
             damping *= _DAMPING_INCREASE
         iteration, reduction = state.iteration + 1, state.cost - cost
-        has_ended = not reduction or reduction < cost_tolerance * min(
-            state.cost, _MAX_COMPARED_COST
+        has_ended = (
+            not reduction
+            or reduction < cost_tolerance * min(state.cost, _MAX_COMPARED_COST)
+            or cost - _EXPECTED_REDUCTION * (max_iterations - iteration) * reduction > highest_cost
         )
         return SearchState(z, cost, damping, iteration, has_ended)
 

@@ -51,7 +51,8 @@ _BLOCK_RANGE = 3, 8  # number of blocks of a recording
 _MAX_COST = 4.0  # of the score, of a parameter that the recordings do not determine: chi-square
 _SMOOTHED_NOISE_LEVEL = 10.0  # residuals per noise that are of more than smoothed friction
 _WEIGHT_ROUNDS = 3  # of weights by redundancies of all candidates
-_MAX_ITERATIONS = 12  # of the fit of a selected set
+# iterations of the fit of a selected set, and cost per cost of the larger set that it has to reach
+_MAX_ITERATIONS, _MAX_COST_RATIO = 12, 1.05
 _SCORE_TOLERANCE = 30.0  # difference of scores of one minimum; more is another one
 _BLOCK_ITERATIONS = 3  # of the fits without a block
 # smoothing and tolerances of the way out of a minimum that may be a kink of friction
@@ -285,12 +286,13 @@ def _candidates_minimum(
     first = search.restricted_search(
         search.problem.variant([x for x in unknowns if x.name not in reserve])
     )
-    z = smoothed_minimum(first)
-    if not channels or first.leaves_noise(z, channels, _SMOOTHED_NOISE_LEVEL):
-        z = _weighted_minimum(first, lowest_minimum(first, z))
-        if not channels or first.leaves_noise(z, channels):
-            return first, z
     z = smoothed_minimum(search)
+    if channels and search.leaves_noise(z, channels, _SMOOTHED_NOISE_LEVEL):
+        fewer = smoothed_minimum(first)
+        if first.leaves_noise(fewer, channels, _SMOOTHED_NOISE_LEVEL):
+            fewer = _weighted_minimum(first, lowest_minimum(first, fewer))
+            if first.leaves_noise(fewer, channels):
+                return first, fewer
     return search, _weighted_minimum(search, lowest_minimum(search, z))
 
 
@@ -346,7 +348,9 @@ def _fewer_parameters(
     )
     chosen, steps = selection.path()
     others = sorted(set(range(len(parameters))) - set(chosen), key=lambda i: -abs(z[i]))
-    score, large = simulated_score(search, z) + 2.0 * len(parameters), 0.0
+    score, cost, large = (
+        simulated_score(search, z) + 2.0 * len(parameters), search.cost(z), 0.0,
+    )  # fmt: skip
     for removed in _last_halves(others):
         remaining = [i for i in range(len(parameters)) if i not in removed]
         kept = [parameters[i] for i in remaining]
@@ -359,6 +363,7 @@ def _fewer_parameters(
             min((z[unknowns], selection.fit(unknowns)[unknowns]), key=fewer.cost),
             COMPARED_COST_TOLERANCE,
             max_iterations=_MAX_ITERATIONS,
+            highest_cost=_MAX_COST_RATIO * cost,
         ).z
         reduction = score - simulated_score(fewer, minimum) - 2.0 * len(names)
         if -_SCORE_TOLERANCE < reduction < 0.0:

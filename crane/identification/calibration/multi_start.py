@@ -93,8 +93,10 @@ def simulated_score(
 def smoothed_minimum(search: LevenbergMarquardt) -> Array:
     """Lowest minimum (p,) with smoothed friction, from several starts."""
     search.start_with_smoothed_friction()
-    given = np.zeros(search.problem.unknown_count)
-    first = search.minimize(given, INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING, _ROUNDS[0][1])
+    first = search.minimize(
+        np.zeros(search.problem.unknown_count), INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING,
+        _ROUNDS[0][1],
+    )  # fmt: skip
     search.minima = [first] if search.leaves_noise(first.z) else _race(search, first)
     search.update_scales(search.minima[0].z)
     return search.minimize(search.minima[0].z, INITIAL_COST_TOLERANCE).z
