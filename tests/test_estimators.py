@@ -261,6 +261,31 @@ def test_unknowns_without_bounds_keep_to_a_thousand_of_their_scales(mini):
     assert search.low.tolist() == [-0.999, -1e3] and search.high.tolist() == [1e3, 9998.0]
 
 
+class FlatSearch(LevenbergMarquardt):
+    """A search of the cost (exp(-2 z) + 100) / 2, by steps of about 1."""
+
+    def __init__(self):
+        self.low, self.high, self.prior = np.array([-99.0]), np.array([99.0]), np.zeros(1)
+        self.states, self.training_cases, self._progress = [], [], lambda share: None
+        self.log = SimpleNamespace(begin=lambda: None, add=self.states.append, iterations=0)
+
+    def linearize(self, z):
+        self.jacobian, self.residual = np.array([[-np.exp(-z[0])], [0.0]]), [np.exp(-z[0]), 10.0]
+
+    def cost(self, z):
+        return 0.5 * float(np.exp(-2.0 * z[0])) + 50.0
+
+
+@pytest.mark.parametrize("highest_cost, iterations", [(40.0, 1), (45.0, 2), (49.9, 3), (51.0, 9)])
+def test_a_search_that_cannot_come_low_enough_is_given_up(highest_cost, iterations):
+    """Twice the last reduction in each of nine iterations: to 42.3, 49.1, 49.9, ..."""
+    search = FlatSearch()
+    last = search.minimize(np.zeros(1), 1e-15, 1e-9, 9, highest_cost=highest_cost)
+    assert last.iteration == len(search.states) == iterations
+    assert last.has_ended == (iterations < 9) and search.states[-1] is last
+    assert last.z[0] == pytest.approx(iterations, rel=1e-6)
+
+
 @pytest.mark.parametrize("inflation", [0.5, 1.5, 4.0])
 def test_payloads_are_as_uncertain_as_their_segments_differ(inflation):
     """A mean of ten segments, whose jackknife gives sum (m_i - m)^2 / (K (K - 1))."""

@@ -210,7 +210,8 @@ class SimulatedSearch:
     def cost(self, z):
         return float(z @ z)
 
-    def minimize(self, z, tolerance, max_iterations):
+    def minimize(self, z, tolerance, max_iterations, highest_cost):
+        assert highest_cost == pytest.approx(1.05 * 5.25)  # of the larger set
         return SimpleNamespace(z=z)
 
     def training_errors(self, z):
@@ -300,13 +301,17 @@ class ReserveSearch:
     ],
 )
 def test_a_reserve_joins_where_more_than_noise_is_left(monkeypatch, levels, expected):
-    tried = []
+    tried, smoothed = [], []
 
     def lowest(search, z):
         tried.append([x.name for x in search.problem.unknowns])
         return z
 
-    monkeypatch.setattr(model_selection, "smoothed_minimum", lambda search: "smoothed")
+    def smooth(search):
+        smoothed.append([x.name for x in search.problem.unknowns])
+        return "smoothed"
+
+    monkeypatch.setattr(model_selection, "smoothed_minimum", smooth)
     monkeypatch.setattr(model_selection, "lowest_minimum", lowest)
     monkeypatch.setattr(model_selection, "_weighted_minimum", lambda search, z: "weighted")
     unknowns = [Unknown(x, 1.0, 0.0, 2.0, 1.0) for x in "abc"]
@@ -315,6 +320,8 @@ def test_a_reserve_joins_where_more_than_noise_is_left(monkeypatch, levels, expe
     found, z = model_selection._candidates_minimum(search, reserve)
     assert [x.name for x in found.problem.unknowns] == expected and z == "weighted"
     assert tried[-1] == expected and len(tried) == 1 + (levels.get("weighted", 0) > 1.5)
+    # without the reserve only where noise alone is left with it
+    assert smoothed == [["a", "b", "c"], ["a", "b"]][: 1 + (levels["smoothed"] < 10.0)]
 
 
 def test_pins_of_a_cylinder():

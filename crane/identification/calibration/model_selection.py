@@ -1,11 +1,11 @@
 """Selection of the parameters of a calibration by the prediction of blocks that are left out.
 
 All candidates are fitted with their priors first, those in reserve only if the others leave more
-than noise. The linearization there, with residual r and Jacobian J by the scaled unknowns z,
-predicts the residuals of every other set S of parameters, the others at the values of the machine:
-r(z_S) = r - J z + J_S z_S. A fit of S without block b of contiguous instants is a Gauss-Newton
-step of normal equations, its error in block b follows from their matrices. The set grows by the
-parameter that reduces
+than noise: where all of them leave no more, the others alone are fitted. The linearization there,
+with residual r and Jacobian J by the scaled unknowns z, predicts the residuals of every other set
+S of parameters, the others at the values of the machine: r(z_S) = r - J z + J_S z_S. A fit of S
+without block b of contiguous instants is a Gauss-Newton step of normal equations, its error in
+block b follows from their matrices. The set grows by the parameter that reduces
 
     score = sum_c n_c ln(mean square of channel c over all blocks left out) + sum_S (z / prior)^2
             + 2 k
@@ -17,9 +17,10 @@ their prior, or that correlate with another one, if they cost nothing.
 A linearization does not hold as far as the values of the machine. Therefore the set is fitted by
 simulation, and replaces the larger one only if its score (see `multi_start`) over the
 training data with the same penalties, is not higher; else the half of what it lacks joins that
-was moved farthest. If it is higher by little, simulated fits without each block decide. The set is
-selected again by the linearization at its minimum, until nothing is left out any more. At the end
-it is searched once more with smoothed friction, from which the lower minimum is kept.
+was moved farthest. If it is higher by little, simulated fits without each block decide; a fit that
+cannot come near the cost of the larger set any more is given up. The set is selected again by the
+linearization at its minimum, until nothing is left out any more. At the end it is searched once
+more with smoothed friction, from which the lower minimum is kept.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
