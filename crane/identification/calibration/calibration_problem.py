@@ -74,6 +74,7 @@ class CalibrationProblem:
         self.unknown_count = count
         self.smooth = self.slopes = 0.0
         self.derivative_tolerance = DERIVATIVE_TOLERANCE
+        # kept by their arguments: methods of machines and residuals
         self._changed_machine = lru_cache(_MAX_CACHED_MACHINES)(self._build_machine)
         self._recent_residuals = lru_cache(_MAX_CACHED_RESIDUALS)(self._simulate_residuals)
 
@@ -229,7 +230,7 @@ class CalibrationProblem:
         return self._recent_residuals(case, tuple(z.tolist()), self.smooth, ends_early)
 
     def _simulate_residuals(
-        self, case: RecordingCase, unknowns: tuple[float, ...], _: float, ends_early: bool
+        self, case: RecordingCase, unknowns: tuple[float, ...], _smooth: float, ends_early: bool
     ) -> Array:
         z = np.array(unknowns)
         curve = self.simulate_readings(case, z, ends_early)
