@@ -290,10 +290,10 @@ def _candidates_minimum(
     z = smoothed_minimum(search)
     if channels and search.leaves_noise(z, channels, _SMOOTHED_NOISE_LEVEL):
         fewer = smoothed_minimum(first)
-        if first.leaves_noise(fewer, channels, _SMOOTHED_NOISE_LEVEL):
-            fewer = _weighted_minimum(first, lowest_minimum(first, fewer))
-            if first.leaves_noise(fewer, channels):
-                return first, fewer
+        if first.leaves_noise(fewer, channels, _SMOOTHED_NOISE_LEVEL) and first.leaves_noise(
+            fewer := _weighted_minimum(first, lowest_minimum(first, fewer)), channels
+        ):
+            return first, fewer
     return search, _weighted_minimum(search, lowest_minimum(search, z))
 
 
