@@ -9,6 +9,7 @@ import crane
 from crane.common.errors import SimulationError
 from crane.formats.machine_loading import MachineVariants
 from crane.identification.calibration import model_selection, multi_start
+from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt
 from crane.identification.calibration.model_selection import (
     LinearizedSelection,
     training_blocks,
@@ -181,15 +182,18 @@ def test_samples_of_starts():
     assert [4.0 * sample(bounded, x) for x in (0, 0.5, 1)] == pytest.approx([-1.0, 1.0, 3.0])
 
 
-def test_what_is_not_believable_is_said():
+def test_what_is_not_believable_is_said(mini):
+    """A zero far from its prior; bounds, and the thousand scales of an unknown without."""
     unknowns = [
-        Unknown("sensor.p.zero", 0.0, -9e9, 9e9, 2e5, prior=1.0), Unknown("a", 1.0, 0.0, 2.0, 1.0)
+        Unknown("sensor.p.zero", 0.0, -9e9, 9e9, 2e5, prior=1.0), Unknown("a", 1.0, 0.0, 2.0, 1.0),
+        Unknown("valve.c1", 1e-7, 1e-10, np.inf, 1e-7),
     ]  # fmt: skip
-    problem = SimpleNamespace(unknowns=unknowns)
-    assert list(implausible_values(problem, np.array([2.9, 0.5, 0.0]))) == []
-    zero, bound = implausible_values(problem, np.array([18.0, 1.0, 0.0]))
+    problem = SimpleNamespace(unknowns=unknowns, unknown_count=4, cases=[], machine=mini)
+    search = LevenbergMarquardt(problem, print, None)
+    assert list(implausible_values(search, np.array([2.9, 0.5, 999.0, 0.0]))) == []
+    zero, *bounds = implausible_values(search, np.array([18.0, 1.0, 1e3, 0.0]))
     assert "sensor.p.zero = 3.6e+06 is not believable, 18 deviations from 0" in zero
-    assert bound == "a = 2 is on its bound."
+    assert bounds == ["a = 2 is on its bound.", "valve.c1 = 0.0001001 is on its bound."]
 
 
 class SimulatedSearch:

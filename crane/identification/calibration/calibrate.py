@@ -198,7 +198,7 @@ def calibrate(
         minima=tuple(x.cost / first.minima[0].cost for x in first.minima),
         findings=(
             *filter(None, [statics.finding(known_mass) if statics is not None else ""]),
-            *implausible_values(problem, estimate.z),
+            *implausible_values(search, estimate.z),
             *near_minima(first.problem, first.minima),
         ),
     )

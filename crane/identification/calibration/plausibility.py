@@ -19,7 +19,10 @@ from crane.description.sensors import PRESSURE_PREFIX
 from crane.dynamics.dynamics import Dynamics
 from crane.formats.machine_loading import MachineVariants
 from crane.identification.calibration.calibration_problem import CalibrationProblem
-from crane.identification.calibration.levenberg_marquardt import SearchState
+from crane.identification.calibration.levenberg_marquardt import (
+    LevenbergMarquardt,
+    SearchState,
+)
 from crane.identification.calibration.recording_case import RecordingCase
 from crane.identification.calibration.unknowns import Unknown
 from crane.machine.machine import Machine
@@ -150,9 +153,11 @@ def _friction_terms(
         yield np.array(frictions), np.array(levers)
 
 
-def implausible_values(problem: CalibrationProblem, z: Array) -> Iterator[str]:
+def implausible_values(search: LevenbergMarquardt, z: Array) -> Iterator[str]:
     """Texts about parameters that are far from what is usual, and about those on a bound."""
-    for unknown, x in zip(problem.unknowns, z, strict=False):
+    for unknown, x, low, high in zip(
+        search.problem.unknowns, z, search.low, search.high, strict=False
+    ):
         value = unknown.start + unknown.scale * x
         if unknown.prior * abs(x) > _MAX_DEVIATIONS - 1e-6:
             yield (
@@ -160,7 +165,7 @@ def implausible_values(problem: CalibrationProblem, z: Array) -> Iterator[str]:
                 f"deviations from {unknown.start:.4g}: the model lacks something, a load or "
                 "another effect."
             )
-        elif not unknown.low < value < unknown.high:
+        elif not low < x < high:
             yield f"{unknown.name} = {value:.4g} is on its bound."
 
 
