@@ -226,7 +226,7 @@ def test_a_piston_that_leaves_its_cylinder_ends_the_run(unstopped):
     part = caught.value.recording
     assert part.stopped == str(caught.value) and part["X_lift"][-1] - 0.535 < room
     assert part.time[-1] == pytest.approx(float(told[1]) - 1e-3)
-    # the last row is interpolated in one run and the end of the other, so rounded otherwise
+    # this near to the event, the last row of a run is rounded otherwise than in a longer one
     last = len(before.time) - 1
     np.testing.assert_array_equal(part.q[:last], before.q[:last])
     np.testing.assert_allclose(part.q[last], before.q[last], rtol=0.0, atol=1e-14)

@@ -74,7 +74,7 @@ class CalibrationProblem:
         self.unknown_count = count
         self.smooth = self.slopes = 0.0
         self.derivative_tolerance = DERIVATIVE_TOLERANCE
-        # kept by their arguments: methods of machines and residuals
+        # keep their last results, by their arguments
         self._changed_machine = lru_cache(_MAX_CACHED_MACHINES)(self._build_machine)
         self._recent_residuals = lru_cache(_MAX_CACHED_RESIDUALS)(self._simulate_residuals)
 
@@ -310,16 +310,16 @@ class CalibrationProblem:
         base: SimulationConstants,
         links: Sequence[str],
         times: Array,
-        nominal: Dynamics,
+        nominal_dynamics: Dynamics,
         start: Array,
     ) -> SimulationConstants:
         """Derivative of the simulation constants by an unknown.
 
         It is a difference quotient of the constants, which are smooth, backwards at a bound.
         """
-        reaches_bound = any(
+        unknown = self.unknowns[i] if i < len(self.unknowns) else None
+        reaches_bound = unknown is not None and (
             unknown.start + unknown.scale * (z[i] + _DIFFERENCE_STEP) > unknown.high
-            for unknown in self.unknowns[i : i + 1]
         )
         sides = (-1.0, 1.0) if reaches_bound else (1.0, -1.0)
         for last, side in enumerate(sides):
@@ -328,7 +328,8 @@ class CalibrationProblem:
             try:
                 other = self.simulated_machine(perturbed, friction_smoothing)
                 inputs = self._inputs_with_start(case, perturbed)
-                dynamics = nominal if other is nominal.machine else Dynamics(other)
+                is_nominal = other is nominal_dynamics.machine
+                dynamics = nominal_dynamics if is_nominal else Dynamics(other)
                 drive, initial = inputs.valve_drive(other), initial_motion(other, inputs.initial)
                 found = simulation_constants_of(dynamics, drive, initial, links, times, start)
             except CraneError:

@@ -60,7 +60,7 @@ class SearchState:
         cost: Cost there.
         damping: Damping of the next step.
         iteration: Number of iterations.
-        has_ended: Whether this is the minimum, or one that is too high.
+        has_ended: Whether the search has ended, at its minimum or because that is too high.
     """
 
     z: Array

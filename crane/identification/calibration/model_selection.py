@@ -284,16 +284,16 @@ def _candidates_minimum(
     """
     unknowns = search.problem.unknowns
     channels = {name for x in unknowns for name in reserve.get(x.name, ())}
-    first = search.restricted_search(
+    reduced = search.restricted_search(
         search.problem.variant([x for x in unknowns if x.name not in reserve])
     )
     z = smoothed_minimum(search)
     if channels and search.leaves_noise(z, channels, _SMOOTHED_NOISE_LEVEL):
-        fewer = smoothed_minimum(first)
-        if first.leaves_noise(fewer, channels, _SMOOTHED_NOISE_LEVEL) and first.leaves_noise(
-            fewer := _weighted_minimum(first, lowest_minimum(first, fewer)), channels
+        minimum = smoothed_minimum(reduced)
+        if reduced.leaves_noise(minimum, channels, _SMOOTHED_NOISE_LEVEL) and reduced.leaves_noise(
+            minimum := _weighted_minimum(reduced, lowest_minimum(reduced, minimum)), channels
         ):
-            return first, fewer
+            return reduced, minimum
     return search, _weighted_minimum(search, lowest_minimum(search, z))
 
 
